@@ -223,11 +223,13 @@ class DocumentedWorld:
 
             write_session(world)
         else:
-            from pluswriter import frame_fields, write_mha
+            from pluswriter import frame_fields, write_sequence
 
             times = 12.5 + np.arange(30) / 25
             images = np.random.default_rng(7).integers(0, 256, (30, 12, 16, 3), dtype=np.uint8)
-            write_mha(place, frame_fields(times, {"StylusToTracker": world.poses(times - 12.5)}), images.shape, images)
+            write_sequence(
+                place, frame_fields(times, {"StylusToTracker": world.poses(times - 12.5)}), images.shape, images
+            )
         return True
 
 

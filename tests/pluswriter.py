@@ -5,9 +5,8 @@ from __future__ import annotations
 import shutil
 import tempfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -37,7 +36,7 @@ def frame_fields(
     return fields
 
 
-def write_mha(
+def write_sequence(
     path: Path,
     fields: Fields,
     shape: Shape,
@@ -45,61 +44,39 @@ def write_mha(
     compressed: bool = False,
     beside: str | None = None,
 ) -> Path:
-    """A MetaImage sequence of images uint8 [H, W, C]; beside: the file for them, else they follow the header."""
+    """A sequence of images uint8 [H, W, C], as NRRD or MetaImage by its name; beside: the file for the images, else
+    they follow the header."""
     count, height, width, channels = shape
-    header: dict[str, Any] = {"ObjectType": "Image", "NDims": 4, "AnatomicalOrientation": "RAI", "BinaryData": True}
-    header |= {"BinaryDataByteOrderMSB": False, "CenterOfRotation": "0 0 0", "CompressedData": compressed}
-
-    def head(stored: int) -> str:
-        given = header | ({"CompressedDataSize": stored} if compressed else {})
-        given |= {"DimSize": f"{width} {height} 1 {count}", "ElementNumberOfChannels": channels}
-        given |= {"ElementSpacing": "1 1 1 1", "ElementType": "MET_UCHAR", "Kinds": "domain domain domain list"}
-        given |= {"UltrasoundImageOrientation": "MFA", "UltrasoundImageType": "RGB_COLOR"}
-        lines = [f"{name} = {value}" for name, value in [*given.items(), *fields]]
-        return "\n".join([*lines, f"ElementDataFile = {beside or 'LOCAL'}"]) + "\n"
-
-    packer = zlib.compressobj(1) if compressed else None
-    return _write(path, head, images, packer, beside)
-
-
-def write_nrrd(
-    path: Path,
-    fields: Fields,
-    shape: Shape,
-    images: Iterable[np.ndarray] = (),
-    compressed: bool = False,
-    beside: str | None = None,
-) -> Path:
-    """The same as NRRD."""
-    count, height, width, channels = shape
-    vector = channels > 1
-    lines = ["NRRD0004", "# Complete NRRD file format specification at:", "type: unsigned char"]
-    lines.append(f"dimension: {5 if vector else 4}")
-    lines.append(f"sizes: {f'{channels} ' if vector else ''}{width} {height} 1 {count}")
-    lines.append(f"kinds: {'vector ' if vector else ''}domain domain domain list")
-    lines += ["endian: little", f"encoding: {'gzip' if compressed else 'raw'}", "space: right-anterior-superior"]
-    lines += [f"{name}:={value}" for name, value in fields]
-    lines += [f"data file: {beside}"] if beside else []
-    packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS | 16) if compressed else None
-    return _write(path, lambda stored: "\n".join(lines) + "\n\n", images, packer, beside)
-
-
-def _write(
-    path: Path, head: Callable[[int], str], images: Iterable[np.ndarray], packer: Any, beside: str | None
-) -> Path:
-    """Write the images, then the header, which says how many bytes they take."""
+    is_nrrd, vector = path.suffix in (".nrrd", ".nhdr"), channels > 1
+    packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS | (16 if is_nrrd else 0)) if compressed else None
     with tempfile.TemporaryFile(dir=path.parent) as data:
         for image in images:
             content = np.ascontiguousarray(image).tobytes()
             data.write(content if packer is None else packer.compress(content))
         data.write(b"" if packer is None else packer.flush())
-        stored = data.tell()
+        if is_nrrd:
+            lines = ["NRRD0004", "# Complete NRRD file format specification at:", "type: unsigned char"]
+            lines.append(f"dimension: {5 if vector else 4}")
+            lines.append(f"sizes: {f'{channels} ' if vector else ''}{width} {height} 1 {count}")
+            lines.append(f"kinds: {'vector ' if vector else ''}domain domain domain list")
+            lines += [
+                "endian: little",
+                f"encoding: {'gzip' if compressed else 'raw'}",
+                "space: right-anterior-superior",
+            ]
+            lines += [f"{name}:={value}" for name, value in fields]
+            lines += [f"data file: {beside}"] * bool(beside) + [""]
+        else:
+            header = {"ObjectType": "Image", "NDims": 4, "AnatomicalOrientation": "RAI", "BinaryData": True}
+            header |= {"BinaryDataByteOrderMSB": False, "CenterOfRotation": "0 0 0", "CompressedData": compressed}
+            header |= {"CompressedDataSize": data.tell()} if compressed else {}
+            header |= {"DimSize": f"{width} {height} 1 {count}", "ElementNumberOfChannels": channels}
+            header |= {"ElementSpacing": "1 1 1 1", "ElementType": "MET_UCHAR", "Kinds": "domain domain domain list"}
+            header |= {"UltrasoundImageOrientation": "MFA", "UltrasoundImageType": "RGB_COLOR"}
+            lines = [f"{name} = {value}" for name, value in [*header.items(), *fields]]
+            lines.append(f"ElementDataFile = {beside or 'LOCAL'}")
+        path.write_text("\n".join(lines) + "\n")
         data.seek(0)
-        with path.open("wb") as file:
-            file.write(head(stored).encode())
-            if beside is None:
-                shutil.copyfileobj(data, file)
-        if beside is not None:
-            with (path.parent / beside).open("wb") as file:
-                shutil.copyfileobj(data, file)
+        with path.open("ab") if beside is None else (path.parent / beside).open("wb") as file:
+            shutil.copyfileobj(data, file)
     return path

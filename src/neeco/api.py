@@ -417,15 +417,15 @@ def ingest(
     """
     from neeco.ingest.convert import convert_folder
     from neeco.ingest.request import IngestRequest
-    from neeco.ingest.sources import folder_to_convert, recordings_of
+    from neeco.ingest.sources import sources_of
     from neeco.report.ingest_page import Ingested, ingest_and_report
 
     joint = [(name, *files) for name, files in (joints or {}).items()]
-    request, output = IngestRequest.of(source=recordings, joint=joint, **options), Path(output)
-    if (folder := folder_to_convert(request.source)) is not None:
-        request.refuse_others(f"{folder}: a folder in another format")
+    output = Path(output)
+    folder, stated = sources_of(IngestRequest.of(source=recordings, joint=joint, **options), output)
+    if folder is not None:
         return Ingested(output, notes=convert_folder(folder, output))
-    return ingest_and_report(recordings_of(request), output, progress or _silent)
+    return ingest_and_report(stated, output, progress or _silent)
 
 
 def _opened(run: Run | PathLike, device: str, force: bool) -> runs.TrainedRun:

@@ -19,6 +19,7 @@ from neeco.ingest.recording.template import write_template
 BEGIN = 1_768_663_926_000_000_000  # ns, Unix time of the first frame's arrival
 LATENCY = 0.06  # s
 COUNT = 30
+SIDECAR = "endoscope_20260117_153206.json"
 TICKS = np.arange(-5, 130) / 100  # of the robot, s from the first image on
 
 
@@ -63,6 +64,10 @@ def write_session(world, layout="LR"):
     return folder
 
 
+def change(file, **changes):
+    file.write_text(json.dumps(json.loads(file.read_text(encoding="utf-8")) | changes), encoding="utf-8")
+
+
 @pytest.fixture
 def session(world):
     return write_session(world)
@@ -95,20 +100,11 @@ def test_each_half_of_a_stereo_video_is_a_camera(world, session):
 
 def test_the_right_camera_may_stand_first(world):
     session = write_session(world, "RL")
-    known = format_of(session)
-    (_, left), (_, right) = (
-        next(iter(known.open_images(session, f"endoscope_20260117_153206.{side}").read([3])))
-        for side in ("left", "right")
-    )
-    (_, whole) = next(iter(format_of(session).open_images(write_mono(session), None).read([3])))
-    np.testing.assert_array_equal(np.concatenate([right, left], axis=1), whole)
-
-
-def write_mono(session):
-    sidecar = session / "endoscope_20260117_153206.json"
-    document = json.loads(sidecar.read_text(encoding="utf-8")) | {"side_by_side": "undefined"}
-    sidecar.write_text(json.dumps(document), encoding="utf-8")
-    return session
+    sides = [f"endoscope_20260117_153206.{side}" for side in ("right", "left")]
+    halves = [next(iter(format_of(session).open_images(session, side).read([3])))[1] for side in sides]
+    change(session / SIDECAR, side_by_side="undefined")
+    (_, whole) = next(iter(format_of(session).open_images(session, None).read([3])))
+    np.testing.assert_array_equal(np.concatenate(halves, axis=1), whole)
 
 
 def test_a_template_of_a_session_is_complete(world, session):
@@ -149,15 +145,11 @@ def test_topics_of_a_session_s_bag_are_on_its_clock(world, session):
     shift = 3.5  # s, of the bag's first message before the video's first frame
     with bag_world.BagWriter(session, "recording-mcap") as bag:
         for tick in TICKS:
-            bag.pose(
-                "/PSM1/measured_cp", tick + shift, world.positions(np.array([tick]))[0] / 1000, [1, 0, 0, 0], "ECM"
-            )
-    index = json.loads((session / "index.json").read_text(encoding="utf-8")) | {"rosbags": bag.path.name}
-    (session / "index.json").write_text(json.dumps(index), encoding="utf-8")
-    sidecar = json.loads((session / "endoscope_20260117_153206.json").read_text(encoding="utf-8"))
+            place = world.positions(np.array([tick]))[0] / 1000
+            bag.pose("/PSM1/measured_cp", tick + shift, place, [1, 0, 0, 0], "ECM")
+    change(session / "index.json", rosbags=bag.path.name)
     begin = bag_world.START + round((shift + LATENCY) * 1e9)
-    sidecar["frames"] = [{"cpu_ts": begin + round(number * 40e6), "gst_ts": 0} for number in range(COUNT)]
-    (session / "endoscope_20260117_153206.json").write_text(json.dumps(sidecar), encoding="utf-8")
+    change(session / SIDECAR, frames=[{"cpu_ts": begin + round(k * 40e6), "gst_ts": 0} for k in range(COUNT)])
     log = read_pose_log(PoseColumns(session, stream="/PSM1/measured_cp"))
     np.testing.assert_allclose(log.times, TICKS, atol=1e-6)
     np.testing.assert_allclose(log.positions, world.positions(TICKS) * [-1, -1, 1], atol=1e-9)  # ECM: x left, y up
@@ -165,7 +157,7 @@ def test_topics_of_a_session_s_bag_are_on_its_clock(world, session):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("changes", "message"),
     [
         ({"frames": [{"cpu_ts": BEGIN + i} for i in range(12)]}, "has 30 images for 12 times"),
         ({"frames": 7}, "frames: expected a cpu_ts"),
@@ -173,10 +165,8 @@ def test_topics_of_a_session_s_bag_are_on_its_clock(world, session):
         ({"estimated_latency": "long"}, "estimated_latency: 'long' is none in s"),
     ],
 )
-def test_times_that_do_not_fit_the_video_are_refused(session, change, message):
-    sidecar = session / "endoscope_20260117_153206.json"
-    document = json.loads(sidecar.read_text(encoding="utf-8")) | change
-    sidecar.write_text(json.dumps(document), encoding="utf-8")
+def test_times_that_do_not_fit_the_video_are_refused(session, changes, message):
+    change(session / SIDECAR, **changes)
     with pytest.raises(NeecoError, match=message) as caught:
         format_of(session).open_images(session, "endoscope_20260117_153206.left")
     assert len(str(caught.value).splitlines()) == 1
@@ -223,21 +213,16 @@ def test_no_bytes_make_reading_raise(session):
 
 def test_a_bag_without_its_reader_s_package_says_what_to_install(session, monkeypatch):
     (session / "rosbag").mkdir()
-    index = json.loads((session / "index.json").read_text(encoding="utf-8")) | {"rosbags": "rosbag"}
-    (session / "index.json").write_text(json.dumps(index), encoding="utf-8")
+    change(session / "index.json", rosbags="rosbag")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(NeecoError, match=r"rosbag: ROS bag: needs rosbags; pip install '\.\[ros\]'") as caught:
+    with pytest.raises(NeecoError, match=r"rosbag: ROS bag: needs rosbags; pip install '\.\[ros\]'"):
         format_of(session).streams(session)
-    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_frames_earlier_than_any_before_them_are_left_out(world):
     session = write_session(world)
-    sidecar = session / "endoscope_20260117_153206.json"
-    document = json.loads(sidecar.read_text(encoding="utf-8"))
-    for number, frame in enumerate(document["frames"]):
-        frame["cpu_ts"] = BEGIN + round((number if number < 20 else number - 12) * 40e6)
-    sidecar.write_text(json.dumps(document), encoding="utf-8")
+    numbers = [number if number < 20 else number - 12 for number in range(COUNT)]
+    change(session / SIDECAR, frames=[{"cpu_ts": BEGIN + round(number * 40e6)} for number in numbers])
     video = format_of(session).open_images(session, "endoscope_20260117_153206.left")
     assert (np.diff(video.times) > 0).all()
     assert any("10 frames are no later than" in note for note in video.notes)

@@ -18,7 +18,7 @@ from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.recording.compatibility import episode_names, separate
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording
-from neeco.ingest.sources import recordings_of
+from neeco.ingest.sources import sources_of
 from neeco.ingest.splits import assign_splits
 from neeco.ingest.timing.episodes import PAUSE_S
 from neeco.ingest.timing.reading import read_episodes
@@ -188,7 +188,7 @@ def test_a_recording_that_does_not_join_the_others_is_named(recorded, tmp_path: 
 
 def test_several_recordings_are_given_on_the_command_line(tmp_path: Path) -> None:
     paths = still_recordings(tmp_path, (1, 1))
-    assert [recording.path for recording in recordings_of(Ingest(source=tuple(paths)))] == paths
+    assert [recording.path for recording in sources_of(Ingest(source=tuple(paths)), Path("out"))[1]] == paths
     for sources, words in [
         ((paths[0], tmp_path), "is a folder; of several recordings give each recording.yaml"),
         ((paths[0], paths[1].parent), "holds a recording; give the file"),

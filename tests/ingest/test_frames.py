@@ -109,7 +109,7 @@ def test_the_frame_that_a_recording_states(tmp_path, frame, place):
     path.write_text(f"video: video.mp4\ninstruments: [{{name: tip, poses: {{file: tip.csv, frame: {frame}}}}}]\n")
     assert_seen(read_pose_log(read_recording(path).instruments[0].poses))
     path.write_text(path.read_text().replace(frame, "sideways"))
-    with pytest.raises(NeecoError, match=r"poses\.frame: 'sideways' is no frame of poses; write one of camera, .*ecm"):
+    with pytest.raises(NeecoError, match=r"poses\.frame: 'sideways' is none of them; write one of camera, .*ecm"):
         read_recording(path)
 
 
@@ -188,7 +188,7 @@ def test_a_plus_transform_to_the_ecm_is_turned_and_one_to_a_tracker_is_not(tmp_p
     poses[:, :3, 3] = ECM
     poses[1, :3, :3] = Rotation.from_rotvec([0, 0, 0.1]).as_matrix()  # it moves
     names = {name: poses for name in ("PSM1ToECM", "StylusToTracker", "StylusToCamera")}
-    path = plus_world.write_mha(tmp_path / "a.mha", plus_world.frame_fields(TIMES, names), (COUNT, 0, 0, 1), ())
+    path = plus_world.write_sequence(tmp_path / "a.mha", plus_world.frame_fields(TIMES, names), (COUNT, 0, 0, 1), ())
     assert_seen(read_pose_log(PoseColumns(path, stream="PSM1ToECM")))
     log = read_pose_log(PoseColumns(path, stream="StylusToTracker"))
     assert log.frame == BASE

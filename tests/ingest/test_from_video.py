@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from neeco.ingest.recording.file import read_recording
 from neeco.ingest.request import IngestRequest
 from neeco.ingest.shaft.axis import axis_between, contour_normals, image_lines
 from neeco.ingest.shaft.from_video import find_shaft
-from neeco.ingest.sources import recordings_of
+from neeco.ingest.sources import sources_of
 from neeco.ingest.timing.episodes import with_roll
 
 
@@ -247,12 +248,12 @@ def test_the_command_line_takes_a_diameter_instead_of_a_tracker(tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"")
     (tmp_path / "log.csv").write_text("t_s,a_rad\n0,0\n")
     video, log = tmp_path / "v.mp4", tmp_path / "log.csv"
-    (recording,) = recordings_of(IngestRequest(video=video, joint=(("jaw", log, None),), shaft_diameter=5))
+    (recording,) = sources_of(IngestRequest(video=video, joint=(("jaw", log, None),), shaft_diameter=5), Path("out"))[1]
     (item,) = recording.instruments
     assert item.from_video is not None
     assert item.placed
     assert list(item.joints) == ["jaw"]
     with pytest.raises(NeecoError, match="--shaft-diameter: -1 is out of range"):
-        recordings_of(IngestRequest(video=video, shaft_diameter=-1))
+        sources_of(IngestRequest(video=video, shaft_diameter=-1), Path("out"))[1]
     with pytest.raises(NeecoError, match="--shaft-diameter: poses are logged"):
-        recordings_of(IngestRequest(video=video, instrument=log, shaft_diameter=5))
+        sources_of(IngestRequest(video=video, instrument=log, shaft_diameter=5), Path("out"))[1]

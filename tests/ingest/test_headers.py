@@ -66,7 +66,7 @@ def test_names_over_two_lines_tell_columns_of_one_name_apart(world):
 
 def test_rows_without_a_header_say_where_they_begin(world):
     rows = lines_of(world)
-    with pytest.raises(NeecoError, match=r"line 1: no header \(found '0,"):
+    with pytest.raises(NeecoError, match=r"line 1 is no header of columns \(found '0,"):
         read_table(world.text("\n".join(rows)))
     with pytest.raises(NeecoError, match=r"line 1 is no header of columns .*the rows of numbers begin at line 4"):
         read_table(world.text("\n".join(["Recorded,2020", "# at night", "", *rows])))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import importlib.util
 import json
 import re
@@ -19,7 +18,8 @@ from neeco.cli.ingest import Ingest, run
 from neeco.ingest.readers import format_of, read_table
 from neeco.ingest.readers.columns import CAMERA as CAMERA_FRAME
 from neeco.ingest.readers.columns import PoseColumns, Units
-from neeco.ingest.readers.lerobot import find_rotations
+from neeco.ingest.readers.lerobot import LeRobot, find_rotations
+from neeco.ingest.readers.lerobot_files import LeRobotLimits
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.file import read_recording
@@ -107,10 +107,6 @@ def test_images_in_parquet_are_read_as_they_are(tmp_path, version):
     assert [(index, left_edge(pixels), int(pixels[2, 2, 0])) for index, pixels in shown] == [(3, 3, 35), (29, 29, 35)]
 
 
-def test_both_ways_to_write_a_stream(plain):
-    np.testing.assert_array_equal(read(plain, f"episode 2: {STATE}").rows, read(plain, f"episode 2/{STATE}").rows)
-
-
 @pytest.mark.parametrize(
     ("given", "names"),
     [
@@ -167,33 +163,30 @@ def test_poses_are_what_the_recording_says_they_are(nameless):
     assert log.frame == CAMERA_FRAME
 
 
-def test_the_order_of_a_quaternion_is_not_guessed(nameless):
-    with pytest.raises(
-        NeecoError, match=r"set: episode 0/observation\.state: header: .*quaternion_wxyz, quaternion_xyz"
-    ):
-        read_pose_log(pose_columns(nameless, rotation=None, form=None))
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"rotation": None, "form": None},
+            r"set: episode 0/observation\.state: header: .*quaternion_wxyz, quaternion_xyz",
+        ),
+        (
+            {"frame": None},
+            r"frame: nothing says .* frame: camera \(.*x right, y down, z forward\), or frame: base",
+        ),
+        ({"units": Units()}, r"in which length unit\?"),
+    ],
+)
+def test_order_frame_and_unit_are_not_guessed(nameless, changes, message):
+    with pytest.raises(NeecoError, match=message):
+        read_pose_log(pose_columns(nameless, **changes))
 
 
 def test_the_convention_of_angles_is_not_guessed(tmp_path):
     names = {STATE: ["x", "y", "z", "roll", "pitch", "yaw"]}
     path = data_set(tmp_path, states=[{STATE: arm(12, 0)[:, :6]}], names=names, cameras=())
-    columns = PoseColumns(path, stream=f"episode 0/{STATE}", units=Units(length="m", angle="rad"), frame="base")
-    with pytest.raises(
-        NeecoError, match=r"roll, pitch, yaw have no one meaning; name them .* with an euler_convention"
-    ):
-        read_pose_log(columns)
-
-
-def test_the_frame_of_poses_is_not_guessed(nameless):
-    with pytest.raises(
-        NeecoError, match=r"frame: nothing says .* frame: camera \(.*x right, y down, z forward\), or frame: base"
-    ):
-        read_pose_log(pose_columns(nameless, frame=None))
-
-
-def test_the_unit_of_lengths_is_not_guessed(nameless):
-    with pytest.raises(NeecoError, match=r"in which length unit\?"):
-        read_pose_log(pose_columns(nameless, units=Units()))
+    with pytest.raises(NeecoError, match=r"roll, pitch, yaw have no one meaning; name them .* euler_convention"):
+        read_pose_log(pose_columns(path, position=None, rotation=None, form=None))
 
 
 @pytest.mark.parametrize(
@@ -273,14 +266,15 @@ def test_rotations_are_found_by_their_numbers():
     turns = Rotation.from_euler("ZYX", np.linspace((0, 0, 0.4), (3, 0.5, 0.1), 40))
     places = np.linspace((0.1, 0.2, 0.3), (0.2, 0.1, 0.4), 40)
     quats, matrices = turns.as_quat().astype(np.float32), turns.as_matrix().reshape(-1, 9).astype(np.float32)
-    found = find_rotations(np.column_stack([places, quats, places]))
-    assert found == [(3, "quaternion_wxyz")]  # of either order
-    found = find_rotations(np.column_stack([places, matrices, quats]))
-    assert found == [(3, "rotation_matrix"), (12, "quaternion_wxyz")]
-    assert find_rotations(np.column_stack([places, places])) == []
-    assert find_rotations(np.tile([1.0, 0, 0, 0], (9, 1))) == []  # four numbers that stand still
-    mirrored = matrices * np.array([1, 1, -1] * 3)
-    assert find_rotations(mirrored.astype(np.float32)) == []
+    quat, matrix = "quaternion_wxyz", "rotation_matrix"  # of either order
+    for columns, rotations in [
+        ((places, quats, places), [(3, quat)]),
+        ((places, matrices, quats), [(3, matrix), (12, quat)]),
+        ((places, places), []),
+        ((np.tile([1.0, 0, 0, 0], (40, 1)),), []),  # four numbers that stand still
+        ((matrices * np.array([1, 1, -1] * 3, np.float32),), []),  # mirrored
+    ]:
+        assert find_rotations(np.column_stack(columns), 1e-3) == rotations
 
 
 def test_init_asks_what_a_data_set_leaves_open_in_words_beside_it(nameless, tmp_path, capsys):
@@ -317,11 +311,9 @@ def test_logs_of_another_episode_than_the_images(plain):
 
 
 def test_which_episode_must_be_said_where_there_are_several(plain):
-    known = format_of(plain)
-    with pytest.raises(NeecoError, match=r"there are episodes 0 to 2; name one, as in episode 0/"):
-        known.read(plain)
-    with pytest.raises(NeecoError, match=r"there are episodes 0 to 2; name one, as in episode 0/"):
-        known.open_images(plain)
+    for action in (format_of(plain).read, format_of(plain).open_images):
+        with pytest.raises(NeecoError, match=r"there are episodes 0 to 2; name one, as in episode 0/"):
+            action(plain)
 
 
 def test_what_is_not_there(plain):
@@ -389,14 +381,15 @@ def test_timestamps_a_little_off_name_the_nearest_image_and_those_of_a_clock_non
         assert len([note for note in video.notes if "state i is taken to be of image i" in note]) == noted
 
 
-@pytest.mark.parametrize(("frames", "refused"), [(29, False), (25, True)])
-def test_a_film_that_ends_before_its_timestamps(tmp_path, frames, refused):
-    path = data_set(tmp_path, version="v2.1", states=[EPISODES[0]], shown={0: frames})
-    with_column(path, "data/*/*.parquet", "timestamp", np.arange(10, 30) / FPS)
-    if refused:
-        assert "25 images for 30 that the timestamps of episode 0" in refusal(path, f"episode 0/{CAMERA}", images=True)
-    else:
-        assert len(format_of(path).open_images(path, f"episode 0/{CAMERA}").times) == 19
+def test_a_film_that_ends_before_its_timestamps(tmp_path):
+    for frames in (25, 29):
+        path = data_set(tmp_path / str(frames), version="v2.1", states=[EPISODES[0]], shown={0: frames})
+        with_column(path, "data/*/*.parquet", "timestamp", np.arange(10, 30) / FPS)
+        if frames == 25:
+            said = refusal(path, f"episode 0/{CAMERA}", images=True)
+            assert "25 images for 30 that the timestamps of episode 0" in said
+        else:
+            assert len(format_of(path).open_images(path, f"episode 0/{CAMERA}").times) == 19
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
@@ -490,21 +483,20 @@ def test_damaged_files(tmp_path, version):
 
 def test_parquet_of_other_columns(tmp_path):
     path = data_set(tmp_path, version="v2.1")
-    file = path / "data/chunk-000/episode_000001.parquet"
+    file, rows = path / "data/chunk-000/episode_000001.parquet", LENGTHS[1]
     table = pyarrow.parquet.read_table(file)
-    pyarrow.parquet.write_table(table.drop_columns([STATE]), file)
-    assert f"has no column '{STATE}'; its columns are action, timestamp" in refusal(path)
-    texts = pyarrow.array(["x"] * LENGTHS[1])
-    pyarrow.parquet.write_table(table.set_column(0, STATE, texts), file)
-    assert f"{STATE}: holds string, no numbers" in refusal(path)
-    ragged = pyarrow.array([[1.0] * (1 + row % 2) for row in range(LENGTHS[1])])
-    pyarrow.parquet.write_table(table.set_column(0, STATE, ragged), file)
-    assert f"{STATE}: its rows have different lengths" in refusal(path)
-    short = pyarrow.array([[1.0]] * LENGTHS[1])
-    pyarrow.parquet.write_table(table.set_column(0, STATE, short), file)
-    assert f"{STATE}: has 1 numbers a row, meta/info.json says 16" in refusal(path)
-    pyarrow.parquet.write_table(table.slice(0, 11), file)
-    assert "has 11 rows of episode 1, meta says 30" in refusal(path)
+    no_numbers = f"{STATE}: holds .*, no numbers, as many in each row"
+    for other, message in [
+        (table.drop_columns([STATE]), f"has no column '{STATE}'; its columns are action, timestamp"),
+        (table.set_column(0, STATE, pyarrow.array(["x"] * rows)), no_numbers),
+        (table.set_column(0, STATE, pyarrow.array([[1.0] * (1 + row % 2) for row in range(rows)])), no_numbers),
+        (table.set_column(0, STATE, pyarrow.array([[1.0]] * rows)), f"{STATE}: has 1 numbers a row, not 16"),
+        (table.set_column(2, "timestamp", pyarrow.array([[]] * rows, pyarrow.list_(pyarrow.float64()))),
+         "timestamp: has 0 numbers a row, not 1"),
+        (table.slice(0, 11), "has 11 rows of episode 1, meta says 30"),
+    ]:  # fmt: skip
+        pyarrow.parquet.write_table(other, file)
+        assert re.search(message, refusal(path))
 
 
 def test_lines_of_episodes_that_are_none(tmp_path):
@@ -521,58 +513,30 @@ def test_lines_of_episodes_that_are_none(tmp_path):
 
 
 def test_timestamps_that_stand_still_are_replaced_with_a_note(tmp_path):
-    path = data_set(tmp_path, version="v2.1")
-    file = path / "data/chunk-000/episode_000001.parquet"
-    table = pyarrow.parquet.read_table(file)
-    still = pyarrow.array(np.full(LENGTHS[1], 1.7e9, np.float32))  # nanoseconds since 1970 as float32 s
-    pyarrow.parquet.write_table(table.set_column(table.schema.get_field_index("timestamp"), "timestamp", still), file)
-    found = read(path, f"episode 1/{STATE}")
-    np.testing.assert_allclose(found.rows[:, 0], np.arange(LENGTHS[1]) / FPS)
-    assert "timestamps do not increase; taken as 25 a second" in found.notes[0]
+    path = data_set(tmp_path, version="v2.1", states=[EPISODES[1]])
+    with_column(path, "data/*/*.parquet", "timestamp", np.full(LENGTHS[1], 1.7e9, np.float32))
+    table = read(path, f"episode 0/{STATE}")
+    np.testing.assert_allclose(table.rows[:, 0], np.arange(LENGTHS[1]) / FPS)
+    assert "timestamps do not increase; taken as 25 a second" in table.notes[0]
 
 
-@pytest.mark.parametrize("column", ["length", "timestamp"])
-def test_lists_where_a_number_stands_in_each_row_are_refused(tmp_path: Path, column: str) -> None:
-    path = data_set(tmp_path, version="v3.0")
-    pattern = "meta/episodes/**/*.parquet" if column == "length" else "data/**/*.parquet"
-    for file in path.glob(pattern):
-        table = pyarrow.parquet.read_table(file)
-        lists = pyarrow.array([[]] * len(table), pyarrow.list_(pyarrow.float64()))
-        pyarrow.parquet.write_table(table.set_column(table.schema.get_field_index(column), column, lists), file)
-    assert f"{column}: expected one number in each row" in refusal(path)
-
-
-def test_row_groups_that_unpack_to_more_than_memory_should_hold_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_row_groups_that_unpack_to_more_than_memory_should_hold_are_refused(tmp_path: Path) -> None:
     """Only those of the columns and the episode that are read count."""
-    from neeco.ingest.readers import lerobot_files
-
     states = [{STATE: arm(20, number)} for number in range(40)]
     path = data_set(tmp_path, states=states, names={}, cameras=(), group=20)
-    monkeypatch.setattr(lerobot_files, "MAX_BYTES", 8_000)
-    assert len(read(path, f"episode 33/{STATE}").rows) == 20
-    monkeypatch.setattr(lerobot_files, "MAX_BYTES", 100)
-    assert "unpacks to over" in refusal(path)
+    known = LeRobot()
+    known.limits = LeRobotLimits(group_bytes=8_000)
+    assert len(known.read(path, f"episode 33/{STATE}").rows) == 20
+    known.limits = LeRobotLimits(group_bytes=100)
+    with pytest.raises(NeecoError, match="unpacks to over"):
+        known.read(path, f"episode 33/{STATE}")
 
 
 def test_without_the_package(tmp_path, monkeypatch):
-    path = data_set(tmp_path, states=EPISODES[:1], cameras=())
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *rest: None if name == "pyarrow" else found(name, *rest)
-    )
-    monkeypatch.setattr(builtins, "__import__", _without(builtins.__import__, "pyarrow"))
+    path, there = data_set(tmp_path, states=EPISODES[:1], cameras=()), importlib.util.find_spec
+    absent = {"pyarrow": None}
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: absent.get(name, name) and there(name, *rest))
     assert "LeRobot data set: needs pyarrow; pip install '.[lerobot]'" in refusal(path)
-
-
-def _without(own: Any, name: str) -> Any:
-    def load(module: str, *rest: Any) -> Any:
-        if module.partition(".")[0] == name:
-            raise ImportError(module)
-        return own(module, *rest)
-
-    return load
 
 
 def test_other_folders_are_none(tmp_path):

@@ -8,7 +8,7 @@ import zlib
 import numpy as np
 import pytest
 from damaged_files import refusals
-from pluswriter import frame_fields, write_mha, write_nrrd
+from pluswriter import frame_fields, write_sequence
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import IMAGES, OTHER, POSES, format_of
@@ -32,30 +32,25 @@ def film(channels=3):
     return np.random.default_rng(7).integers(0, 256, (COUNT, 12, 16, channels), dtype=np.uint8)
 
 
-def mha(path, fields, images=None, **more):
-    """A MetaImage sequence; without images, of poses alone."""
+def sequence(path, fields, images=None, **more):
+    """A sequence; without images, of poses alone."""
     shape, content = ((COUNT, 0, 0, 1), ()) if images is None else (images.shape, images)
-    return write_mha(path, fields, shape, content, **more)
-
-
-def nrrd(path, fields, images, **more):
-    return write_nrrd(path, fields, images.shape, images, **more)
+    return write_sequence(path, fields, shape, content, **more)
 
 
 LAYOUTS = {
-    "whole.igs.mha": (mha, {}),
-    "packed.mha": (mha, {"compressed": True}),
-    "beside.mhd": (mha, {"beside": "beside.raw"}),
-    "zbeside.mhd": (mha, {"compressed": True, "beside": "beside.zraw"}),
-    "whole.nrrd": (nrrd, {}),
-    "packed.nrrd": (nrrd, {"compressed": True}),
-    "beside.nhdr": (nrrd, {"compressed": True, "beside": "beside.raw.gz"}),
+    "whole.igs.mha": {},
+    "packed.mha": {"compressed": True},
+    "beside.mhd": {"beside": "beside.raw"},
+    "zbeside.mhd": {"compressed": True, "beside": "beside.zraw"},
+    "whole.nrrd": {},
+    "packed.nrrd": {"compressed": True},
+    "beside.nhdr": {"compressed": True, "beside": "beside.raw.gz"},
 }
 
 
 def write(folder, name, fields, images):
-    writer, how = LAYOUTS[name]
-    return writer(folder / name, fields, images, **how)
+    return sequence(folder / name, fields, images, **LAYOUTS[name])
 
 
 BESIDE = {"beside.mhd": "beside.raw", "zbeside.mhd": "beside.zraw", "beside.nhdr": "beside.raw.gz"}
@@ -86,7 +81,7 @@ def test_poses_and_images_come_back_from_every_layout(world, transforms, name, c
 
 def test_frames_that_are_not_ok_are_left_out_and_noted(world, transforms):
     statuses = {("StylusToTracker", frame): "MISSING" for frame in (4, 5, 9)}
-    path = mha(world.folder / "a.igs.mha", frame_fields(TIMES, transforms, statuses, bad_images=(0, 20)), film())
+    path = sequence(world.folder / "a.igs.mha", frame_fields(TIMES, transforms, statuses, bad_images=(0, 20)), film())
     log = read_pose_log(PoseColumns(path))
     kept = np.delete(np.arange(COUNT), [4, 5, 9])
     first = TIMES[1]  # of the first image that can be used
@@ -102,43 +97,32 @@ def test_frames_that_are_not_ok_are_left_out_and_noted(world, transforms):
 
 def test_a_file_of_poses_alone_keeps_its_clock(world, transforms):
     fields = frame_fields(TIMES, {"StylusToTracker": transforms["StylusToTracker"]})
-    path = mha(world.folder / "tracker.igs.mha", fields)
+    path = sequence(world.folder / "tracker.igs.mha", fields)
     np.testing.assert_allclose(read_pose_log(PoseColumns(path)).times, TIMES, atol=1e-6)
     with pytest.raises(NeecoError, match="0 streams of images"):
         format_of(path).open_images(path)
 
 
-def test_a_transform_may_be_named_in_full(world, transforms):
-    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms))
-    log = read_pose_log(PoseColumns(path, stream="StylusToTrackerTransform"))
-    assert len(log.times) == COUNT
-    assert log.stated_in == "Tracker"
-
-
 @pytest.mark.parametrize(
     ("stream", "message"),
     [
-        ("ProbeToTracker", "holds no 'ProbeToTracker'; name one of StylusToTracker"),
+        (None, r"name one as `stream` .*: ScopeToTracker, StylusToTracker"),
+        ("ProbeToTracker", "holds no 'ProbeToTracker'; name one of ScopeToTracker, StylusToTracker"),
         ("ImageToProbe", "is fixed transform, not poses"),
         ("images", "not poses"),
     ],
 )
-def test_a_stream_that_holds_no_poses_is_refused(world, transforms, stream, message):
-    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms), film())
+def test_a_stream_of_poses_must_be_named(world, transforms, stream, message):
+    tools = transforms | {"ScopeToTracker": transforms["StylusToTracker"]}
+    path = sequence(world.folder / "a.mha", frame_fields(TIMES, tools), film())
     with pytest.raises(NeecoError, match=message):
         read_pose_log(PoseColumns(path, stream=stream))
-
-
-def test_several_tools_must_be_named(world, transforms):
-    tools = {"StylusToTracker": transforms["StylusToTracker"], "ScopeToTracker": transforms["StylusToTracker"]}
-    path = mha(world.folder / "a.mha", frame_fields(TIMES, tools), film())
-    with pytest.raises(NeecoError, match=r"name one as `stream` .*: ScopeToTracker, StylusToTracker"):
-        read_pose_log(PoseColumns(path))
+    assert read_pose_log(PoseColumns(path, stream="StylusToTrackerTransform")).stated_in == "Tracker"
 
 
 def test_a_template_of_a_sequence_is_complete(world, transforms):
     tools = {**transforms, "ScopeToTracker": transforms["StylusToTracker"]}
-    path = mha(world.folder / "surgery.igs.mha", frame_fields(TIMES, tools), film())
+    path = sequence(world.folder / "surgery.igs.mha", frame_fields(TIMES, tools), film())
     text = write_template(path)
     recording = read_recording(world.text(text, "recording.yaml"))
     assert recording.video == path
@@ -179,7 +163,7 @@ def changed(path, old, new):
     ],
 )
 def test_a_header_that_cannot_be_is_refused_in_one_line(world, transforms, old, new, message):
-    path = changed(mha(world.folder / "a.igs.mha", frame_fields(TIMES, transforms), film()), old, new)
+    path = changed(sequence(world.folder / "a.igs.mha", frame_fields(TIMES, transforms), film()), old, new)
     with pytest.raises(NeecoError, match=message) as caught:
         format_of(path).open_images(path)
     assert str(caught.value).startswith(str(path))
@@ -205,7 +189,7 @@ def test_truncated_and_damaged_images_are_refused(world, transforms):
 
 
 def test_a_compressed_bomb_is_refused_before_it_is_unpacked(world, transforms):
-    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms), film(), compressed=True)
+    path = sequence(world.folder / "a.mha", frame_fields(TIMES, transforms), film(), compressed=True)
     changed(path, b"16 12 1 30", b"8000 8000 1 3000")
     with pytest.raises(NeecoError, match="of which no 3000 images"):
         list(format_of(path).open_images(path).read(range(COUNT)))
@@ -218,23 +202,23 @@ def test_a_compressed_bomb_is_refused_before_it_is_unpacked(world, transforms):
 
 
 def test_a_file_without_transforms_says_so(world):
-    path = mha(world.folder / "a.mha", frame_fields(TIMES, {}), film())
+    path = sequence(world.folder / "a.mha", frame_fields(TIMES, {}), film())
     assert [stream.name for stream in format_of(path).streams(path)] == ["images"]
     with pytest.raises(
         NeecoError, match=r"a.mha: holds no transforms \(Seq_Frame0000_StylusToTrackerTransform\); name"
     ):
         read_pose_log(PoseColumns(path))
-    volume = mha(world.folder / "ct.mha", [], film())
+    volume = sequence(world.folder / "ct.mha", [], film())
     with pytest.raises(NeecoError, match="no PLUS sequence"):
         read_pose_log(PoseColumns(volume))
 
 
 def test_statuses_all_invalid_are_said(world, transforms):
     statuses = {("StylusToTracker", frame): "INVALID" for frame in range(COUNT)}
-    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms, statuses), film())
+    path = sequence(world.folder / "a.mha", frame_fields(TIMES, transforms, statuses), film())
     with pytest.raises(NeecoError, match=r"StylusToTracker: no frame can be used: .*Status is 'INVALID'"):
         read_pose_log(PoseColumns(path))
-    path = mha(world.folder / "b.mha", frame_fields(TIMES, transforms, bad_images=tuple(range(COUNT))), film())
+    path = sequence(world.folder / "b.mha", frame_fields(TIMES, transforms, bad_images=tuple(range(COUNT))), film())
     with pytest.raises(NeecoError, match=r"0 of 30 images can be used \(30 images are not OK"):
         format_of(path).open_images(path)
 
@@ -242,7 +226,7 @@ def test_statuses_all_invalid_are_said(world, transforms):
 def test_a_tool_that_was_never_in_view_hides_no_other(world, transforms):
     both = transforms | {"ProbeToTracker": world.poses(TIMES - START)}
     statuses = {("StylusToTracker", frame): "INVALID" for frame in range(COUNT)}
-    path = mha(world.folder / "a.mha", frame_fields(TIMES, both, statuses), film())
+    path = sequence(world.folder / "a.mha", frame_fields(TIMES, both, statuses), film())
     problems = []
     text = write_template(path, problems.append)
     assert [problem.partition(": no frame")[0] for problem in problems] == ["a.mha: StylusToTracker"]
@@ -267,8 +251,8 @@ def test_a_header_of_its_own_may_end_with_its_file(world, transforms, name, endi
 
 
 def test_a_folder_lists_what_it_cannot_read(world, transforms):
-    mha(world.folder / "ct.mha", [], film())
-    mha(world.folder / "surgery.mha", frame_fields(TIMES, transforms), film())
+    sequence(world.folder / "ct.mha", [], film())
+    sequence(world.folder / "surgery.mha", frame_fields(TIMES, transforms), film())
     text = write_template(world.folder)
     assert "ct.mha: holds no fields of frames" in text
     recording = read_recording(world.text(text, "recording.yaml"))
@@ -291,7 +275,7 @@ def test_no_bytes_make_reading_raise(world, transforms, name):
 def test_a_transform_without_to_is_read_and_its_frame_asked_for(tmp_path, world):
     """As 3D Slicer names them."""
     poses = world.poses(TIMES - START)
-    path = mha(tmp_path / "slicer.seq.mha", frame_fields(TIMES, {"LinearTransform_3": poses}))
+    path = sequence(tmp_path / "slicer.seq.mha", frame_fields(TIMES, {"LinearTransform_3": poses}))
     (stream,) = format_of(path).streams(path)
     assert (stream.name, stream.kind, stream.count) == ("LinearTransform_3", POSES, COUNT)
     assert "LinearTransform_3" in stream.asks[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import IngestSettings, Splits
 from neeco.ingest.recording.template import open_questions, write_template
 from neeco.ingest.request import IngestRequest
-from neeco.ingest.sources import recordings_of
+from neeco.ingest.sources import sources_of
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
@@ -41,7 +42,7 @@ def flags(folder, **more):
         "intrinsics": (290, 290, 160, 128),
         "sync": folder / "logs/sync.json",
     }
-    return recordings_of(IngestRequest(video=folder / "video.mp4", **(given | more)))[0]
+    return sources_of(IngestRequest(video=folder / "video.mp4", **(given | more)), Path("out"))[1][0]
 
 
 def test_flags(folder):
@@ -234,15 +235,9 @@ def test_links_are_given_inline_or_by_a_tool_file(world, folder):
     ("words", "message"),
     [
         (LINKS.replace("jaw", "elbow"), r"instruments\[0\]\.kinematics: 'elbow' is no joint of it; .*\(jaw, wrist\)"),
-        (
-            LINKS.replace("shaft, type", "tip, type"),
-            r"instruments\[0\]\.kinematics\.links: joined in a circle: 'tip'",
-        ),
+        (LINKS.replace("shaft, type", "tip, type"), r"kinematics\.links: joined in a circle: 'tip'"),
         ("{dvrk_tool: none.json}", r"instruments\[0\]\.kinematics\.dvrk_tool: no such file: 'none\.json'"),
-        (
-            "{dvrk_tool: tool.json, reading: {}}",
-            r"reading: it has no such field; .*did you mean readings\?",
-        ),
+        ("{dvrk_tool: tool.json, reading: {}}", r"reading: it has no such field; .*did you mean readings\?"),
         ("{dvrk_tool: tool.json, readings: {yaw: jaw}}", r"kinematics\.readings\.yaw: unknown key"),
         ("{dvrk_tool: tool.json, readings: 3}", r"kinematics\.readings: is a group of fields"),
         ("{dvrk_tool: tool.json}", r"instruments\[0\]\.kinematics: 'wrist_pitch' is no joint of it"),
@@ -266,11 +261,7 @@ def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder)
     ("old", "new", "message"),
     [
         ("frames:", "frmes:", r"frmes: it has no such field; it has .*; did you mean frames\?"),
-        (
-            "quaternion:",
-            "quaternions:",
-            r"\[0\]\.poses\.columns\.quaternions: it has no such field; .*did you mean",
-        ),
+        ("quaternion:", "quaternions:", r"\[0\]\.poses\.columns\.quaternions: it has no such field; .*did you mean"),
         ("file: video.mp4", "file: vide.mp4", r"video\.file: no such file: 'vide\.mp4'"),
         ("fps: 50", "fps: -1", r"video\.fps: -1 is out of range; give a number above 0"),
         ("fps: 50", "fps: fast", r"video\.fps: expected a number, found 'fast'"),
@@ -281,7 +272,7 @@ def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder)
         ("[x_mm, y_mm, z_mm]", "[x_mm, y_mm, x_mm]", r"columns\.position: names a column twice"),
         ("[qw, qx, qy, qz]", "[a, b, c, d]", "the names do not say the order"),
         ("quaternion: [qw, qx, qy, qz]", "euler: [qx, qy, qz]", r"euler_convention: missing"),
-        ("quaternion:", "euler_convention: XXY, quaternion:", r"'XXY' is none"),
+        ("quaternion: [qw, qx, qy, qz]", "euler: [qx, qy, qz], euler_convention: XXY", r"'XXY' is none"),
         ("quaternion:", "rotation_vector: [a, b, c], quaternion:", "keep one of them"),
         ("millimetres", "inches", r"units\.length: 'inches' is no unit of length; use mm, cm, m"),
         ("[0, 1.5]", "[1.5, 0]", r"joints\.jaw\.limits: 1\.5 is not below 0"),
@@ -289,31 +280,15 @@ def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder)
         ("jaw: -1}", "jaww: -1}", r"sync\.jaww: no log has the clock 'jaww'; did you mean jaw\?"),
         ("jaw: -1}", "jaw: soon}", r"sync\.jaw: 'soon' is not an offset in seconds"),
         ("frames: 100", "frames: 1.5", r"frames: 1\.5 is out of range; give a whole number"),
-        (
-            "unseen_by: jaw",
-            "unseen_by: elbow",
-            r"splits\.unseen_by: no joint is called 'elbow'; the joints are jaw, wrist",
-        ),
+        ("unseen_by: jaw", "unseen_by: elbow", r"unseen_by: no joint is called 'elbow'; the joints are jaw, wrist"),
         ("10-12", "12-10", r"splits\.unseen: '12-10' is no range of frames"),
         ("video: {file: video.mp4, fps: 50}", "", "give either `video: FILE` or `images:"),
         ("video: {file: video.mp4, fps: 50}", "images: {folder: logs}", r"images\.fps: when were the images taken\?"),
         ("instruments:\n", "instruments: 3\nx:\n", r"x: it has no such field"),
         ("frames: 100", "frames: [100", r"line \d+: not valid YAML"),
-        (
-            "shape_frames: 20",
-            "shape_frame: 20",
-            r"settings\.shape_frame: it has no such .*did you mean shape_frames\?",
-        ),
-        (
-            "shape_frames: 20",
-            "shape_frames: 0",
-            r"settings\.shape_frames: 0 is out of range; give a whole number, 1 or",
-        ),
-        (
-            "tracker_noise_mm: 1",
-            "tracker_noise_mm: 0",
-            r"settings\.tracker_noise_mm: 0 is out of range; give a number above",
-        ),
+        ("shape_frames: 20", "shape_frame: 20", r"shape_frame: it has no such .*did you mean shape_frames\?"),
+        ("shape_frames: 20", "shape_frames: 0", r"shape_frames: 0 is out of range; give a whole number, 1 or"),
+        ("tracker_noise_mm: 1", "tracker_noise_mm: 0", r"tracker_noise_mm: 0 is out of range; give a number above"),
     ],
 )
 def test_mistakes_are_told_with_their_key(world, folder, old, new, message):
@@ -344,7 +319,11 @@ def test_an_offset_of_a_log_that_was_not_given_is_noted(folder):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("[]", "expected clock offsets"), ("{}", "clocks: missing"), ('{"clocks": {"em": "x"}}', "'x' is not an offset")],
+    [
+        ("[]", "expected clock offsets"),
+        ("{}", "clocks: expected clock offsets"),
+        ('{"clocks": {"em": "x"}}', "'x' is not an offset"),
+    ],
 )
 def test_sync_files_that_are_none(world, folder, content, message):
     with pytest.raises(NeecoError, match=rf"sync\.json: .*{message}"):
@@ -352,15 +331,17 @@ def test_sync_files_that_are_none(world, folder, content, message):
 
 
 def test_flags_that_cannot_be(folder):
-    with pytest.raises(NeecoError, match=r"--laparoscope: no such file: .*absent\.csv"):
-        flags(folder, laparoscope=folder / "absent.csv")
-    with pytest.raises(NeecoError, match="--joint jaw_angle: needs --instrument"):
-        flags(folder, instrument=None)
-    with pytest.raises(NeecoError, match="--frames: 1 is too few"):
-        flags(folder, frames=1)
     joint = ("jaw_angle", folder / "logs/jaw.csv", None)
-    with pytest.raises(NeecoError, match="--joint jaw_angle: given twice"):
-        flags(folder, joint=[joint, joint])
+    exchanged = ("jaw_angle", folder / "logs/jaw_calibration.csv", folder / "logs/jaw.csv")
+    for options, message in [
+        ({"laparoscope": folder / "absent.csv"}, r"--laparoscope: no such file: .*absent\.csv"),
+        ({"instrument": None}, "--joint jaw_angle: needs --instrument"),
+        ({"frames": 1}, "--frames: 1 is too few"),
+        ({"joint": [joint, joint]}, "--joint jaw_angle: given twice"),
+        ({"joint": [exchanged]}, r"--joint jaw_angle: .*calibration\.csv has no times, .*jaw\.csv has; give the"),
+    ]:
+        with pytest.raises(NeecoError, match=message):
+            flags(folder, **options)
 
 
 def test_two_instruments_with_one_joint_name_have_two_clocks(world, folder):
@@ -372,16 +353,11 @@ def test_two_instruments_with_one_joint_name_have_two_clocks(world, folder):
 def test_a_fault_of_a_flag_is_told_by_its_flag(folder):
     (folder / "empty").mkdir()
     with pytest.raises(NeecoError, match=r"empty: holds 0 images"):
-        recordings_of(IngestRequest(video=folder / "empty", fps=25))[0].source.open()
+        sources_of(IngestRequest(video=folder / "empty", fps=25), Path("out"))[1][0].source.open()
     (folder / "frames").mkdir()
     Image.new("RGB", (8, 8)).save(folder / "frames" / "1.png")
     with pytest.raises(NeecoError, match=r"--fps: when were the images taken\?"):
-        recordings_of(IngestRequest(video=folder / "frames"))
-    joint = ("jaw_angle", folder / "logs/jaw_calibration.csv", folder / "logs/jaw.csv")
-    with pytest.raises(
-        NeecoError, match=r"--joint jaw_angle: .*calibration\.csv has no times, .*jaw\.csv has; give the"
-    ):
-        flags(folder, joint=[joint])
+        sources_of(IngestRequest(video=folder / "frames"), Path("out"))[1]
     with pytest.raises(NeecoError, match=r"^--intrinsics: fl_x, fl_y: must be two positive focal lengths in pixels"):
         flags(folder, intrinsics=(-290, 290, 160, 128)).read_lens()
     with pytest.raises(NeecoError) as told:

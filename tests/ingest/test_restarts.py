@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,13 +67,6 @@ def test_a_second_run_in_a_file_is_refused_with_its_line(world, begins):
         read_pose_log(PoseColumns(path))
 
 
-def test_a_repeated_header_is_named(world):
-    path = world.write("t_s,jaw_rad", np.column_stack([np.arange(100) / 50, np.sin(np.arange(100))]))
-    path.write_text(path.read_text() + path.read_text())
-    with pytest.raises(NeecoError, match=r"line 103: time begins anew .*: line 102 repeats the header"):
-        read_reading_log(JointColumns(path, "jaw"))
-
-
 @pytest.mark.parametrize("times", [(4.0, 4.5), (4.48, 4.48)], ids=["gap", "same time"])
 @pytest.mark.parametrize("begins", [(0.0, 0.5), (0.0, 0.0)], ids=["gap", "same time"])
 def test_a_second_run_is_refused_however_uneven_the_rows_around_its_beginning_are(world, times, begins):
@@ -81,12 +76,18 @@ def test_a_second_run_is_refused_however_uneven_the_rows_around_its_beginning_ar
         read_reading_log(JointColumns(path, "jaw"))
 
 
-def test_a_repeated_header_is_refused_where_rows_have_no_times(world):
-    path = world.write("jaw_rad", np.sin(np.arange(100))[:, None])
-    assert len(read_reading_log(JointColumns(path, "jaw", rate_hz=50.0)).times) == 100
-    path.write_text(path.read_text() + path.read_text())
-    with pytest.raises(NeecoError, match="line 102 repeats the header"):
-        read_reading_log(JointColumns(path, "jaw", rate_hz=50.0))
+def test_a_repeated_header_is_named_whether_or_not_rows_have_times(world):
+    values = np.sin(np.arange(100))
+    for header, columns, message in [
+        ("t_s,jaw_rad", [np.arange(100) / 50, values], "line 103: time begins anew .*: line 102 repeats the header"),
+        ("jaw_rad", [values], "line 102 repeats the header"),
+    ]:
+        source = JointColumns(world.write(header, np.column_stack(columns)), "jaw", rate_hz=None)
+        source = source if "t_s" in header else replace(source, rate_hz=50.0)
+        assert len(read_reading_log(source).times) == 100
+        source.path.write_text(source.path.read_text() * 2)
+        with pytest.raises(NeecoError, match=message):
+            read_reading_log(source)
 
 
 def test_a_run_that_ends_near_a_counters_period_is_no_wrap(world):

@@ -12,7 +12,7 @@ from bag_world import KINDS, BagWriter
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers import IMAGES, OTHER, POSES, READINGS, VideoSource, format_of, read_table
+from neeco.ingest.readers import IMAGES, OTHER, POSES, READINGS, RecordingFormat, VideoSource, format_of, read_table
 from neeco.ingest.readers.columns import BASE, CAMERA, JointColumns, PoseColumns
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog, read_pose_log, read_reading_log
@@ -66,10 +66,14 @@ def poses(path: Path, stream: str = ARM) -> PoseLog:
     return read_pose_log(PoseColumns(path, stream=stream))
 
 
+def known(path: Path) -> RecordingFormat:
+    found = format_of(path)
+    assert found is not None
+    return found
+
+
 def images(path: Path, stream: str | None = None) -> VideoSource:
-    known = format_of(path)
-    assert known is not None
-    return known.open_images(path, stream)
+    return known(path).open_images(path, stream)
 
 
 def refusal(action: Callable[[], object]) -> str:
@@ -87,9 +91,12 @@ def kind(request: pytest.FixtureRequest) -> str:
 # --- poses, joints, transforms
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_a_bag_gives_back_what_was_recorded(tmp_path: Path, kind: str, packed: bool) -> None:
-    with BagWriter(tmp_path, kind, packed=("lz4" if kind.endswith(".bag") else "zstd") if packed else None) as bag:
+@pytest.mark.parametrize(
+    ("kind", "packed"),
+    [*((kind, None) for kind in KINDS), *zip(("recording.bag", *KINDS), ("bz2", "lz4", "zstd", "zstd"), strict=True)],
+)
+def test_a_bag_gives_back_what_was_recorded(tmp_path: Path, kind: str, packed: str | None) -> None:
+    with BagWriter(tmp_path, kind, packed=packed) as bag:
         write_arm(bag)
         write_images(bag)
     for path in {bag.path, bag.file} if "db3" not in kind or not packed else {bag.path}:
@@ -110,21 +117,13 @@ def test_a_bag_gives_back_what_was_recorded(tmp_path: Path, kind: str, packed: b
             np.testing.assert_array_equal(pixels, picture(number))
 
 
-def test_bz2_chunks_are_read(tmp_path: Path) -> None:
-    with BagWriter(tmp_path, "recording.bag", packed="bz2") as bag:
-        write_arm(bag)
-    np.testing.assert_allclose(poses(bag.path).times, TICKS, atol=2 * NS)
-
-
 def test_streams_say_what_there_is(tmp_path: Path, kind: str) -> None:
     with BagWriter(tmp_path, kind) as bag:
         write_arm(bag, "ECM")
         write_images(bag, count=20)
         bag.tf(0.0, [0, 0, 0], [1, 0, 0, 0], "world", "camera", static=True)
         bag.other("/chatter", 0.0)
-    known = format_of(bag.path)
-    assert known is not None
-    found = {stream.name: stream for stream in known.streams(bag.path)}
+    found = {stream.name: stream for stream in known(bag.path).streams(bag.path)}
     told = {name: (stream.kind, stream.count) for name, stream in found.items()}
     assert told == {
         LEFT: (IMAGES, 20), ARM: (POSES, 40), JAW: (READINGS, 40), "/PSM1/measured_js": (READINGS, 40),
@@ -134,13 +133,6 @@ def test_streams_say_what_there_is(tmp_path: Path, kind: str) -> None:
     assert found[LEFT].type == "sensor_msgs/Image (rgb8, 24x16)"
     assert found["/chatter"].type == "std_msgs/String"
     assert found[ARM].rate_hz == pytest.approx(1 / STEP)
-
-
-@pytest.mark.parametrize(("frame", "meant"), [("ECM", CAMERA), ("/ecm", CAMERA), ("PSM1_base", BASE), ("", BASE)])
-def test_poses_in_a_cameras_frame_are_known_as_such(tmp_path: Path, frame: str, meant: str) -> None:
-    path = whole(tmp_path, frame=frame)  # its images are of `camera`
-    assert poses(path).frame == meant
-    assert read_pose_log(PoseColumns(path, stream=ARM, frame=BASE)).frame == BASE
 
 
 def test_a_dvrks_poses_in_the_images_own_frame_have_either_axes_and_are_asked_for(tmp_path: Path) -> None:
@@ -163,22 +155,20 @@ def test_times_are_the_headers_and_not_those_of_receipt(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sort(poses(bag.path).times), TICKS, atol=2 * NS)
 
 
-def test_without_stamps_times_of_receipt_are_taken_and_said(tmp_path: Path) -> None:
+def test_missing_stamps_and_those_of_another_clock_are_said(tmp_path: Path) -> None:
     with BagWriter(tmp_path, "recording.bag", late=0.0) as bag:
         write_images(bag)
         for time in TICKS:
+            bag.late = 0.0
             bag.pose(ARM, time, place(time), turn(time), stamp=None if time > 0.5 else -1)
             bag.pose("/none", time, place(time), turn(time), stamp=-1)
+            bag.late = 37.2
+            bag.pose("/late", time, place(time), turn(time))
     log = poses(bag.path)
     np.testing.assert_allclose(log.times, TICKS, atol=2 * NS)
     assert log.notes == (f"recording.bag: {ARM}: 21 headers have no time; those of receipt are taken",)
     assert "its headers have no times" in poses(bag.path, "/none").notes[0]
-
-
-def test_stamps_of_another_clock_are_noted(tmp_path: Path) -> None:
-    with BagWriter(tmp_path, "recording.bag", late=37.2) as bag:
-        write_arm(bag)
-    assert "37.20 s before those of receipt" in poses(bag.path).notes[0]
+    assert "37.20 s before those of receipt" in poses(bag.path, "/late").notes[0]
 
 
 def test_transforms_are_poses(tmp_path: Path, kind: str) -> None:
@@ -265,19 +255,6 @@ def test_joints_without_names_are_numbered_or_the_dvrks(tmp_path: Path) -> None:
 # --- images and lenses
 
 
-def mosaic(encoding: str) -> np.ndarray:
-    """A bayer mosaic of one colour: red 200, green 120, blue 40."""
-    values = {"r": 200, "g": 120, "b": 40}
-    tile = np.array([values[letter] for letter in encoding[6:10]], np.uint8).reshape(2, 2)
-    return np.tile(tile, (SIZE[1] // 2, SIZE[0] // 2))
-
-
-def packed_yuv(encoding: str) -> np.ndarray:
-    """uint8 [H, W, 2] of one colour: Y 120, U 90, V 160."""
-    pair = [120, 90, 120, 160] if encoding in ("yuv422_yuy2", "yuyv") else [90, 120, 160, 120]
-    return np.tile(np.array(pair, np.uint8), (SIZE[1], SIZE[0] // 2)).reshape(SIZE[1], SIZE[0], 2)
-
-
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "mono8", "8UC1"])
 @pytest.mark.parametrize("padding", [0, 7])
 def test_every_plain_encoding_gives_the_image(tmp_path: Path, encoding: str, padding: int) -> None:
@@ -295,22 +272,27 @@ def test_every_plain_encoding_gives_the_image(tmp_path: Path, encoding: str, pad
 
 @pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
 def test_bayer_mosaics_give_their_colours(tmp_path: Path, encoding: str) -> None:
-    with BagWriter(tmp_path, "recording.bag") as bag:
-        for number in range(3):
-            bag.image(LEFT, number / 25, mosaic(encoding), encoding)
-    _, pixels = next(images(bag.path).read([1]))
-    np.testing.assert_array_equal(pixels, np.broadcast_to([200, 120, 40], pixels.shape))
+    values = {"r": 200, "g": 120, "b": 40}
+    tile = np.array([values[letter] for letter in encoding[6:10]], np.uint8).reshape(2, 2)
+    shown = of_one_colour(tmp_path, np.tile(tile, (SIZE[1] // 2, SIZE[0] // 2)), encoding)
+    np.testing.assert_array_equal(shown, np.broadcast_to([200, 120, 40], shown.shape))
 
 
 @pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuv422_yuy2", "yuyv"])
 def test_both_orders_of_yuv_give_their_colours(tmp_path: Path, encoding: str) -> None:
-    with BagWriter(tmp_path, "recording.bag") as bag:
-        for number in range(3):
-            bag.image(LEFT, number / 25, packed_yuv(encoding), encoding)
-    _, pixels = next(images(bag.path).read([2]))
+    pair = [120, 90, 120, 160] if "yuy" in encoding else [90, 120, 160, 120]  # Y 120, U 90, V 160
+    pixels = np.tile(np.array(pair, np.uint8), (SIZE[1], SIZE[0] // 2)).reshape(SIZE[1], SIZE[0], 2)
     luma = 1.164 * (120 - 16)  # BT.601, of values from 16 to 235
     rgb = [luma + 1.596 * 32, luma - 0.813 * 32 + 0.391 * 38, luma - 2.018 * 38]
-    np.testing.assert_allclose(pixels[4, 5], rgb, atol=1.5)
+    np.testing.assert_allclose(of_one_colour(tmp_path, pixels, encoding)[4, 5], rgb, atol=1.5)
+
+
+def of_one_colour(folder: Path, pixels: np.ndarray, encoding: str) -> np.ndarray:
+    """An image of a bag of three such ones."""
+    with BagWriter(folder, "recording.bag") as bag:
+        for number in range(3):
+            bag.image(LEFT, number / 25, pixels, encoding)
+    return next(images(bag.path).read([1]))[1]
 
 
 def test_packed_images_are_decoded(tmp_path: Path, kind: str) -> None:
@@ -368,20 +350,18 @@ def test_the_lens_is_the_cameras_beside_the_images(tmp_path: Path, kind: str) ->
             bag.compressed(f"{LEFT}/compressed", time, picture(0))
             bag.camera_info("/stereo/left/camera_info", time, SIZE, FOCAL, [0.1, -0.2, 0.003, 0.004, 0.05])
             bag.camera_info("/fresh/camera_info", time, SIZE, (0.0, 0.0, 12.0, 8.0))
-    known = format_of(bag.path)
-    assert known is not None
     for topic in ("image_raw", "image_raw/compressed"):
-        lens = known.lens(bag.path, f"/stereo/left/{topic}")
+        lens = known(bag.path).lens(bag.path, f"/stereo/left/{topic}")
         assert lens is not None
         assert lens.intrinsics == FOCAL
         assert lens.distortion == (0.1, -0.2, 0.003, 0.004, 0.05)
         assert lens.size == SIZE
-    straight = known.lens(bag.path, "/stereo/left/image_rect_color")
+    straight = known(bag.path).lens(bag.path, "/stereo/left/image_rect_color")
     assert straight is not None
     assert straight.intrinsics == pytest.approx((27.0, 27.9, 12.5, 8.0))
     assert not straight.distorted
-    assert known.lens(bag.path, "/other/image_raw") is None
-    assert known.lens(bag.path, "/fresh/image_raw") is None  # never calibrated
+    assert known(bag.path).lens(bag.path, "/other/image_raw") is None
+    assert known(bag.path).lens(bag.path, "/fresh/image_raw") is None  # never calibrated
 
 
 def write_stereo(folder: Path, kind: str = "recording.bag", baseline: float = 0.0055) -> Path:
@@ -404,12 +384,10 @@ def test_the_right_cameras_camera_info_gives_its_pose_to_the_left_one(
     tmp_path: Path, kind: str, rectified: bool
 ) -> None:
     path, name = write_stereo(tmp_path, kind), "image_rect_color" if rectified else "image_raw"
-    known = format_of(path)
-    assert known is not None
-    found = known.stereo(path, f"/stereo/left/{name}", f"/stereo/right/{name}")
+    found = known(path).stereo(path, f"/stereo/left/{name}", f"/stereo/right/{name}")
     assert found is not None
     left, right, right_from_left = found
-    assert left == known.lens(path, f"/stereo/left/{name}")
+    assert left == known(path).lens(path, f"/stereo/left/{name}")
     assert right.intrinsics == pytest.approx((0.9 * 30.011, 27.9, 12.5, 8.0) if rectified else (30.011, *FOCAL[1:]))
     # a point of the left camera's frame has the same x and depth in both rectified frames, but for the baseline
     of_left, of_right = (
@@ -423,10 +401,8 @@ def test_the_right_cameras_camera_info_gives_its_pose_to_the_left_one(
 
 def test_another_recordings_bag_gives_its_only_pair_of_cameras(tmp_path: Path) -> None:
     path = write_stereo(tmp_path)
-    known = format_of(path)
-    assert known is not None
-    of_these = known.stereo(path, "/stereo/left/image_raw", "/stereo/right/image_raw")
-    of_others = known.stereo(path, "/endoscope/l/image_raw", "/endoscope/r/image_raw")
+    of_these = known(path).stereo(path, "/stereo/left/image_raw", "/stereo/right/image_raw")
+    of_others = known(path).stereo(path, "/endoscope/l/image_raw", "/endoscope/r/image_raw")
     assert of_these is not None
     assert of_others is not None
     np.testing.assert_array_equal(of_these[2], of_others[2])
@@ -444,23 +420,32 @@ def test_a_calibration_of_no_stereo_scope_is_refused(
     tmp_path: Path, baseline: float, left: str, right: str, words: str
 ) -> None:
     path = write_stereo(tmp_path, baseline=baseline)
-    known = format_of(path)
-    assert known is not None
     with pytest.raises(NeecoError) as caught:
-        known.stereo(path, f"/stereo/{left}/image_raw", f"/stereo/{right}/image_raw")
+        known(path).stereo(path, f"/stereo/{left}/image_raw", f"/stereo/{right}/image_raw")
     assert words in str(caught.value)
 
 
 def test_a_bag_without_the_right_cameras_camera_info_says_what_to_give(tmp_path: Path) -> None:
     path = whole(tmp_path)
-    known = format_of(path)
-    assert known is not None
-    with pytest.raises(NeecoError, match="holds no /stereo/right/camera_info; give a calibration of both cameras"):
-        known.stereo(path, LEFT, "/stereo/right/image_raw")
+    assert "holds no /stereo/right/camera_info; give a calibration of both cameras" in refusal(
+        lambda: known(path).stereo(path, LEFT, "/stereo/right/image_raw")
+    )
 
 
-def mcap_of(tmp_path, change):
-    """An MCAP file of poses with other bytes."""
+def without_profile(content: bytearray) -> None:
+    length = int.from_bytes(content[9:17], "little")
+    content[17 : 17 + length] = bytes(4) + (length - 8).to_bytes(4, "little") + b"-" * (length - 8)
+
+
+def of_other_encoding(content: bytearray) -> None:
+    content[:] = content.replace(b"\3\0\0\0cdr", b"\3\0\0\0own").replace(b"ros2msg", b"foreign")
+    content[:] = content.replace(b"Header header", b"\xc9eader header")  # a schema that is no text
+
+
+@pytest.mark.parametrize("change", [without_profile, of_other_encoding])
+def test_an_mcap_file_need_not_name_a_profile_and_other_messages_are_called_what_they_are(
+    tmp_path: Path, change: Callable[[bytearray], None]
+) -> None:
     with BagWriter(tmp_path, "recording-mcap") as bag:
         for index in range(5):
             bag.pose("/psm1", index / 25, (0.01 * index, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0), "PSM1_base")
@@ -468,26 +453,9 @@ def mcap_of(tmp_path, change):
     change(content)
     path = tmp_path / "other.mcap"
     path.write_bytes(content)
-    return path
-
-
-def without_profile(content):
-    length = int.from_bytes(content[9:17], "little")
-    content[17 : 17 + length] = bytes(4) + (length - 8).to_bytes(4, "little") + b"-" * (length - 8)
-
-
-def of_other_encoding(content):
-    content[:] = content.replace(b"\3\0\0\0cdr", b"\3\0\0\0own").replace(b"ros2msg", b"foreign")
-    content[:] = content.replace(b"Header header", b"\xc9eader header")  # a schema that is no text
-
-
-def test_an_mcap_file_need_not_name_a_profile(tmp_path):
-    path = mcap_of(tmp_path, without_profile)
-    (stream,) = format_of(path).streams(path)
-    assert (stream.name, stream.kind, stream.count) == ("/psm1", POSES, 5)
-
-
-def test_an_mcap_file_of_other_messages_is_called_what_it_is(tmp_path):
-    path = mcap_of(tmp_path, of_other_encoding)
-    with pytest.raises(NeecoError, match=r"/psm1 \(geometry_msgs/PoseStamped\) is written as own, not as cdr"):
-        format_of(path).streams(path)
+    if change is without_profile:
+        (stream,) = known(path).streams(path)
+        assert (stream.name, stream.kind, stream.count) == ("/psm1", POSES, 5)
+    else:
+        said = refusal(lambda: known(path).streams(path))
+        assert "/psm1 (geometry_msgs/PoseStamped) is written as own, not as cdr" in said

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bz2
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +21,14 @@ from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.ingest.cameras.still_scene import read_right_camera
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.readers import format_of, read_table
+from neeco.ingest.readers import RecordingFormat, _bagfile, format_of, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.readers.rosbag import RosBag
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 from neeco.ingest.request import IngestRequest
-from neeco.ingest.sources import recordings_of
+from neeco.ingest.sources import sources_of
 from neeco.ingest.timing.reading import read_episodes
 
 SIZE = (64, 48)  # px
@@ -78,6 +79,20 @@ def refusal(action: Callable[[], object]) -> str:
 
 def read_arm(path: Path) -> object:
     return read_pose_log(PoseColumns(path, stream="/dvrk/PSM1/measured_cp"))
+
+
+def known(path: Path) -> RecordingFormat:
+    found = format_of(path)
+    assert found is not None
+    return found
+
+
+def write_tool(bag: BagWriter, topics: Sequence[str] = ("/tool/pose",), frame: str = "tracker") -> None:
+    """Poses of a tool on each topic and images of a camera, 40 at 25 a second."""
+    for time in np.arange(40) / 25:
+        for number, topic in enumerate(topics, 1):
+            bag.pose(topic, time, number * shaft(time), [1, 0, 0, 0], frame)
+        bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
 
 
 @pytest.fixture(scope="module")
@@ -153,11 +168,9 @@ def test_a_laparoscope_in_another_base_than_the_arms_is_not_taken_for_registrati
 
 def test_bags_of_other_robots_offer_what_was_measured(tmp_path: Path) -> None:
     with BagWriter(tmp_path, "recording-mcap") as bag:
+        write_tool(bag, ["/tool/left/pose", "/tool/right/pose", "/tool/left/pose_goal"])
         for time in np.arange(40) / 25:
-            for topic in ("/tool/left/pose", "/tool/right/pose", "/tool/left/pose_goal"):
-                bag.pose(topic, time, shaft(time), [1, 0, 0, 0], "tracker")
             bag.joints("/tool/right/joint_states", time, grip=time)
-            bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
     document = yaml.safe_load(write_template(bag.path))
     assert [item["name"] for item in document["instruments"]] == ["tool_left", "tool_right"]
     assert list(document["instruments"][1]["joints"]) == ["grip"]
@@ -165,11 +178,9 @@ def test_bags_of_other_robots_offer_what_was_measured(tmp_path: Path) -> None:
 
 
 def test_a_folder_with_a_bag_and_other_files_is_looked_through(tmp_path: Path) -> None:
-    for scale, kind in enumerate(("first.bag", "second-db3"), 1):
+    for number, kind in enumerate(("first.bag", "second-db3"), 1):
         with BagWriter(tmp_path, kind) as bag:
-            for time in np.arange(40) / 25:
-                bag.pose(f"/tool{scale}/pose", time, scale * scale * shaft(time), [1, 0, 0, 0], "tracker")
-                bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
+            write_tool(bag, [f"/tool{number}/pose"])
     (tmp_path / "notes.csv").write_text("t_s,x_mm\n1,2\n")
     document = yaml.safe_load(write_template(tmp_path))
     assert {item["poses"]["file"] for item in document["instruments"]} == {"first.bag", "second-db3"}
@@ -177,10 +188,8 @@ def test_a_folder_with_a_bag_and_other_files_is_looked_through(tmp_path: Path) -
 
 def test_a_bag_alone_is_enough_where_it_holds_one_of_each(tmp_path: Path) -> None:
     with BagWriter(tmp_path, "recording-db3") as bag:
-        for time in np.arange(40) / 25:
-            bag.pose("/tool/pose", time, shaft(time), [1, 0, 0, 0], "tracker")
-            bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
-    (recording,) = recordings_of(IngestRequest(video=bag.path, instrument=bag.path))
+        write_tool(bag)
+    (recording,) = sources_of(IngestRequest(video=bag.path, instrument=bag.path), Path("out"))[1]
     data = read_episodes([recording])
     states, usable = data.with_assumed_clocks().states_at(data.times)
     assert usable.all()
@@ -191,11 +200,10 @@ def test_names_in_a_bag_are_names_and_no_more(tmp_path: Path) -> None:
     """Neither keys of a recording.yaml nor what a terminal obeys."""
     bad = "ECM\nsettings: {sfm_features: 1}\x1b[2J"
     with BagWriter(tmp_path, "recording.bag") as bag:
+        write_tool(bag, frame=bad)
         for time in np.arange(40) / 25:
-            bag.pose("/tool/pose", time, shaft(time), [1, 0, 0, 0], bad)
             bag.tf(time, shaft(time), [1, 0, 0, 0], bad, f"child{bad}")
             bag.joints("/tool/joint_states", time, **{f"jaw{bad}": time})
-            bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
     text = write_template(bag.path)
     assert "settings" not in yaml.safe_load(text)
     said = refusal(lambda: read_table(bag.path, "tf:nothing"))
@@ -251,17 +259,15 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, name: str, content: bytes) ->
 
 def test_topics_that_are_not_there_or_not_of_the_kind_are_named(bags: dict[str, Path]) -> None:
     path = bags["recording.bag"]
-    images = format_of(path)
-    assert images is not None
     poses = "name one of /dvrk/PSM1/measured_cp, tf:table, /dvrk/PSM1/jaw/measured_js"
     assert f"stream: holds no '/PSM1/measured_cp'; {poses}" in refusal(lambda: read_table(path, "/PSM1/measured_cp"))
     message = f"'{RIGHT}' is sensor_msgs/Image (bgr8, 8x8), not poses or readings; {poses}"
     assert message in refusal(lambda: read_table(path, RIGHT))
     assert f"holds 2 streams of images; name one as `stream` in the recording: /left/compressed, {RIGHT}" in refusal(
-        lambda: images.open_images(path)
+        lambda: known(path).open_images(path)
     )
     assert "'tf:table' is tf2_msgs/TFMessage in world, not images" in refusal(
-        lambda: images.open_images(path, "tf:table")
+        lambda: known(path).open_images(path, "tf:table")
     )
 
 
@@ -270,9 +276,7 @@ def test_encodings_that_are_not_read_are_named(tmp_path: Path, encoding: str) ->
     with BagWriter(tmp_path, "recording.bag") as bag:
         for time in range(3):
             bag.image(LEFT, float(time), np.zeros((8, 8, 2), np.uint8), encoding)
-    known = format_of(bag.path)
-    assert known is not None
-    message = refusal(lambda: known.open_images(bag.path, LEFT))
+    message = refusal(lambda: known(bag.path).open_images(bag.path, LEFT))
     assert f"{bag.path}: {LEFT}: 0 of 3 images can be used: 3 are not: one is in encoding '{encoding}'" in message
     why = f"no images that can be read: {LEFT}: none of 3 messages can be used: one is in encoding '{encoding}'"
     assert why in refusal(lambda: write_template(bag.path))
@@ -283,10 +287,8 @@ def test_images_of_two_sizes_and_lenses_of_a_part_are_refused(tmp_path: Path) ->
         for number in range(4):
             bag.image(LEFT, number / 25, np.zeros((8, 8 + 8 * (number > 1), 3), np.uint8), "rgb8")
         bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, FOCAL, binning=2)
-    known = format_of(bag.path)
-    assert known is not None
-    assert "changes from 8x8 to 16x8 pixels midway" in refusal(lambda: known.open_images(bag.path))
-    assert "camera_info: states binning" in refusal(lambda: known.lens(bag.path, LEFT))
+    assert "changes from 8x8 to 16x8 pixels midway" in refusal(lambda: known(bag.path).open_images(bag.path))
+    assert "camera_info: states binning" in refusal(lambda: known(bag.path).lens(bag.path, LEFT))
 
 
 def test_a_type_that_is_defined_otherwise_is_not_read(tmp_path: Path, bags: dict[str, Path]) -> None:
@@ -314,29 +316,23 @@ def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Pat
     assert "its files are packed as a whole; unpack one with `zstd -d`" in refusal(lambda: read_arm(path))
 
 
-def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path) -> None:
     """The limit is lowered: a bomb of its real size would take seconds to make."""
-    from neeco.ingest.readers import _bagfile
-
-    monkeypatch.setattr(_bagfile, "MAX_CHUNK_BYTES", 60_000)
+    narrow = RosBag()
+    narrow.limits = _bagfile.BagLimits(chunk_bytes=60_000)
     for kind, packed in (("a.bag", "bz2"), ("b.bag", "lz4"), ("c.bag", None), ("d-mcap", "zstd"), ("e-db3", "zstd")):
         with BagWriter(tmp_path, kind, packed=packed) as bag:
             for time in range(4):
                 bag.pose("/dvrk/PSM1/measured_cp", float(time), [0, 0, 0], [1, 0, 0, 0])
                 bag.image(LEFT, float(time), np.zeros((200, 200, 3), np.uint8), "rgb8")
-        known = format_of(bag.path)
-        assert known is not None
-        assert "a chunk of its messages" in refusal(lambda known=known, bag=bag: known.open_images(bag.path))
+        assert "a chunk of its messages" in refusal(lambda bag=bag: narrow.open_images(bag.path))
 
 
-def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
-    from neeco.ingest.readers import _bagfile
-
-    monkeypatch.setattr(_bagfile, "MAX_CHUNK_BYTES", 1000)
-    assert _bagfile.unpack(bz2.compress(bytes(1000)), "bz2") == bytes(1000)
+def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further() -> None:
+    assert _bagfile.unpack(bz2.compress(bytes(1000)), "bz2", 1000) == bytes(1000)
     for data in (bz2.compress(bytes(1001)), bz2.compress(bytes(900))[:-5], b"BZh"):
         with pytest.raises((OSError, _bagfile.ReaderError)):
-            _bagfile.unpack(data, "bz2")
+            _bagfile.unpack(data, "bz2", 1000)
 
 
 def test_definitions_in_a_bag_are_never_executed(tmp_path: Path, bags: dict[str, Path]) -> None:
@@ -357,15 +353,14 @@ def test_whatever_happens_to_its_bytes_a_bag_is_read_or_refused_in_one_line(
     tmp_path: Path, bags: dict[str, Path], kind: str
 ) -> None:
     path = _copy(bags[kind], tmp_path)
-    known = format_of(path)
-    assert known is not None
+    bag = known(path)
     reads: list[Callable[[], object]] = [
         lambda: write_template(path),
         lambda: read_arm(path),
         lambda: read_reading_log(JointColumns(path, "video", stream="/dvrk/PSM1/jaw/measured_js")),
-        lambda: list(known.open_images(path, RIGHT).read(range(2))),
-        lambda: list(known.open_images(path, "/left/compressed").read(range(2))),
-        lambda: known.lens(path, "/left/compressed"),
+        lambda: list(bag.open_images(path, RIGHT).read(range(2))),
+        lambda: list(bag.open_images(path, "/left/compressed").read(range(2))),
+        lambda: bag.lens(path, "/left/compressed"),
     ]
     refusals([path] if path.is_file() else sorted(path.iterdir()), reads, CASES)
 

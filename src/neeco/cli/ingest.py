@@ -7,7 +7,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from neeco.base.errors import NeecoError, visible
+from neeco.base.errors import visible
 from neeco.cli._output import JsonTarget, whole_lines
 from neeco.ingest.request import IngestRequest
 
@@ -33,31 +33,21 @@ def run(args: Ingest) -> int:
     from neeco.cli._output import ready_for_json, write_numbers
     from neeco.cli._progress import Bars
     from neeco.ingest.convert import convert_folder
-    from neeco.ingest.sources import folder_to_convert, recordings_of, write_draft
+    from neeco.ingest.sources import sources_of, write_draft
     from neeco.report.ingest_page import ingest_and_report
 
     if args.formats:
-        args.refuse_others("--formats", "formats")
         return _list_formats()
     if args.init:
-        args.refuse_others("--init", "init")
-        if len(args.source) > 1:
-            raise NeecoError("--init: looks at one folder or file; give one")
-        print(*write_draft(args.source[0] if args.source else Path(), print), sep="\n")
+        print(*write_draft(args.source, print), sep="\n")
         return 0
-    if not args.source and args.video is None:
-        raise NeecoError("ingest: no source; give recording.yaml (`neeco ingest --init` drafts it) or --video FILE")
-    folder = folder_to_convert(args.source)
-    if args.output is None:
-        raise NeecoError("--output: give the folder of the capture to write")
-    output = Path(os.path.normpath(args.output))  # a/../b is b, whatever a is
+    folder, recordings = sources_of(args, args.output)
+    output = Path(os.path.normpath(args.output or ""))  # a/../b is b, whatever a is
     if folder is not None:
-        args.refuse_others(f"{folder}: a folder in another format", "output")
         for sentence in convert_folder(folder, output):
             print(f"note: {visible(sentence)}")
         print(f"capture: {output}  (next: neeco check {shlex.quote(str(output))})")
         return 0
-    recordings = recordings_of(args)
     with ready_for_json(args.json):
         with Bars() as bars:
             try:

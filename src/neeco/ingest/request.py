@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from neeco.base.errors import NeecoError
 from neeco.base.settings import Place, faults_in, read
 
 
@@ -52,9 +51,8 @@ class IngestRequest:
             request: IngestRequest = read(cls, Place(values), "ingest")
             return request
 
-    def refuse_others(self, what: str, *keep: str) -> None:
-        """Raise NeecoError where an option is given that `what` would ignore."""
-        for option in fields(self):
-            if option.name not in ("source", *keep) and getattr(self, option.name) != option.default:
-                name = option.name.replace("_", "-")
-                raise NeecoError(f"{what}, and --{name} would be ignored with it; leave one of them out")
+    @property
+    def options(self) -> list[str]:
+        """The options that state a recording and are given, as the command line spells them."""
+        given = (item.name for item in fields(IngestRequest) if getattr(self, item.name) != item.default)
+        return [f"--{name.replace('_', '-')}" for name in given if name != "source"]

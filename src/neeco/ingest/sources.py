@@ -33,9 +33,13 @@ _OPTIONS = {
 }  # by the beginning of a field of recording.yaml
 
 
-def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
-    """Write a recording.yaml for what lies at `source`, into the folder or next to the file, and return lines on it;
-    `report` is called with what is left out. Raises NeecoError where there is one, and where there are no images."""
+def write_draft(sources: Sequence[Path], report: Callable[[str], None]) -> list[str]:
+    """Write a recording.yaml for what lies at the one source (none: here), into the folder or next to the file, and
+    return lines on it; `report` is called with what is left out. Raises NeecoError where there is one, and where there
+    are no images."""
+    if len(sources) > 1:
+        raise NeecoError("--init: looks at one folder or file; give one")
+    source = sources[0] if sources else Path()
     path = (source.parent if source.is_file() or format_of(source) is not None else source) / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
@@ -46,7 +50,29 @@ def write_draft(source: Path, report: Callable[[str], None]) -> list[str]:
     return [*lines, f"wrote {path}: look through it, then: neeco ingest {path} --output CAPTURE"]
 
 
-def folder_to_convert(sources: Sequence[Path]) -> Path | None:
+def sources_of(request: IngestRequest, output: Path | None) -> tuple[Path | None, list[Recording]]:
+    """Return the folder in another format that a request names, to be converted; else the recordings that it states: by
+    files, or by its other options, whose columns are recognised from the headers. Raises NeecoError naming the file or
+    the option, and where there is no output."""
+    folder = _folder_to_convert(request.source)
+    if not request.source and request.video is None:
+        raise NeecoError("--video: give the video (or a folder of images), or a recording.yaml")
+    if output is None:
+        raise NeecoError("--output: give the folder of the capture to write")
+    ignored = [option for option in request.options if folder is not None or option != "--frames"]
+    if request.source and ignored:
+        raise NeecoError(f"{request.source[0]}: {ignored[0]} would be ignored with it; leave one of them out")
+    if request.frames is not None and request.frames < MIN_FRAMES:
+        raise NeecoError(f"--frames: {request.frames} is too few; give {MIN_FRAMES} or more")
+    if folder is not None:
+        return folder, []
+    if request.video is not None:
+        return None, [_recording_of_options(request, request.video)]
+    recordings = [read_recording(source) for source in request.source]
+    return None, [item if request.frames is None else replace(item, frames=request.frames) for item in recordings]
+
+
+def _folder_to_convert(sources: Sequence[Path]) -> Path | None:
     """Return the folder that holds cameras in another format; None where the sources are files of recordings. Raises
     NeecoError for what is neither."""
     for source in sources:
@@ -66,17 +92,7 @@ def folder_to_convert(sources: Sequence[Path]) -> Path | None:
     return None
 
 
-def recordings_of(request: IngestRequest) -> list[Recording]:
-    """Return the recordings that a request states: by files, or by its other options, whose columns are recognised from
-    the headers. Raises NeecoError naming the file or the option."""
-    if request.frames is not None and request.frames < MIN_FRAMES:
-        raise NeecoError(f"--frames: {request.frames} is too few; give {MIN_FRAMES} or more")
-    if request.source:
-        request.refuse_others(f"{request.source[0]}: states what was recorded", "output", "frames", "json", "strict")
-        recordings = [read_recording(source) for source in request.source]
-        return [item if request.frames is None else replace(item, frames=request.frames) for item in recordings]
-    if request.video is None:
-        raise NeecoError("--video: give the video (or a folder of images), or a recording.yaml")
+def _recording_of_options(request: IngestRequest, video: Path) -> Recording:
     if request.intrinsics is not None and request.calibration is not None:
         raise NeecoError("--calibration: given together with --intrinsics; give one of them")
     shaft, joints = request.shaft_diameter, request.joint
@@ -89,14 +105,14 @@ def recordings_of(request: IngestRequest) -> list[Recording]:
         timed = [recognise_time(read_table(file).header).time for file in (log, table) if file and file.exists()]
         if timed and timed[0] is None and timed[-1] is not None:
             raise NeecoError(f"--joint {joint}: {log} has no times, {table} has; give the log first, its table second")
-    is_folder = request.video.is_dir() and format_of(request.video) is None
+    is_folder = video.is_dir() and format_of(video) is None
     tool = {
         "name": "instrument",
         "poses": _plain(request.instrument),
         "joints": {joint: {"file": _plain(log), "calibration": _plain(table)} for joint, log, table in joints},
         "from_video": None if shaft is None else {"shaft_diameter_mm": shaft},
     }
-    images = {"folder" if is_folder else "file": str(request.video), "fps": request.fps}
+    images = {"folder" if is_folder else "file": str(video), "fps": request.fps}
     document = {
         "images" if is_folder else "video": images,
         "intrinsics": _plain(request.calibration or request.intrinsics),
@@ -106,7 +122,7 @@ def recordings_of(request: IngestRequest) -> list[Recording]:
         "frames": request.frames,
     }
     try:
-        return [replace(recording_of(document, Path("this folder")), path=request.video)]
+        return replace(recording_of(document, Path("this folder")), path=video)
     except Fault as fault:
         options = (option for field, option in _OPTIONS.items() if fault.field.startswith(field))
         option = "--calibration" if request.calibration and fault.field == "intrinsics" else next(options, fault.field)

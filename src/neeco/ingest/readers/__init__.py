@@ -60,7 +60,6 @@ class Table:
     rows: np.ndarray
     lines: np.ndarray
     _: KW_ONLY
-    decimal_comma: bool = False
     stream: str | None = None
     record: str = "line"
     stated_in: str | None = None
@@ -278,8 +277,7 @@ def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
     chosen, bad = table.rows[:, [column_index(table, name) for name in columns]], dict[int, str]()
     if chosen.dtype == object:
         cells = chosen.ravel().tolist()
-        texts = [cell.replace(",", ".") for cell in cells] if table.decimal_comma else cells
-        values = [parse_number(text) for text in texts]
+        values = [parse_number(cell) for cell in cells]
         for place in (place for place, value in enumerate(values) if value is None):
             row, slot = divmod(place, len(columns))
             bad.setdefault(row, f"{columns[slot]} is {printable(cells[place], 24)}, not a number")

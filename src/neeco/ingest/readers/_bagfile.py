@@ -12,9 +12,9 @@ import re
 import sys
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cache, lru_cache, partial
 from io import BytesIO
 from pathlib import Path
@@ -46,50 +46,47 @@ else:
     from backports import zstd
 
 MCAP_HEADER_AT, MCAP_SCHEMA = 17, 3  # byte where the header's content begins, and the opcode of schemas
-MAX_NAME_LENGTH = 200
-MIB = 2**20
-MAX_CHUNK_BYTES = 256 * MIB  # unpacked; recorders write some MiB
-MAX_METADATA_BYTES = 16 * MIB
-MAX_JOINTS = 400  # of one topic
-MAX_BODIES = 2000  # of all transforms
 _DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
-MAX_PIXELS = 90_000_000  # of an image, as for files of images
-MAX_SKIPPED = 30  # images that are read and dropped rather than sought over
-MIN_IMAGES = 2
-_REMEDIES = {
-    ".bag": "repair it with `rosbag reindex`, or copy it again",
-    ".mcap": "repair it with `mcap recover`, or copy it again",
-    ".db3": "copy it again",
-    "": "repair it with `ros2 bag reindex`, or copy it again",
-}  # by suffix
+_REMEDIES = {".bag": "`rosbag reindex`", ".mcap": "`mcap recover`", "": "`ros2 bag reindex`"}  # by suffix
 POSE = {"geometry_msgs/PoseStamped", "geometry_msgs/TransformStamped"}
 TRANSFORMS = {"tf2_msgs/TFMessage", "tf/tfMessage"}
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 JOINTS = "sensor_msgs/JointState"
 IMAGE = {"sensor_msgs/Image", "sensor_msgs/CompressedImage"}
 CAMERA_INFO = "sensor_msgs/CameraInfo"
 READ = {*POSE, *TRANSFORMS, JOINTS, *IMAGE, CAMERA_INFO}
 # encoding -> bytes a pixel, OpenCV's conversion to RGB (None: it is RGB)
 ENCODINGS: dict[str, tuple[int, int | None]] = {
-    "rgb8": (3, None),
-    "bgr8": (3, cv2.COLOR_BGR2RGB),
-    "rgba8": (4, cv2.COLOR_RGBA2RGB),
-    "bgra8": (4, cv2.COLOR_BGRA2RGB),
-    "mono8": (1, cv2.COLOR_GRAY2RGB),
-    "8UC1": (1, cv2.COLOR_GRAY2RGB),
-    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
-    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
-    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
-    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
-    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
-    "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
-    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
-    "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
-}
+    "rgb8": (3, None), "bgr8": (3, cv2.COLOR_BGR2RGB), "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB), "mono8": (1, cv2.COLOR_GRAY2RGB), "8UC1": (1, cv2.COLOR_GRAY2RGB),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB), "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB), "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY), "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2), "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class BagLimits:
+    """Limits on what is read of a bag."""
+
+    chunk_bytes: int = 256 << 20  # unpacked; recorders write some MiB
+    metadata_bytes: int = 16 << 20
+    joints: int = 400  # of one topic
+    bodies: int = 2000  # of all transforms
+    pixels: int = 90_000_000  # of an image, as for files of images
+    min_images: int = 2
+    skipped_images: int = 30  # that are read and dropped rather than sought over
+    other_clock_s: float = 1.0  # between stamps and receipt: they are of different clocks
+
+
+class _UnusableError(Exception):
+    """A message that cannot be used, and the reason."""
 
 
 def plain(name: str) -> str:
     """Return a name from a bag without the characters that control a terminal or a recording.yaml."""
-    return "".join(letter if letter.isprintable() else "?" for letter in name[:MAX_NAME_LENGTH])
+    return "".join(letter if letter.isprintable() else "?" for letter in name[:200])
 
 
 class _AnyMcap(io.BufferedReader):
@@ -140,8 +137,13 @@ class Bag:
     """An open bag: a reader of all of it, and one of each of its files."""
 
     path: Path
+    limits: BagLimits
     reader: Any
     sources: list[Any]
+
+    @property
+    def is_ros1(self) -> bool:
+        return isinstance(self.reader, Ros1Reader)
 
     def messages(
         self, topics: Collection[str], start: int | None = None, stop: int | None = None
@@ -149,16 +151,15 @@ class Bag:
         """Yield (topic, time of receipt in ns since 1970, message or None where it is damaged) of the given topics,
         received in [start, stop). The order of two messages does not depend on what else is asked for.
         Raises NeecoError."""
-        ros1 = isinstance(self.reader, Ros1Reader)
-        deserialize = _store(ros1).deserialize_ros1 if ros1 else _store(ros1).deserialize_cdr
-        packed = not ros1 and self.reader.metadata.compression_mode == "message"
+        deserialize = _store(True).deserialize_ros1 if self.is_ros1 else _store(False).deserialize_cdr
+        packed = not self.is_ros1 and self.reader.metadata.compression_mode == "message"
         with _damage_named(self.path):
             for source in self.sources:
                 wanted = [connection for connection in source.connections if connection.topic in topics]
                 for connection, received, data in source.messages(wanted, start, stop) if wanted else ():
                     if not 0 <= received < 2**63:
                         raise ReaderError("a message has an invalid time of receipt")
-                    data = unpack(data, "zstd" if packed else "none")
+                    data = unpack(data, "zstd" if packed else "none", self.limits.chunk_bytes)
                     try:
                         message = deserialize(data, connection.msgtype)
                     except Exception:  # rosbags raises nearly anything of damaged ones; a message hides no other
@@ -167,54 +168,53 @@ class Bag:
 
     def problem(self, connection: Any) -> str | None:
         """Return why a topic cannot be read."""
-        kind, ros1 = connection.msgtype, isinstance(self.reader, Ros1Reader)
-        encoding, store = "cdr" if ros1 else connection.ext.serialization_format, _store(ros1)
+        kind, store = connection.msgtype, _store(self.is_ros1)
+        encoding = "cdr" if self.is_ros1 else connection.ext.serialization_format
         if encoding != "cdr" and (kind in store.fielddefs or isinstance(self.reader, McapReader)):
             return f"is written as {plain(encoding) or 'nothing named'}, not as cdr"
         if kind in store.fielddefs and connection.digest not in ("", "*"):
-            digest = store.generate_msgdef(kind)[1] if ros1 else store.hash_rihs01(kind)
+            digest = store.generate_msgdef(kind)[1] if self.is_ros1 else store.hash_rihs01(kind)
             if connection.digest != digest:
                 return f"defines {kind.replace('/msg/', '/')} otherwise than ROS"
         return None if plain(connection.topic) == connection.topic else "has an unprintable name"
 
 
 @contextmanager
-def open_bag(path: Path) -> Iterator[Bag]:
+def open_bag(path: Path, limits: BagLimits) -> Iterator[Bag]:
     """Open a bag for the block: a ROS 1 `.bag`, a ROS 2 folder, or one `.mcap` or `.db3` of it. Raises NeecoError when
     it cannot be read, as `Bag.messages` does."""
     for file in visible_entries(path) if path.is_dir() else [path]:
         require_content(file)
-    metadata = path / "metadata.yaml"
-    if metadata.is_file() and metadata.stat().st_size > MAX_METADATA_BYTES:
-        size = f"{metadata}: has over {MAX_METADATA_BYTES // MIB} MiB"
-        raise NeecoError(f"{size}; write it anew with `ros2 bag reindex`")
+    suffix, metadata = "" if path.is_dir() else path.suffix.lower(), path / "metadata.yaml"
+    if metadata.is_file() and metadata.stat().st_size > limits.metadata_bytes:
+        raise NeecoError(f"{metadata}: is too large; write it anew with `ros2 bag reindex`")
     if path.is_dir() and re.search(rb"compression_mode: [\"']?file", read_head(metadata, 1 << 20), re.I):
         raise NeecoError(f"{path}: its files are packed as a whole; unpack one with `zstd -d` and give that")
     kinds = {"": DirectoryReader, ".bag": Ros1Reader, ".mcap": _McapReader, ".db3": Sqlite3Reader}
     with ExitStack() as stack:
         with _damage_named(path):
-            reader: Any = kinds["" if path.is_dir() else path.suffix.lower()](path)
+            reader: Any = kinds[suffix](path)
             reader.open()
             stack.callback(reader.close)
             sources = reader.storages if path.is_dir() else [reader]
             for source in sources:
-                _limit_chunks(source)
-        yield Bag(path, reader, sources)
+                _limit_chunks(source, limits.chunk_bytes)
+        yield Bag(path, limits, reader, sources)
 
 
-def unpack(data: bytes, compression: str) -> bytes:
-    """Return the unpacked bytes, at most MAX_CHUNK_BYTES of them. Raises ReaderError."""
+def unpack(data: bytes, compression: str, max_bytes: int) -> bytes:
+    """Return the unpacked bytes, at most so many of them. Raises ReaderError."""
     if compression == "none":
         return data
     machine = _DECOMPRESSORS[compression]()
-    unpacked = machine.decompress(data, max_length=MAX_CHUNK_BYTES + 1)
-    _check_size(len(unpacked))
+    unpacked = machine.decompress(data, max_length=max_bytes + 1)
+    _check_size(len(unpacked), max_bytes)
     if not machine.eof:
         raise ReaderError("a chunk of its messages ends early")
     return unpacked
 
 
-def _limit_chunks(reader: Any) -> None:
+def _limit_chunks(reader: Any, max_bytes: int) -> None:
     """Have an open ROS 1 or MCAP reader refuse chunks that do not fit into memory. Raises ReaderError.
 
     An index states the unpacked size of MCAP's chunks; ROS 1 bags state none, so these are unpacked up to the limit.
@@ -223,18 +223,18 @@ def _limit_chunks(reader: Any) -> None:
         if not reader.chunks and reader.metadata.message_count:
             raise ReaderError("its messages are not in chunks")
         for listed in reader.chunks:
-            _check_size(max(listed.uncompressed_size, listed.compressed_size))
+            _check_size(max(listed.uncompressed_size, listed.compressed_size), max_bytes)
     elif isinstance(reader, Ros1Reader):
         names = {known: name for name, known in decompressors.items()}
         for place, chunk in reader.chunks.items():
-            _check_size(chunk.datasize)
-            limited = partial(unpack, compression=names[chunk.decompressor])
+            _check_size(chunk.datasize, max_bytes)
+            limited = partial(unpack, compression=names[chunk.decompressor], max_bytes=max_bytes)
             reader.chunks[place] = chunk._replace(decompressor=limited)
 
 
-def _check_size(size: int) -> None:
-    if size > MAX_CHUNK_BYTES:
-        raise ReaderError(f"a chunk of its messages has over {MAX_CHUNK_BYTES // MIB} MiB")
+def _check_size(size: int, max_bytes: int) -> None:
+    if size > max_bytes:
+        raise ReaderError(f"a chunk of its messages has over {max_bytes >> 20} MiB")
 
 
 @contextmanager
@@ -246,34 +246,82 @@ def _damage_named(path: Path) -> Iterator[None]:
     # damaged bags make rosbags raise nearly anything: struct.error, KeyError, AssertionError, OverflowError ...
     except Exception as error:
         reason = plain(" ".join(str(error).split())).rstrip(".") or "its records do not fit together"
-        remedy = _REMEDIES["" if path.is_dir() else path.suffix.lower()]
+        repair = _REMEDIES.get("" if path.is_dir() else path.suffix.lower())
+        remedy = f"repair it with {repair}, or copy it again" if repair else "copy it again"
         raise NeecoError(f"{path}: is cut short or damaged, or no bag ({reason}); {remedy}") from error
 
 
 @dataclass
 class Samples:
     """Samples of a stream, one per message. stamps, received: ns; a stamp is 0 where the header has none; frames: as
-    ROS 2 writes them, without a slash; bad: messages that cannot be used, by why."""
+    ROS 2 writes them, without a slash; columns: numbers by name, NaN where a message lacks one; bad: messages that
+    cannot be used, by the reason; static: valid at all times.
+
+    Of images, instead of columns: arrived: ns, of every message; numbers: which message each sample is; sizes: (width,
+    height), and encodings, in the order of their appearance."""
 
     type: str
+    limits: BagLimits
+    static: bool = False
+    _: KW_ONLY
     stamps: array[int] = field(default_factory=lambda: array("q"))
     received: array[int] = field(default_factory=lambda: array("q"))
     frames: set[str] = field(default_factory=set)
+    columns: dict[str, array[float]] = field(default_factory=dict)
     bad: Counter[str] = field(default_factory=Counter)
+    arrived: array[int] = field(default_factory=lambda: array("q"))
+    numbers: array[int] = field(default_factory=lambda: array("q"))
+    sizes: dict[tuple[int, int], None] = field(default_factory=dict)
+    encodings: dict[str, None] = field(default_factory=dict)
 
     def add(self, received: int, message: Any) -> None:
         """Add a message (None: a damaged one)."""
-        problem = "is damaged" if message is None else self.take(message)
-        if problem is not None:
-            self.bad[problem] += 1
+        self.arrived.append(received)
+        try:
+            values = self._values(message)
+        except _UnusableError as error:
+            self.bad[str(error)] += 1
             return
+        count = len(self.stamps)
+        for name, value in values:
+            if name in self.columns or len(self.columns) < self.limits.joints:
+                column = self.columns.setdefault(name, array("d"))
+                column.extend([np.nan] * (count - len(column)))
+                column.extend([value] * (len(column) == count))  # of a joint named twice, the first
+        self.numbers.append(len(self.arrived) - 1)
         self.stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
         self.received.append(received)
         self.frames.add(plain(message.header.frame_id).lstrip("/"))
 
-    def take(self, message: Any) -> str | None:
-        """Take a message's values, or say why it cannot be used."""
-        raise NotImplementedError
+    def _values(self, message: Any) -> Iterable[tuple[str, float]]:
+        """Return numbers by column; of images none. Raises _UnusableError."""
+        if message is None:
+            raise _UnusableError("is damaged")
+        if self.type in IMAGE:
+            raw = hasattr(message, "encoding")
+            encoding, size = _inspect(message) if raw else _inspect_compressed(message)
+            if not 0 < size[0] * size[1] <= self.limits.pixels:
+                raise _UnusableError(f"has {size[0]}x{size[1]} pixels")
+            self.sizes[size] = self.encodings[encoding] = None
+            return ()
+        if self.type == JOINTS:
+            values = message.position.tolist()
+            names = [plain(name) for name in message.name] or [f"joint_{n + 1}" for n in range(len(values))]
+            if len(names) != len(values):
+                raise _UnusableError("is damaged")
+            return zip(names, values, strict=True)
+        if hasattr(message, "pose"):
+            place, turn = message.pose.position, message.pose.orientation
+        else:
+            place, turn = message.transform.translation, message.transform.rotation
+        return zip(POSE_COLUMNS, (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w), strict=True)
+
+    def table(self) -> np.ndarray:
+        """[N, C]"""
+        values = np.full((len(self.stamps), len(self.columns)), np.nan)
+        for index, column in enumerate(self.columns.values()):
+            values[: len(column), index] = column
+        return values
 
     @property
     def problem(self) -> str | None:
@@ -282,113 +330,41 @@ class Samples:
             return None
         return f"none of {self.bad.total()} messages can be used: one {self.bad.most_common(1)[0][0]}"
 
-
-@dataclass
-class Poses(Samples):
-    """Poses of a body. values: x, y, z m and qx, qy, qz, qw of each; static: valid at all times."""
-
-    values: array[float] = field(default_factory=lambda: array("d"))
-    static: bool = False
-
-    def take(self, message: Any) -> None:
-        """Take a PoseStamped or TransformStamped."""
-        if hasattr(message, "pose"):
-            place, turn = message.pose.position, message.pose.orientation
-        else:
-            place, turn = message.transform.translation, message.transform.rotation
-        self.values.extend((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
-
-    def table(self) -> np.ndarray:
-        """[N, 7]"""
-        return np.array(self.values).reshape(-1, 7)
-
-
-@dataclass
-class Joints(Samples):
-    """Readings of joints. columns: values by joint, NaN where a message does not have the joint."""
-
-    columns: dict[str, array[float]] = field(default_factory=dict)
-
-    def take(self, message: Any) -> str | None:
-        """Take a JointState."""
-        positions, count = message.position.tolist(), len(self.stamps)
-        names = [plain(name) for name in message.name] or [f"joint_{n + 1}" for n in range(len(positions))]
-        if len(names) != len(positions):
-            return "is damaged"
-        for name, value in zip(names, positions, strict=True):
-            if name not in self.columns and len(self.columns) >= MAX_JOINTS:
-                continue
-            column = self.columns.setdefault(name, array("d"))
-            column.extend([np.nan] * (count - len(column)))
-            column.extend([value] * (len(column) == count))  # of a joint named twice, the first
-        return None
-
-    def table(self) -> np.ndarray:
-        """[N, J]"""
-        values = np.full((len(self.stamps), len(self.columns)), np.nan)
-        for index, column in enumerate(self.columns.values()):
-            values[: len(column), index] = column
-        return values
-
-
-@dataclass
-class ImageLog(Samples):
-    """The messages of an image topic, all but the pixels. arrived: ns, of every message; numbers: which message each of
-    those in use is; sizes: (width, height), in the order found."""
-
-    arrived: array[int] = field(default_factory=lambda: array("q"))
-    numbers: array[int] = field(default_factory=lambda: array("q"))
-    sizes: dict[tuple[int, int], None] = field(default_factory=dict)
-    encodings: dict[str, None] = field(default_factory=dict)
-
-    def add(self, received: int, message: Any) -> None:
-        self.arrived.append(received)
-        super().add(received, message)
-
-    def take(self, message: Any) -> str | None:
-        """Take an Image or a CompressedImage."""
-        raw = hasattr(message, "encoding")
-        encoding, size, problem = _inspect(message) if raw else _inspect_compressed(message)
-        if problem is None and not 0 < size[0] * size[1] <= MAX_PIXELS:
-            problem = f"has {size[0]}x{size[1]} pixels"
-        if problem is None:
-            self.numbers.append(len(self.arrived) - 1)
-            self.sizes[size] = self.encodings[encoding] = None
-        return problem
-
     @property
-    def description(self) -> str:
-        """`rgb8, 640x480`."""
-        return ", ".join([*self.encodings, *(f"{width}x{height}" for width, height in self.sizes)][:6])
+    def title(self) -> str:
+        """The type; of images `sensor_msgs/Image (rgb8, 640x480)`."""
+        words = [*self.encodings, *(f"{width}x{height}" for width, height in self.sizes)][:6]
+        return f"{self.type} ({', '.join(words)})" if words else self.type
 
 
-def _inspect(message: Any) -> tuple[str, tuple[int, int], str | None]:
-    """Return the encoding and size of an Image, and why it cannot be used."""
-    encoding, size, problem = message.encoding, (message.width, message.height), None
+def _inspect(message: Any) -> tuple[str, tuple[int, int]]:
+    """Return the encoding and size of an Image. Raises _UnusableError."""
+    encoding, size = message.encoding, (message.width, message.height)
     if encoding not in ENCODINGS:
-        problem = f"is in encoding {printable(encoding, 24)}, which is not read"
-    elif message.step < size[0] * ENCODINGS[encoding][0] or len(message.data) < message.step * size[1]:
-        problem = "has fewer pixels than its size says"
-    return encoding, size, problem
+        raise _UnusableError(f"is in encoding {printable(encoding, 24)}, which is not read")
+    if message.step < size[0] * ENCODINGS[encoding][0] or len(message.data) < message.step * size[1]:
+        raise _UnusableError("has fewer pixels than its size says")
+    return encoding, size
 
 
-def _inspect_compressed(message: Any) -> tuple[str, tuple[int, int], str | None]:
+def _inspect_compressed(message: Any) -> tuple[str, tuple[int, int]]:
     """Return the same of a CompressedImage."""
     try:
         with Image.open(BytesIO(message.data), formats=FORMATS) as image:
             kind, size, mode = str(image.format), image.size, image.mode
             if kind == "PNG":
                 image.verify()
+            elif b"\xff\xd9" not in message.data[-4096:].tobytes():
+                raise ValueError("cut short")
     except Exception:  # Pillow's readers raise nearly anything
-        return "", (0, 0), f"is no whole JPEG or PNG ({printable(message.format, 24)})"
+        raise _UnusableError(f"is no whole JPEG or PNG ({printable(message.format, 24)})") from None
     if mode[0] in "IF":
-        return kind, size, "has 16 bits a channel, which is not read"
-    whole = kind != "JPEG" or b"\xff\xd9" in message.data[-4096:].tobytes()
-    return kind, size, None if whole else "is no whole JPEG or PNG (cut short)"
+        raise _UnusableError("has 16 bits a channel, which is not read")
+    return kind, size
 
 
 def decode(message: Any) -> np.ndarray:
-    """Return uint8 [H, W, 3] RGB of an Image or a CompressedImage that `ImageLog` found usable."""
+    """Return uint8 [H, W, 3] RGB of a usable Image or CompressedImage."""
     if not hasattr(message, "encoding"):
         with Image.open(BytesIO(message.data), formats=FORMATS) as image:
             return np.array(image.convert("RGB"))
@@ -398,76 +374,70 @@ def decode(message: Any) -> np.ndarray:
     return pixels.copy() if conversion is None else cv2.cvtColor(pixels, conversion)
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, eq=False)  # cached by identity
 class Survey:
-    """Contents of a bag by stream, without the pixels of images. lenses: a CameraInfo by topic; origin: ns, of all
-    times."""
+    """Contents of a bag by stream, without the pixels of images. lenses: by topic, a CameraInfo and its numbers K, D, R
+    and P; origin: ns, of all times."""
 
     path: Path
-    poses: dict[str, Poses] = field(default_factory=dict)
-    joints: dict[str, Joints] = field(default_factory=dict)
-    images: dict[str, ImageLog] = field(default_factory=dict)
-    lenses: dict[str, Any] = field(default_factory=dict)
+    limits: BagLimits
+    poses: dict[str, Samples] = field(default_factory=dict)
+    joints: dict[str, Samples] = field(default_factory=dict)
+    images: dict[str, Samples] = field(default_factory=dict)
+    lenses: dict[str, tuple[Any, dict[str, list[float]]]] = field(default_factory=dict)
     others: list[Stream] = field(default_factory=list)
     origin: int = 0
 
     def add(self, topic: str, kind: str, received: int, message: Any) -> None:
-        if kind in IMAGE:
-            self.images[topic].add(received, message)
-        elif kind == CAMERA_INFO:
-            if message is not None and (topic not in self.lenses or not matrix_of(self.lenses[topic], "K")[0]):
-                self.lenses[topic] = message
+        if kind == CAMERA_INFO:
+            if message is not None and (topic not in self.lenses or not self.lenses[topic][1]["K"][0]):
+                # its fields have capitals in ROS 1
+                fields = {name: getattr(message, name if hasattr(message, name) else name.lower()) for name in "KDRP"}
+                self.lenses[topic] = message, {name: list(map(float, values)) for name, values in fields.items()}
         elif kind in TRANSFORMS:
             for item in [] if message is None else message.transforms:
                 name = f"tf:{plain(item.child_frame_id).lstrip('/')}"
-                if name in self.poses or len(self.poses) < MAX_BODIES:
-                    self.poses.setdefault(name, Poses(kind, static=topic.endswith("tf_static"))).add(received, item)
-        elif kind in POSE:
-            self.poses.setdefault(topic, Poses(kind)).add(received, message)
+                if name in self.poses or len(self.poses) < self.limits.bodies:
+                    static = topic.endswith("tf_static")
+                    self.poses.setdefault(name, Samples(kind, self.limits, static)).add(received, item)
         else:
-            self.joints.setdefault(topic, Joints(kind)).add(received, message)
+            streams = self.images if kind in IMAGE else self.poses if kind in POSE else self.joints
+            streams.setdefault(topic, Samples(kind, self.limits)).add(received, message)
 
     def seconds(self, log: Samples) -> np.ndarray:
         """Return times [N] s from the origin: the stamps or, where those are 0, the times of receipt, ns."""
-        given, arrived = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
-        return (np.where(given == 0, arrived, given) - self.origin) * 1e-9
+        stamps, received = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
+        return (np.where(stamps == 0, received, stamps) - self.origin) * 1e-9
 
 
 @lru_cache(maxsize=4)
-def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
+def survey_of(path: Path, state: tuple[object, ...], limits: BagLimits) -> Survey:
     """Read a bag once; `state` of its files distinguishes it from another of its name."""
-    survey = Survey(path=path)
-    with open_bag(path) as bag:
+    survey = Survey(path=path, limits=limits)
+    with open_bag(path, limits) as bag:
         kinds: dict[str, str] = {}
         unread, topics = [], sorted({connection.topic for connection in bag.reader.connections})
         for topic in topics:
-            own = [connection for connection in bag.reader.connections if connection.topic == topic]
-            types = sorted({plain(connection.msgtype.replace("/msg/", "/")) for connection in own})
-            problem = (
-                f"holds {' and '.join(types)}" if len(types) > 1 else next(filter(None, map(bag.problem, own)), None)
-            )
+            of_topic = [connection for connection in bag.reader.connections if connection.topic == topic]
+            types = sorted({plain(connection.msgtype.replace("/msg/", "/")) for connection in of_topic})
+            problem = next(filter(None, map(bag.problem, of_topic)), None)
+            problem = f"holds {' and '.join(types)}" if len(types) > 1 else problem
             if problem is None and types[0] in READ:
                 kinds[topic] = types[0]
                 if types[0] in IMAGE:
-                    survey.images[topic] = ImageLog(types[0])
+                    survey.images[topic] = Samples(types[0], limits)
                 continue
             unread += [] if problem is None else [f"{plain(topic)} ({types[0]}) {problem}"]
             words = types[0] if problem is None else f"{types[0]}, which {problem}"
-            count = sum(connection.msgcount for connection in own)
-            survey.others.append(Stream(plain(topic), OTHER, words, count))
+            survey.others.append(Stream(plain(topic), OTHER, words, sum(one.msgcount for one in of_topic)))
         if unread and len(unread) == len(topics):
             raise NeecoError(f"{path}: no topic can be read: {', '.join(unread)}; record or convert to ROS 2's cdr")
         for name, received, message in bag.messages(set(kinds)):
             survey.add(name, kinds[name], received, message)
-    logs: list[Samples] = [log for log in survey.images.values() if log.stamps]
+    logs = [log for log in survey.images.values() if log.stamps]
     logs = logs or [log for log in [*survey.poses.values(), *survey.joints.values()] if log.stamps]
     survey.origin = min((min(log.stamps) or min(log.received) for log in logs), default=0)
     return survey
-
-
-def matrix_of(info: Any, name: str) -> list[float]:
-    """Return the numbers K, D, R or P of a CameraInfo, whose fields have capitals in ROS 1."""
-    return [float(value) for value in getattr(info, name if hasattr(info, name) else name.lower())]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -475,21 +445,22 @@ class BagImages(VideoSource):
     """Images of a topic. arrived: ns, of each of its messages; numbers: which message each frame is."""
 
     topic: str
+    limits: BagLimits
     arrived: np.ndarray
     numbers: np.ndarray
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = np.array(sorted({int(index) for index in indices}), np.int64)
         steps = np.diff(self.numbers[wanted])
-        with open_bag(self.path) as bag:
-            for stretch in np.split(wanted, np.flatnonzero((steps <= 0) | (steps > MAX_SKIPPED)) + 1):
+        cuts = np.flatnonzero((steps <= 0) | (steps > self.limits.skipped_images)) + 1
+        with open_bag(self.path, self.limits) as bag:
+            for stretch in np.split(wanted, cuts):
                 numbers = {int(self.numbers[index]): int(index) for index in stretch}
                 times = self.arrived[list(numbers)]
                 start, stop = int(times.min(initial=2**62)), int(times.max(initial=-1)) + 1
-                passed = np.flatnonzero((self.arrived >= start) & (self.arrived < stop))
-                for number, (_, _, message) in zip(
-                    passed.tolist(), bag.messages([self.topic], start, stop), strict=False
-                ):
+                passed = np.flatnonzero((self.arrived >= start) & (self.arrived < stop)).tolist()
+                messages = bag.messages([self.topic], start, stop)
+                for number, (_, _, message) in zip(passed, messages, strict=False):
                     if number in numbers:
                         yield numbers.pop(number), self._decoded(number, message)
                 if numbers:
@@ -499,10 +470,9 @@ class BagImages(VideoSource):
         try:
             pixels = decode(message)
         except Exception as error:  # Pillow's decoders raise nearly anything
-            raise NeecoError(
-                f"{self.path}: {self.topic}: message {number + 1} cannot be decoded; record again, or cut it out with "
-                "`rosbag filter`"
-            ) from error
+            remedy = "record again, or cut it out with `rosbag filter`"
+            problem = f"message {number + 1} cannot be decoded; {remedy}"
+            raise NeecoError(f"{self.path}: {self.topic}: {problem}") from error
         if pixels.shape[1::-1] != self.size:
             raise NeecoError(f"{self.path}: {self.topic}: message {number + 1} has another size than it had")
         return pixels
@@ -511,27 +481,24 @@ class BagImages(VideoSource):
 def open_topic(survey: Survey, topic: str, notes: Sequence[str]) -> BagImages:
     """Return the images of a topic, sorted by time. Raises NeecoError."""
     log, where, title = survey.images[topic], f"{survey.path}: {topic}", f"{survey.path.name}: {topic}"
-    if len(log.numbers) < MIN_IMAGES:
-        why, count = log.bad.most_common(1)[0] if log.bad else ("is there", 0)
-        raise NeecoError(
-            f"{where}: {len(log.numbers)} of {len(log.arrived)} images can be used"
-            f"{f': {count} are not: one {why}' if count else ''}; name another topic"
-        )
+    seconds = survey.seconds(log)
+    times, order = np.unique(seconds, return_index=True)
+    if len(times) < survey.limits.min_images:
+        why, count = log.bad.most_common(1)[0] if log.bad else ("", 0)
+        problem = f": {count} are not: one {why}" if count else ", by their times" if len(seconds) > len(times) else ""
+        raise NeecoError(f"{where}: {len(times)} of {len(log.arrived)} images can be used{problem}; name another topic")
     if len(log.sizes) > 1:
         first, second = [f"{width}x{height}" for width, height in log.sizes][:2]
         raise NeecoError(f"{where}: changes from {first} to {second} pixels midway; cut the bag there")
-    seconds = survey.seconds(log)
     for place in restarts(seconds)[1]:
-        found = f"{seconds[place]:.6g} s, then {seconds[place + 1]:.6g} s"
-        raise NeecoError(f"{where}: image {place + 2}: time begins anew ({found}); keep the images of one run in a bag")
-    times, order = np.unique(seconds, return_index=True)
-    if len(times) < MIN_IMAGES:
-        raise NeecoError(f"{where}: all images have one time; record them with their own")
+        jump = f"{seconds[place]:.6g} s, then {seconds[place + 1]:.6g} s"
+        raise NeecoError(f"{where}: image {place + 2}: time begins anew ({jump}); keep the images of one run in a bag")
     left_out = dict(log.bad)
     if len(times) < len(seconds):
         left_out["shares its time with another"] = len(seconds) - len(times)
     notes = [*notes, *(f"{title}: {counted(count, 'image')} left out: one {why}" for why, count in left_out.items())]
     numbers, arrived = np.array(log.numbers, np.int64)[order], np.array(log.arrived, np.int64)
     return BagImages(
-        survey.path, next(iter(log.sizes)), tuple(notes), times, topic=topic, arrived=arrived, numbers=numbers
-    )
+        survey.path, next(iter(log.sizes)), tuple(notes), times, topic=topic, limits=survey.limits, arrived=arrived,
+        numbers=numbers,
+    )  # fmt: skip

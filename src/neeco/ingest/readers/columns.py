@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated
@@ -17,14 +18,7 @@ VIDEO_CLOCK = "video"  # that of the images, and of logs that stand in the same 
 QUATERNION_WXYZ, QUATERNION_XYZW = "quaternion_wxyz", "quaternion_xyzw"
 CAMERA, BASE = "camera", "base"  # frames that poses may be stated in: OpenCV's camera axes, or what registration places
 ROTATION_VECTOR, EULER, ROTATION_MATRIX, MATRIX = "rotation_vector", "euler", "rotation_matrix", "matrix"
-FORMS = {
-    QUATERNION_WXYZ: (4,),
-    QUATERNION_XYZW: (4,),
-    ROTATION_VECTOR: (3,),
-    EULER: (3,),
-    ROTATION_MATRIX: (9,),
-    MATRIX: (12, 16),
-}  # how many columns each form of rotation takes; matrices row by row
+FORMS = (QUATERNION_WXYZ, QUATERNION_XYZW, ROTATION_VECTOR, EULER, ROTATION_MATRIX, MATRIX)  # matrices row by row
 
 UNITS = {
     "length": {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3},
@@ -192,16 +186,12 @@ _ROS = re.compile(r"(^|[._/])(pose|transform|transforms\d*)[._/]")
 
 def recognise_time(header: Sequence[str]) -> RecognisedColumns:
     """The column of times."""
-    plain = _by_plain_name(header, "time")
-    seconds = [name for name in plain if name.endswith("stamp_sec")]
-    fraction = [name for name in plain if name.endswith(("stamp_nanosec", "stamp_nsec"))]
-    if not seconds:  # `header.stamp.sec` reads as a stamp in seconds next to its nanoseconds
-        split = {_plain(name): name for name in header}
-        seconds = [name for name in split if name.endswith(("stamp_sec", "stamp_secs"))]
-        fraction = [name for name in split if name.endswith(("stamp_nanosec", "stamp_nsec", "stamp_nsecs"))]
-        plain = plain | {name: split[name] for name in seconds + fraction}
+    plain, whole = _by_plain_name(header, "time"), {_plain(name): name for name in header}
+    # `header.stamp.sec` reads as a stamp in seconds next to its nanoseconds
+    seconds = [name for name in whole if name.endswith(("stamp_sec", "stamp_secs"))]
+    fraction = [name for name in whole if name.endswith(("stamp_nanosec", "stamp_nsec", "stamp_nsecs"))]
     if len(seconds) == len(fraction) == 1:
-        return RecognisedColumns(time=(plain[seconds[0]], plain[fraction[0]]))
+        return RecognisedColumns(time=(whole[seconds[0]], whole[fraction[0]]))
     for wanted in _TIMES:
         behind = [name for name in plain if len(wanted) > 1 and name.endswith("_" + wanted)]
         if wanted in plain or len(behind) == 1:
@@ -250,19 +240,22 @@ def pose_bodies(header: Sequence[str]) -> dict[str, tuple[str, ...]]:
     for prefixed, names in _POSITIONS:
         if all(name in plain for name in names):
             return {"": tuple(header)}
-        ending = "_" + names[0]
-        prefixes = [name.removesuffix(ending) for name in plain if prefixed and name.endswith(ending)]
-        prefixes = [prefix for prefix in prefixes if all(f"{prefix}_{name}" in plain for name in names)]
-        if not prefixes:
-            continue
-        words = {prefix: prefix.split("_") for prefix in prefixes}
-        shared = set.intersection(*map(set, words.values())) if len(words) > 1 else set(_POSE_WORDS)
-        found = {}
-        for prefix in prefixes:
-            name = "_".join(word for word in words[prefix] if word not in shared) or prefix
-            found[name] = tuple(held for key, held in plain.items() if key.startswith(prefix + "_"))
-        return found
+        if prefixes := _prefixes(plain, names) if prefixed else []:
+            words = [set(prefix.split("_")) for prefix in prefixes]
+            shared = set.intersection(*words) if len(words) > 1 else set(_POSE_WORDS)
+            return {
+                "_".join(word for word in prefix.split("_") if word not in shared) or prefix: tuple(
+                    name for key, name in plain.items() if key.startswith(prefix + "_")
+                )
+                for prefix in prefixes
+            }
     return {}
+
+
+def _prefixes(plain: Mapping[str, str], names: Sequence[str]) -> list[str]:
+    """Return the prefixes behind which all of some plain names stand."""
+    prefixes = [name.removesuffix("_" + names[0]) for name in plain if name.endswith("_" + names[0])]
+    return [prefix for prefix in prefixes if all(f"{prefix}_{name}" in plain for name in names)]
 
 
 def recognise_value(header: Sequence[str], given: _Given = _NOTHING) -> tuple[str | None, RecognisedColumns]:
@@ -344,10 +337,7 @@ def _group(
     for prefixed, names in choices:
         if all(name in plain for name in names):
             return tuple(plain[name] for name in names)
-        if not prefixed:
-            continue
-        prefixes = [name.removesuffix("_" + names[0]) for name in plain if name.endswith("_" + names[0])]
-        prefixes = [prefix for prefix in prefixes if all(f"{prefix}_{name}" in plain for name in names)]
+        prefixes = _prefixes(plain, names) if prefixed else []
         if len(prefixes) == 1:
             return tuple(plain[f"{prefixes[0]}_{name}"] for name in names)
         if prefixes:
@@ -358,13 +348,11 @@ def _group(
 
 def _matrix(header: Sequence[str]) -> tuple[str, ...] | None:
     """Columns m00 ... m33 (or from 1; or m, t, r, mat, matrix): 16, 12 or, for a rotation alone, 9."""
-    plain: dict[str, str] = {}
-    for key, name in _by_plain_name(header, "length").items():
-        plain.setdefault(re.sub(r"[_\[\](),]", "", key), name)
-    for stem in ("m", "t", "r", "mat", "matrix", "pose", "rot"):
-        for first in (0, 1):
-            for rows, columns in ((4, 4), (3, 4), (3, 3)):
-                names = [f"{stem}{first + i}{first + j}" for i in range(rows) for j in range(columns)]
-                if all(name in plain for name in names):
-                    return tuple(plain[name] for name in names)
+    plain = {re.sub(r"[_\[\](),]", "", key): name for key, name in reversed(_by_plain_name(header, "length").items())}
+    for stem, first, (rows, columns) in product(
+        ("m", "t", "r", "mat", "matrix", "pose", "rot"), (0, 1), ((4, 4), (3, 4), (3, 3))
+    ):
+        names = [f"{stem}{first + i}{first + j}" for i in range(rows) for j in range(columns)]
+        if all(name in plain for name in names):
+            return tuple(plain[name] for name in names)
     return None

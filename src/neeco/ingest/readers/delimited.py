@@ -1,4 +1,7 @@
-"""Delimited text: comma, semicolon, tab or blanks between the cells, in any usual encoding."""
+"""Delimited text: comma, semicolon, tab or blanks between the cells, in any usual encoding.
+
+Exports of trackers have the columns of several bodies in a row: NDI's tools, each followed by its markers.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,9 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import StringIO
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +19,27 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes
 from neeco.capture.documents import printable
-from neeco.ingest.readers import DELIMITED, MISSING, RecordingFormat, Table, parse_number
-from neeco.ingest.readers.columns import UNITS, canonical_unit
-from neeco.ingest.readers.ndi import find_tools
+from neeco.ingest.readers import DELIMITED, MISSING, Body, RecordingFormat, Table, parse_number
+from neeco.ingest.readers.columns import UNITS, PoseColumns, canonical_unit
 
 EXPECTED = "CSV with a header line"
-MAX_COLUMNS = 4096
-MAX_PADDING = 16  # of the cells of a text as a table over those that it holds
-SAMPLE_LINES = 400  # that tell which columns hold numbers
 _COMMENT = re.compile(r"^\s*(?:#+|//|%\s)\s*")
+_PORT = re.compile(r"port\b\s*(?P<port>[^:]*?)\s*(?::\s*(?P<name>.*))?$", re.IGNORECASE)
+_NUMBERED = re.compile(r"#\d+$")  # what tells columns of one name apart
+MARKERS = "markers"  # the column behind which those of a tool's markers begin
+_DECIMAL_COMMA = re.compile(r"[+-]?(?:\d+,\d*|,\d+)(?:[eE][+-]?\d+)?")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextLimits:
+    """Limits on a text as a table."""
+
+    columns: int = 4096
+    padding: int = 16  # of its cells, by those that the text holds
+    sample_lines: int = 400  # that tell which columns hold numbers
+
+
+LIMITS = TextLimits()
 
 
 class DelimitedText(RecordingFormat):
@@ -45,30 +61,30 @@ class DelimitedText(RecordingFormat):
         if not used.any():
             raise NeecoError(f"{path}: has a header but no rows; record again or name another file")
         header, rows = unique_names(names), text.cells[used, : len(names)]
-        return Table(
-            path, header, rows, text.lines[used], decimal_comma=text.decimal_comma, bodies=find_tools(header, rows)
-        )
+        return Table(path, header, rows, text.lines[used], bodies=find_tools(header, rows))
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
     """The lines of a text that hold anything. cells [N, W]: stripped, "" where a line has fewer; lines [N]: their
     numbers, from 1; counts [N]: of their own cells; comment [N]: are they behind a `#`, `//` or `% `, which is left
-    out?; decimal_comma: commas in cells are those of decimals."""
+    out?"""
 
     cells: np.ndarray
     lines: np.ndarray
     counts: np.ndarray
     comment: np.ndarray
-    decimal_comma: bool
 
     def numeric(self, rows: np.ndarray | slice) -> np.ndarray:
         """Return which cells [R, W] of some lines hold numbers."""
-        found = np.zeros(self.cells[rows].shape, dtype=bool)
-        for place, cell in np.ndenumerate(self.cells[rows]):
-            value = parse_number(cell.replace(",", ".") if self.decimal_comma else cell)
-            found[place] = value is not None and cell.lower() not in MISSING
-        return found
+        cells = self.cells[rows]
+        found = [parse_number(cell) is not None and cell.lower() not in MISSING for cell in cells.ravel()]
+        return np.array(found, dtype=bool).reshape(cells.shape)
+
+    def names(self, row: int) -> list[str]:
+        """Return the cells of a line."""
+        names: list[str] = self.cells[row, : self.counts[row]].tolist()
+        return names
 
 
 def read_cells(path: Path) -> Cells:
@@ -84,10 +100,10 @@ def read_cells(path: Path) -> Cells:
     lines = [_COMMENT.sub("", text) for _, text in texts]
     counts = np.array([len(line.split()) if sign == " " else line.count(sign) + 1 for line in lines])
     columns = range(int(counts.max()))
-    if len(columns) > MAX_COLUMNS:
+    if len(columns) > LIMITS.columns:
         line = texts[int(counts.argmax())][0]
-        raise NeecoError(f"{path}: line {line}: has {len(columns)} cells; expected at most {MAX_COLUMNS}")
-    if len(columns) * len(lines) > MAX_PADDING * int(counts.sum()) + 10**6:
+        raise NeecoError(f"{path}: line {line}: has {len(columns)} cells; expected at most {LIMITS.columns}")
+    if len(columns) * len(lines) > LIMITS.padding * int(counts.sum()) + 10**6:
         raise NeecoError(f"{path}: most lines are much shorter than the longest one; expected the rows of one table")
     is_open = any(line.count('"') % 2 for line in lines)  # a quote left open must not swallow the rest of the file
     try:
@@ -99,11 +115,12 @@ def read_cells(path: Path) -> Cells:
     except (ValueError, OverflowError) as error:
         raise NeecoError(f"{path}: not readable as CSV ({' '.join(str(error).split())[:100]}); repair it") from None
     frame = frame.fillna("")  # where a line has fewer cells
+    stripped = [cell.strip(' \t"') for cell in frame.to_numpy(object).ravel().tolist()]
+    if sign in ";\t" and any("," in text for text in plain[:49]):
+        stripped = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in stripped]
     cells = np.empty(frame.size, object)
-    cells[:] = [cell.strip(' \t"') for cell in frame.to_numpy(object).ravel().tolist()]
-    commas = sign in ";\t" and any("," in text for text in plain[:49])
-    rows = cells.reshape(frame.shape)
-    return Cells(rows, np.array([number for number, _ in texts]), counts, comment, commas)
+    cells[:] = stripped
+    return Cells(cells.reshape(frame.shape), np.array([number for number, _ in texts]), counts, comment)
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -119,75 +136,53 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
 def _header(path: Path, text: Cells) -> tuple[list[str], int]:
     """The names of the columns, and the line from which the rows are. Raises NeecoError where nothing names them."""
     plain = np.flatnonzero(~text.comment).tolist()
-    sample = plain[len(plain) // 2 :][:SAMPLE_LINES]
+    sample = plain[len(plain) // 2 :][: LIMITS.sample_lines]
     numeric = np.flatnonzero(text.numeric(np.array(sample)).mean(axis=0) > 0.5)
-    start = next((row for row in plain if _is_row(text, row, numeric)), None)
+
+    def is_row(row: int) -> bool:
+        """Whether a line holds numbers, or a word for a missing one, wherever most do."""
+        held = text.numeric(slice(row, row + 1))[0, numeric]
+        missing = [index < text.counts[row] and text.cells[row, index].lower() in MISSING for index in numeric]
+        return bool(held.any() and (held | missing).all())
+
+    def names_columns(row: int, columns: np.ndarray) -> bool:
+        """Whether a line has no numbers where the rows have them, and names for at least half of those columns."""
+        held = text.numeric(slice(row, row + 1))[0, columns]
+        return sum(map(bool, text.cells[row, columns])) >= 0.5 * len(columns) and not held.any()
+
+    start = next((row for row in plain if is_row(row)), None)
     if not len(numeric) or start is None:
-        return _names(text, plain[0]), plain[0] + 1
-    above = [int(row) for row in plain if row < start]
-    places = [row for row in above if _names_columns(text, row, numeric)]
-    if places:
-        place, units = places[-1], [_unit_of(cell) for cell in text.cells[places[-1]]]
+        return text.names(plain[0]), plain[0] + 1
+    above = [row for row in plain if row < start]
+    if places := [row for row in above if names_columns(row, numeric)]:
+        place, others = places[-1], [row for row in above if row < places[-1]]
+        units = [canonical_unit(cell.strip("[]() ")) for cell in text.cells[place]]
+        units = [unit if any(unit in known for known in UNITS.values()) else "" for unit in units]
         filled = [unit for unit, cell in zip(units, text.cells[place], strict=True) if cell.strip("[]()- ")]
-        before = next((row for row in reversed(above) if row < place), None)
-        if before in places and sum(unit is not None for unit in filled) > 0.5 * len(filled) > 0:
-            place, before = before, next((row for row in reversed(above) if row < before), None)
+        if others and others[-1] in places and sum(map(bool, filled)) > 0.5 * len(filled) > 0:  # a line of units
+            place = others.pop()
         else:
-            units = [None] * len(units)
-        names = _names(text, place)
-        if before is not None:
-            names = _grouped(names, text.cells[before])
+            units = [""] * len(units)
+        names = text.names(place)
+        if others:  # names of groups, where these tell columns of one name apart
+            groups = accumulate(text.cells[others[-1]].tolist(), lambda last, group: str(group or last))
+            joined = ["_".join(filter(None, pair)) for pair in zip(groups, names, strict=False)]
+            names = joined if len(set(names)) < len(set(joined)) else names
         named = (f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, units, strict=False))
         return list(named), places[-1] + 1
-    if above and text.counts[above[-1]] == text.counts[start] and _names_columns(text, above[-1], np.array([0])):
-        return _names(text, above[-1]), above[-1] + 1
+    if above and text.counts[above[-1]] == text.counts[start] and names_columns(above[-1], np.array([0])):
+        return text.names(above[-1]), above[-1] + 1
     for row in reversed(np.flatnonzero(text.comment[:start]).tolist()):
-        if text.counts[row] == text.counts[start] and _names_columns(text, row, numeric):
-            return _names(text, row), start
-    found, number = printable(",".join(_names(text, plain[0]))[:40]), text.lines[plain[0]]
-    where = f"{path}: line {number}"
-    if above:
-        raise NeecoError(
-            f"{where} is no header of columns (found {found}), and the rows of numbers begin at line "
-            f"{text.lines[start]}; write a line that names the columns above that"
-        )
-    raise NeecoError(f"{where}: no header (found {found}); add a line naming the columns")
-
-
-def _names(text: Cells, row: int) -> list[str]:
-    return text.cells[row, : text.counts[row]].tolist()
-
-
-def _is_row(text: Cells, row: int, numeric: np.ndarray) -> bool:
-    """Return whether a line holds numbers, or a word for a missing one, wherever most do."""
-    held = text.numeric(slice(row, row + 1))[0, numeric]
-    missing = [index < text.counts[row] and text.cells[row, index].lower() in MISSING for index in numeric]
-    return bool(held.any() and (held | missing).all())
-
-
-def _names_columns(text: Cells, row: int, numeric: np.ndarray) -> bool:
-    """Return whether a line has no numbers where the rows have them, and names for at least half of those columns."""
-    named = sum(bool(cell) for cell in text.cells[row, numeric])
-    return named >= 0.5 * len(numeric) and not text.numeric(slice(row, row + 1))[0, numeric].any()
-
-
-def _unit_of(cell: str) -> str | None:
-    unit = canonical_unit(cell.strip("[]() "))
-    return unit if any(unit in units for units in UNITS.values()) else None
-
-
-def _grouped(names: list[str], groups: Sequence[str]) -> list[str]:
-    """Names of columns behind those of their groups, where these tell columns of one name apart."""
-    joined, last = [], ""
-    for name, group in zip(names, groups, strict=False):
-        last = group or last
-        joined.append("_".join(filter(None, (last, name))))
-    return joined if len(set(names)) < len(set(joined)) else names
+        if text.counts[row] == text.counts[start] and names_columns(row, numeric):
+            return text.names(row), start
+    found, where = printable(",".join(text.names(plain[0]))[:40]), f"{path}: line {text.lines[plain[0]]}"
+    rows = f", and the rows of numbers begin at line {text.lines[start]}" if above else ""
+    raise NeecoError(f"{where} is no header of columns (found {found}){rows}; add a line that names the columns")
 
 
 def _delimiter(lines: Sequence[str]) -> str:
     """Return the sign between the cells of the rows, which are most of the second half of a file."""
-    rows = lines[len(lines) // 2 :][:SAMPLE_LINES]
+    rows = lines[len(lines) // 2 :][: LIMITS.sample_lines]
     for delimiter in "\t;":  # before commas, which may be those of decimals then
         count, n_similar = Counter(row.count(delimiter) for row in rows).most_common(1)[0]
         if count and n_similar > 0.9 * len(rows):
@@ -207,3 +202,79 @@ def _read_text(path: Path) -> str:
     if not text.strip() or any(character < " " and character not in "\t\r\n\f\v" for character in text[:4096]):
         raise NeecoError(f"{path}: {'not a text file' if text.strip() else 'the file is empty'}; expected {EXPECTED}")
     return text
+
+
+def find_tools(header: Sequence[str], rows: np.ndarray) -> tuple[Body, ...]:
+    """Return NDI's tools: the columns of each from its `Port` to its markers; named by name or serial number, else by
+    port, where that is no other's."""
+    plain = [_NUMBERED.sub("", name).strip() for name in header]
+    starts = [index for index, name in enumerate(plain) if _PORT.match(name)]
+    found: list[tuple[range, str, list[str]]] = []
+    for start, end in pairwise([*starts, len(plain)]):
+        names = [name.lower() for name in plain[start:end]]
+        own = next((n for n, name in enumerate(names) if name == MARKERS or name in names[:n]), len(names))
+        if {"q0", "tx"} <= set(names[:own]):
+            match, cell = _PORT.match(plain[start]), next(filter(None, rows[:, start]), "")
+            port, name = (match["port"], match["name"] or "") if match else ("", "")
+            title = plain[start] if port or name else cell or plain[start]
+            found.append((range(start, start + own), title, [name, port or cell, plain[start], cell]))
+    shared = Counter(word for _, _, words in found for word in {_canonical(word) for word in words if word})
+    return tuple(
+        Body(
+            next((word for word in words[:2] if word and shared[_canonical(word)] == 1), printable(title)),
+            tuple(columns), title=printable(title), aliases=frozenset(_canonical(word) for word in words if word),
+        )
+        for columns, title, words in found
+    )  # fmt: skip
+
+
+def tool_columns(table: Table, source: PoseColumns) -> Table:
+    """The columns of the tool that `source` names, under their plain names, and those that stand before all tools; what
+    is no export of several tools stays as it is.
+
+    Raises NeecoError where there are several tools and none is named, or columns are named that are not all one tool's:
+    the second `Tx` is the first tool's first marker.
+    """
+    if not table.bodies:
+        if source.tool is not None:
+            raise NeecoError(f"{table.path}: tool: there are no columns of tools or rigid bodies; leave it out")
+        return table
+    if source.tool is None and (source.position or source.rotation):
+        _refuse_mixed(table, source)
+        return table
+    wanted = None if source.tool is None else _canonical(source.tool)
+    chosen = [body for body in table.bodies if wanted is None or wanted in {_canonical(body.name), *body.aliases}]
+    if len(chosen) != 1:
+        listed = ", ".join(body.title or printable(body.name) for body in table.bodies)
+        count, given = len(chosen) or "none", printable(source.tool)
+        problem = f"holds {len(table.bodies)} tools" if wanted is None else f"tool: {given} is {count} of them"
+        raise NeecoError(f"{table.path}: {problem}; say which as `tool` in the recording: {listed}")
+    columns = [*range(min(body.columns[0] for body in table.bodies)), *chosen[0].columns]
+    header = tuple(_NUMBERED.sub("", table.header[index]) for index in columns)
+    return replace(table, header=header, rows=table.rows[:, columns], stream=chosen[0].name, bodies=())
+
+
+def tool_names(table: Table) -> tuple[str, ...]:
+    """Return the name of each body of an export of several; () for other tables, and for NDI's with one tool."""
+    single = len(table.bodies) == 1 and table.bodies[0].aliases
+    return () if single else tuple(body.name for body in table.bodies)
+
+
+def _refuse_mixed(table: Table, source: PoseColumns) -> None:
+    """Raise NeecoError where the columns that the recording names are not all one tool's own."""
+    named = [*(source.position or ()), *(source.rotation or ()), *([source.state] if source.state else [])]
+    places = {name: table.header.index(name) for name in named if name in table.header}
+    owners = {name: [body.name for body in table.bodies if place in body.columns] for name, place in places.items()}
+    strangers = [name for name, own in owners.items() if not own]
+    if strangers or len({own[0] for own in owners.values()}) > 1:
+        what = f"{strangers[0]} is a marker's, no tool's" if strangers else f"{', '.join(places)} are of several tools"
+        raise NeecoError(f"{table.path}: columns: {what}; name the tool instead, as `tool` in the recording")
+
+
+def _canonical(name: str) -> str:
+    """A name in small letters; of a number, as ports have in several spellings, its value."""
+    text = re.sub(r"^port\s*", "", name.strip().lower())
+    try:
+        return str(int(text, 16 if text.startswith("0x") else 10))
+    except ValueError:
+        return text

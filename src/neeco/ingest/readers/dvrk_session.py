@@ -88,13 +88,18 @@ class DvrkSession(RecordingFormat):
                 return (*found, Stream(bag.name, OTHER, "bag", 0, problem=str(error)))
         for topic, file in _topics(path).items():
             try:
-                table = DelimitedText().read(file)
+                kind, columns, table = _topic(file)
             except NeecoError as error:
                 found.append(Stream(topic, OTHER, "table", 0, problem=str(error)))
                 continue
-            kind, columns = _columns(table)
-            if kind is not None:
-                found.append(_stream(topic, kind, columns, table))
+            match = (_POSES if kind == POSES else _JOINTS).fullmatch(topic)
+            stream = Stream(topic, kind, kind, len(table.rows), offered=match is not None, body=match and match[1])
+            if kind == POSES:
+                frames = _frames(table)
+                meaning = meaning_of(frames[0] if len(frames) == 1 else "", dvrk=True)
+                found.append(replace(stream, hints=(*meaning.hints, DVRK_HINT), asks=meaning.asks))
+            elif kind == READINGS:
+                found.append(replace(stream, joints=wrist_joints(_joint_names(table, columns), "/jaw/" in topic)))
         return tuple(found)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
@@ -104,11 +109,25 @@ class DvrkSession(RecordingFormat):
             rows = np.array(table.rows, np.float64)
             rows[:, 0] += RosBag().origin_s(bag) - start
             return replace(table, path=path, rows=rows)
-        chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS))
-        file = _topics(path)[chosen.name]
-        table = DelimitedText().read(file)
-        _, columns = _columns(table)
-        return _converted(path, chosen, table, columns, start)
+        name = choose_stream(path, self.streams(path), stream, (POSES, READINGS)).name
+        kind, columns, table = _topic(_topics(path)[name])
+        stamps = ["header.stamp.sec", "header.stamp.nanosec"]
+        times = numbers(table, ["timestamp"])[0][:, 0] * 1e-9  # of receipt
+        if set(stamps) <= set(table.header):
+            stated = numbers(table, stamps)[0] @ [1.0, 1e-9]
+            times = np.where(stated == 0, times, stated)
+        frames = _frames(table) if kind == POSES else []
+        if len(frames) > 1:
+            listed = ", ".join(frames[:4])
+            raise NeecoError(f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame")
+        joints = (joint_column(name) for name in _joint_names(table, columns))
+        values, _, bad = numbers(table, columns)
+        return Table(
+            path, POSE_HEADER if kind == POSES else unique_names(["t_s", *joints]),
+            np.column_stack([times - start, values]), table.lines, stream=name,
+            notes=(f"{path.name}: {name}: {len(bad)} rows cannot be read; left out",) if bad else (),
+            stated_in=frames[0] if frames else None, meaning=meaning_of(frames[0], dvrk=True) if frames else None,
+        )  # fmt: skip
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         films, absent = _films(path)
@@ -117,23 +136,20 @@ class DvrkSession(RecordingFormat):
         name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
         if name not in films:
             raise NeecoError(f"{path}: stream: {printable(name)} is in the bag; name the bag as the video's file")
-        film, start = films[name], _start(path)
-        times, keep = film.times, np.diff(np.maximum.accumulate(film.times), prepend=-np.inf) > 0
-        notes = (
-            [] if keep.all() else [f"{name}: {int((~keep).sum())} frames are no later than the one before; left out"]
-        )
+        film, times = films[name], films[name].times - _start(path)
+        keep = np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0
+        early = f"{name}: {int((~keep).sum())} frames are no later than the one before; left out"
+        notes: tuple[str, ...] = () if keep.all() else (early,)
         if film.files[0].suffix.lower() != ".mp4":
             files = tuple(file for file, good in zip(film.files, keep, strict=True) if good)
-            return ImageFiles(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files=files)
+            return ImageFiles(path, open_image(files[0]).size, notes, times[keep], files=files)
         video = open_video(film.files[0])
-        count = len(video.times)
-        notes += compare_counts(film.files[0], count, len(times), "times", UNLIKE)
-        usable = np.flatnonzero(keep[:count])
+        notes += compare_counts(film.files[0], len(video.times), len(times), "times", UNLIKE)
+        usable = np.flatnonzero(keep[: len(video.times)])
         width, height = video.size
-        size = (width if film.half is None else width // 2, height)
         return ChosenFrames(
-            path, size, (*video.notes, *notes), times[usable] - start, video=video, frames=tuple(usable.tolist()),
-            half=film.half, pixel_aspect=video.pixel_aspect,
+            path, (width if film.half is None else width // 2, height), (*video.notes, *notes), times[usable],
+            video=video, frames=tuple(usable.tolist()), half=film.half, pixel_aspect=video.pixel_aspect,
         )  # fmt: skip
 
 
@@ -223,10 +239,7 @@ def _tables_in(path: Path) -> list[Path]:
 
 
 def _topics(path: Path) -> dict[str, Path]:
-    found = {topic: file for file in _tables_in(path) if (topic := _topic_of(file))}
-    if not found and not any(_films(path)):
-        raise NeecoError(f"{path}: holds no videos and no topics; give the folder of a session")
-    return found
+    return {topic: file for file in _tables_in(path) if (topic := _topic_of(file))}
 
 
 def _topic_of(file: Path) -> str | None:
@@ -234,57 +247,23 @@ def _topic_of(file: Path) -> str | None:
     return "/" + line.removeprefix(TOPIC).strip() if line.startswith(TOPIC) else None
 
 
-def _columns(table: Table) -> tuple[str | None, list[str]]:
-    """POSES or READINGS, and the columns that hold them; None for other topics."""
+def _topic(file: Path) -> tuple[str, list[str], Table]:
+    """POSES, READINGS or OTHER, the columns that hold them, and the table of a topic's CSV file."""
+    table = DelimitedText().read(file)
     for position, rotation in _POSE_PARTS:
         wanted = [*(position + axis for axis in "xyz"), *(rotation + axis for axis in "xyzw")]
         if set(wanted) <= set(table.header):
-            return POSES, wanted
+            return POSES, wanted, table
     joints: list[str] = []
     while f"position.{len(joints)}" in table.header:
         joints.append(f"position.{len(joints)}")
-    return (READINGS if joints else None), joints
-
-
-def _stream(topic: str, kind: str, columns: list[str], table: Table) -> Stream:
-    match = (_POSES if kind == POSES else _JOINTS).fullmatch(topic)
-    body, offered = match[1] if match else None, match is not None
-    if kind == POSES:
-        frames = _frames(table)
-        meaning = meaning_of(frames[0] if len(frames) == 1 else "", dvrk=True)
-        hints = (*meaning.hints, DVRK_HINT)
-        return Stream(
-            topic, POSES, "poses", len(table.rows), offered=offered, body=body, hints=hints, asks=meaning.asks
-        )
-    joints = wrist_joints(_joint_names(table, columns), "/jaw/" in topic)
-    return Stream(topic, READINGS, "joints", len(table.rows), offered=offered, body=body, joints=joints)
+    return READINGS if joints else OTHER, joints, table
 
 
 def _joint_names(table: Table, columns: list[str]) -> list[str]:
     """Return the joints of columns position.0, position.1, ..., by the first row's name.0, name.1, ..."""
     first = dict(zip(table.header, table.rows[0], strict=True))
     return [first.get(f"name.{number}") or f"joint_{number + 1}" for number in range(len(columns))]
-
-
-def _converted(path: Path, stream: Stream, table: Table, columns: list[str], start: float) -> Table:
-    """A topic's CSV as numbers, its times s from `start` on."""
-    when, frames = ["header.stamp.sec", "header.stamp.nanosec"], _frames(table)
-    times = numbers(table, ["timestamp"])[0][:, 0] * 1e-9  # of receipt
-    if set(when) <= set(table.header):
-        stamps = numbers(table, when)[0] @ [1.0, 1e-9]
-        times = np.where(stamps == 0, times, stamps)
-    header: tuple[str, ...] = POSE_HEADER
-    if stream.kind != POSES:
-        header, frames = unique_names(["t_s", *map(joint_column, _joint_names(table, columns))]), []
-    if len(frames) > 1:
-        listed = ", ".join(frames[:4])
-        raise NeecoError(f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame")
-    values, _, bad = numbers(table, columns)
-    notes = (f"{path.name}: {stream.name}: {len(bad)} rows cannot be read; left out",) if bad else ()
-    return Table(
-        path, header, np.column_stack([times - start, values]), table.lines, stream=stream.name, notes=notes,
-        stated_in=frames[0] if frames else None, meaning=meaning_of(frames[0], dvrk=True) if frames else None,
-    )  # fmt: skip
 
 
 def _frames(table: Table) -> list[str]:

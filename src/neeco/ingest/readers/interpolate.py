@@ -19,13 +19,22 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.model import evenly_spaced
 from neeco.ingest.readers.logs import PoseLog, ReadingLog
 
-WIDTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0)  # half windows tried, in median steps
-MAX_WIDTH_S = 1.0
-N_VALIDATED = 600  # samples predicted to choose a width (cross-validation)
-MIN_SAMPLES, MIN_FOR_CURVATURE = 4, 6  # in a window: fewer are interpolated linearly, fitted by a line
-N_ROUNDS = 3  # of robust reweighting
-CUTOFF_SD = 4.7  # of the bisquare, per axis (Beaton & Tukey 1974)
-CHUNK = 300_000  # window samples worked on at once
+
+@dataclass(frozen=True, kw_only=True)
+class SmoothingSettings:
+    """Choice of the windows, and the robust fit within one."""
+
+    widths: tuple[float, ...] = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)  # half windows tried, in median steps
+    max_width_s: float = 1.0
+    validated: int = 600  # samples predicted to choose a width (cross-validation)
+    min_samples: int = 4  # in a window: fewer are interpolated linearly,
+    min_for_curvature: int = 6  # and fewer fitted by a line
+    rounds: int = 3  # of robust reweighting
+    cutoff_sd: float = 4.7  # of the bisquare, per axis (Beaton & Tukey 1974)
+    chunk: int = 300_000  # window samples worked on at once
+
+
+SETTINGS = SmoothingSettings()
 
 
 @dataclass(frozen=True)
@@ -143,9 +152,9 @@ class _Series:
         inner = inner[(inner > self.first) & (inner < self.last - 1)]  # never the end of a stretch
         if not len(inner):
             return 0.0
-        chosen = inner[evenly_spaced(len(inner), N_VALIDATED, floor=True)]
-        widths = [steps * self.step for steps in WIDTHS if steps == WIDTHS[0] or steps * self.step <= MAX_WIDTH_S]
-        widths = [0.0, *widths]
+        chosen = inner[evenly_spaced(len(inner), SETTINGS.validated, floor=True)]
+        first, *others = (steps * self.step for steps in SETTINGS.widths)
+        widths = [0.0, first, *(width for width in others if width <= SETTINGS.max_width_s)]
         fitted = [self.fit(self.times[chosen], width, chosen) for width in widths]
         errors = [np.linalg.norm(self.relative(values, self.values[chosen]), axis=1) for values in fitted]
         # outliers do not count for one width or another
@@ -158,7 +167,7 @@ class _Series:
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
         """Yield times with enough samples within `width`, in chunks: rows [N], their samples [N, K], bool [N, K] of
         those in use, and their offsets [N, K] in half widths."""
-        size = max(int(CHUNK / max(2 * width / self.step, 8)), 1)
+        size = max(int(SETTINGS.chunk / max(2 * width / self.step, 8)), 1)
         for start in range(0, len(times), size):
             rows = np.arange(start, min(start + size, len(times)))
             near = times[rows]
@@ -170,7 +179,7 @@ class _Series:
             index, used = np.minimum(index, len(self.times) - 1), index < high[:, None]
             if leave_out is not None:
                 used &= index != leave_out[rows, None]
-            enough = used.sum(axis=1) >= MIN_SAMPLES
+            enough = used.sum(axis=1) >= SETTINGS.min_samples
             if enough.any():
                 rows, index, used = rows[enough], index[enough], used[enough]
                 yield rows, index, used, (self.times[index] - times[rows, None]) / width
@@ -204,7 +213,7 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
     # with few samples the curvature is held at 0; the rest only keeps the equations solvable
     ridge = np.zeros((len(offsets), 3))
     ridge[:, 1] = 1e-9
-    ridge[:, 2] = np.where(used.sum(axis=1) < MIN_FOR_CURVATURE, 1e6, 1e-9)
+    ridge[:, 2] = np.where(used.sum(axis=1) < SETTINGS.min_for_curvature, 1e6, 1e-9)
     # start from what the middle of the window says, so that an outlier does not bend the first fit
     axis_first = np.moveaxis(values, -1, 0)  # [D, N, K]
     middle = np.moveaxis(_median(axis_first, np.broadcast_to(used, axis_first.shape)), 0, -1)[:, None]
@@ -212,18 +221,18 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
     scale = np.maximum(_median(residuals, used), noise)
     weights = near / (1 + (residuals / (3 * scale[:, None])) ** 2)
     axes = np.sqrt(values.shape[-1])
-    for round_ in range(N_ROUNDS + 1):
+    for round_ in range(SETTINGS.rounds + 1):
         normal = np.einsum("nk,nki,nkj->nij", weights, powers, powers) + ridge[:, :, None] * np.eye(3)
         right = np.einsum("nk,nki,nkd->nid", weights, powers, values)
         normal[:, 0, 0] += 1e-300
         coefficients = np.linalg.solve(normal, right)
-        if round_ == N_ROUNDS:
+        if round_ == SETTINGS.rounds:
             break
         residuals = np.linalg.norm(values - powers @ coefficients, axis=-1)
         scale = np.maximum(1.48 * _median(residuals, used) / axes, noise)
-        weights = near * np.clip(1 - (residuals / (CUTOFF_SD * axes * scale[:, None])) ** 2, 0, None) ** 2
+        weights = near * np.clip(1 - (residuals / (SETTINGS.cutoff_sd * axes * scale[:, None])) ** 2, 0, None) ** 2
         # where too few samples are left, all count
-        too_few = (weights > 0).sum(axis=1) < MIN_SAMPLES
+        too_few = (weights > 0).sum(axis=1) < SETTINGS.min_samples
         weights[too_few] = near[too_few]
     return coefficients[:, 0]
 

@@ -9,13 +9,14 @@ The layout is that of the data set's readme (Gao et al. 2014, "The JHU-ISI Gestu
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
-from neeco.ingest.readers import POSES, RecordingFormat, Stream, Table, choose_stream, parse_number
+from neeco.ingest.readers import POSES, RecordingFormat, Stream, Table, choose_stream, file_state, parse_number
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.delimited import read_cells
 from neeco.ingest.readers.frame_names import NamedFrame
@@ -41,23 +42,34 @@ class JigsawsKinematics(RecordingFormat):
         )
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        count = len(read_cells(path).lines)
-        hints = ("poses are stated in the frame of this arm's own base",)
+        count = len(_lines(path, file_state(path))[0])
         return tuple(
             Stream(
                 arm, POSES, "tool tip in the arm's base", count, RATE_HZ, offered=arm.startswith("slave"),
-                body=arm.replace(" ", "_"), joints=(("gripper_angle", GRIPPER),), hints=hints, clock=VIDEO_CLOCK,
+                body=arm.replace(" ", "_"), joints=(("gripper_angle", GRIPPER),), clock=VIDEO_CLOCK,
+                hints=("poses are stated in the frame of this arm's own base",),
             )
             for arm in ARMS
         )  # fmt: skip
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         arm = choose_stream(path, self.streams(path), stream, (POSES,)).name
-        text, columns = read_cells(path), COLUMNS * len(ARMS)
-        bad = (text.counts != columns) | ~text.numeric(slice(None))[:, :columns].all(axis=1)
+        values, lines = _lines(path, file_state(path))
+        bad = np.isnan(values).any(axis=1)
         if bad.any():
-            line = text.lines[bad][0]
-            raise NeecoError(f"{path}: line {line}: has not {columns} numbers; repair it, or cut the file there")
+            problem = f"has not {COLUMNS * len(ARMS)} numbers"
+            raise NeecoError(f"{path}: line {lines[bad][0]}: {problem}; repair it, or cut the file there")
         used = [COLUMNS * ARMS.index(arm) + index for index in USED]
-        rows = np.column_stack([np.arange(len(text.lines)) / RATE_HZ, text.cells[:, used].astype(np.float64)])
-        return Table(path, HEADER, rows, text.lines, stream=arm, meaning=NamedFrame(BASE), image_hz=RATE_HZ)
+        rows = np.column_stack([np.arange(len(values)) / RATE_HZ, values[:, used]])
+        return Table(path, HEADER, rows, lines, stream=arm, meaning=NamedFrame(BASE), image_hz=RATE_HZ)
+
+
+@lru_cache(maxsize=2)
+def _lines(path: Path, state: tuple[object, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return numbers [R, 76], NaN in lines that have not as many, and the lines [R] that they stand in."""
+    text, count = read_cells(path), COLUMNS * len(ARMS)
+    cells = text.cells[:, :count].tolist()
+    values = np.array([[parse_number(cell) for cell in row] for row in cells], np.float64)
+    padded = np.full((len(cells), count), np.nan)
+    padded[text.counts == count, : values.shape[1]] = values[text.counts == count]
+    return padded, text.lines

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from io import BytesIO
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -51,22 +50,17 @@ from neeco.ingest.readers.lerobot_files import (
     DataSet,
     Episode,
     Feature,
+    LeRobotLimits,
     batches,
     parquet_names,
-    read_columns,
     read_data_set,
-    read_scalars,
 )
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
 TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
-MAX_PIXELS = 90_000_000  # of an image, as for files of images
-IMAGES_AT_ONCE = 16  # of those that stand in Parquet
-MAX_IMAGES = 10**7  # of a film: timestamps beyond are those of a clock
-UNIT_TOLERANCE = 1e-3  # of a quaternion's length, and of R^T R - I: rounding of float32 and text
 DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
-_NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
+_NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*/\s*(\S+)\s*", re.IGNORECASE)
 
 
 class LeRobot(RecordingFormat):
@@ -76,6 +70,7 @@ class LeRobot(RecordingFormat):
     holds = "poses, readings and images of an episode: folders of versions 2.0, 2.1 and 3.0 (meta/info.json)"
     package = "pyarrow"
     extra = "lerobot"
+    limits = LeRobotLimits()
 
     def claims(self, path: Path) -> bool:
         return b'"codebase_version"' in read_head(path / "meta" / "info.json", 2**20)
@@ -93,7 +88,7 @@ class LeRobot(RecordingFormat):
         episode, key = self._chosen(data, stream, (POSES, READINGS))
         names, name = data.features[key].names, f"episode {episode.number}/{key}"
         times, order, _, notes = _times(data, episode)
-        rows = np.column_stack([times, self._values(episode, key, names)[order]])
+        rows = np.column_stack([times, data.columns(episode, {key: len(names)})[key][order]])
         return Table(
             path, (TIME, *names), rows, np.arange(len(rows)), stream=name, record="frame", notes=notes,
             meaning=_meaning(key, names),
@@ -104,28 +99,29 @@ class LeRobot(RecordingFormat):
         episode, key = self._chosen(data, stream, (IMAGES,))
         times, order, places, notes = _times(data, episode)
         if data.features[key].dtype == "image":
-            return _open_stored(data, episode, key, times, order, notes)
+            stored = _Stored(
+                episode.data, (0, 0), notes, times, key=key, episode=episode.number, limits=self.limits,
+                rows=tuple(order.tolist()),
+            )  # fmt: skip
+            height, width = next(stored.read([0]))[1].shape[:2]
+            return replace(stored, size=(width, height))
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
-        film = episode.films[key]
-        part = film.part
+        film, part = episode.films[key]
         if part is not None and places[-1] >= len(places):  # the part was counted without the rows that were removed
             part = part[0], max(part[1], part[0] + (int(places[-1]) + 1) / data.fps)
-        video = open_video(film.file, part=part)
+        video = open_video(film, part=part)
         # the episode's frame of each of the video's, in which those that cannot be decoded are missing
         numbers = np.rint(video.times / float(np.median(np.diff(video.times)))).astype(np.int64)
         damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
         count = int(places[-1]) + 1  # images that the states belong to, and those between
         last = int(numbers[-1]) + 1
-        if last < count and last == len(times):
-            places, count = np.arange(last), last
-            notes = (*notes, f"{film.file.name}: is shorter than its timestamps; state i is taken to be of image i")
         shown = max(last, count) if damaged else max(last, len(numbers)) if last > count else len(numbers)
         noun, remedy = f"states of episode {episode.number}", "download the data set again, or name another episode"
         if count > len(times):
-            notes = (*notes, f"{film.file.name}: by timestamps, not all images have {noun}; the others are left out")
+            notes = (*notes, f"{film.name}: by timestamps, not all images have {noun}; the others are left out")
             noun, shown = f"that the timestamps of episode {episode.number} reach", min(shown, count)
-        notes = (*notes, *compare_counts(film.file, shown, count, noun, remedy=remedy))
+        notes = (*notes, *compare_counts(film, shown, count, noun, remedy=remedy))
         row = np.full(max(last, count), -1)
         row[places] = np.arange(len(times))
         usable = row[numbers] >= 0
@@ -145,7 +141,7 @@ class LeRobot(RecordingFormat):
 
     def _data_set(self, path: Path) -> DataSet:
         self.require_package(path)
-        return read_data_set(path)
+        return read_data_set(path, self.limits)
 
     def _chosen(self, data: DataSet, stream: str | None, kinds: Sequence[str]) -> tuple[Episode, str]:
         """Return the episode and the feature that a stream names; the only ones there are where none is named."""
@@ -163,7 +159,7 @@ class LeRobot(RecordingFormat):
     def _episode_streams(self, data: DataSet, episode: Episode) -> tuple[Stream, ...]:
         found = []
         absent = dict(episode.absent)
-        for key in set(data.features) - set(data.films) - set(parquet_names(episode.data)):
+        for key in set(data.features) - set(data.films) - set(parquet_names(episode.data, self.limits)):
             absent[key] = f"{episode.data}: has no column {printable(key)}; download the data set again"
         for key in sorted(data.features, key=_camera_order):
             feature, name = data.features[key], f"episode {episode.number}/{key}"
@@ -191,131 +187,102 @@ class LeRobot(RecordingFormat):
         if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
             return [plain]
         bodies = pose_bodies(feature.names)
-        readings, found = joint_columns(feature.names, bodies), []
+        readings, streams = joint_columns(feature.names, bodies), []
         for prefix, columns in bodies.items():
             body, poses = without_frame(prefix), recognise_pose(columns)
             if poses.position is None:
                 continue
-            own = [name for name in readings if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
-            joints = tuple((_joint_name(name, body), name) for name in own)
+            of_body = [name for name in readings if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
             columns = tuple(name for name in columns if name not in readings)
-            asks = () if poses.rotation else _rotation_asks(self._columns(episode, feature, columns), columns)
+            asks = () if poses.rotation else _rotation_asks(data, episode, feature, columns)
             meaning = _meaning(feature.key, columns)
-            found.append(replace(plain, kind=POSES, offered=True, body=body or UNNAMED, joints=joints, columns=columns,
-                                 hints=meaning.hints, asks=(*meaning.asks, *asks)))  # fmt: skip
-        if found:
-            return found
-        asks = _rotation_asks(self._columns(episode, feature, feature.names), feature.names)
-        if asks:
+            streams.append(
+                replace(
+                    plain, kind=POSES, offered=True, body=body or UNNAMED, columns=columns, hints=meaning.hints,
+                    joints=tuple((_joint_name(name, body), name) for name in of_body), asks=(*meaning.asks, *asks),
+                )
+            )  # fmt: skip
+        if not streams and (asks := _rotation_asks(data, episode, feature, feature.names)):
             meaning = _meaning(feature.key, feature.names)
-            return [replace(plain, kind=POSES, offered=True, body=UNNAMED, hints=meaning.hints,
-                            asks=(*meaning.asks, *asks), joints=(), columns=())]  # fmt: skip
-        return [plain]
-
-    def _columns(self, episode: Episode, feature: Feature, columns: Sequence[str]) -> np.ndarray:
-        values = self._values(episode, feature.key, feature.names)
-        return values[:, [feature.names.index(column) for column in columns]]
-
-    def _values(self, episode: Episode, key: str, names: Sequence[str]) -> np.ndarray:
-        values = read_columns(episode.data, ["episode_index", key], episode.number)[key]
-        if values.shape[1] != len(names):
-            raise NeecoError(
-                f"{episode.data}: {key}: has {values.shape[1]} numbers a row, meta/info.json says {len(names)}; "
-                "download the data set again"
-            )
-        return values
+            asked = replace(plain, kind=POSES, offered=True, body=UNNAMED, joints=(), columns=())
+            streams = [replace(asked, hints=meaning.hints, asks=(*meaning.asks, *asks))]
+        return streams or [plain]
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Stored(VideoSource):
-    """Images that stand in the Parquet file, as PNG or JPEG. rows: of the episode, in its file, of each image."""
+    """Images that stand in the Parquet file, as PNG or JPEG. rows: of the episode, in its file, of each image; size:
+    (0, 0) until the first was read."""
 
     key: str
     episode: int
+    limits: LeRobotLimits
     rows: tuple[int, ...]
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.rows[int(index)]: int(index) for index in indices}
         row = 0
         with ThreadPoolExecutor(DECODERS) as pool:  # zlib lets other threads run
-            for cells in _cells(self.path, self.key, self.episode):
-                numbers = [number for number in range(row, row + len(cells)) if number in wanted]
-                chosen = [cells[number - row] for number in numbers]
-                places = [f"{self.path}: {self.key}: frame {wanted[number]}" for number in numbers]
+            for cells in self._cells():
+                chosen = [number for number in range(row, row + len(cells)) if number in wanted]
+                contents = [cells[number - row] for number in chosen]
                 row += len(cells)
-                for number, pixels in zip(numbers, pool.map(_decoded, places, chosen, repeat(self.size)), strict=True):
+                for number, pixels in zip(chosen, pool.map(self._decoded, chosen, contents), strict=True):
                     yield wanted.pop(number), pixels
                 if not wanted:
                     return
-        if wanted:
-            raise NeecoError(f"{self.path}: {self.key}: is shorter than before; do not change the data set")
+        raise NeecoError(f"{self.path}: {self.key}: holds fewer images than states; download the data set again")
 
+    def _cells(self) -> Iterator[list[Any]]:
+        """Yield the bytes of some images of the episode at a time."""
+        import pyarrow
 
-def _open_stored(
-    data: DataSet, episode: Episode, key: str, times: np.ndarray, order: np.ndarray, notes: tuple[str, ...]
-) -> VideoSource:
-    where = f"{episode.data}: {key}"
-    first = next(_cells(episode.data, key, episode.number), None)
-    if not first:
-        raise NeecoError(f"{where}: holds no images of episode {episode.number}; download it again")
-    height, width = _decoded(f"{where}: frame 0", first[0], None).shape[:2]
-    rows = tuple(order.tolist())
-    return _Stored(episode.data, (width, height), notes, times, key=key, episode=episode.number, rows=rows)
+        columns = ["episode_index", self.key]
+        for part in batches(self.path, columns, self.limits, self.episode, self.limits.images_at_once):
+            column = part.column(self.key)
+            if pyarrow.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0:
+                column = column.field("bytes")
+            if not (pyarrow.types.is_binary(column.type) or pyarrow.types.is_large_binary(column.type)):
+                kind = printable(str(column.type))
+                raise NeecoError(f"{self.path}: {self.key}: holds {kind}, no images; name another feature")
+            yield column.to_pylist()
 
-
-def _cells(file: Path, key: str, episode: int) -> Iterator[list[Any]]:
-    """Yield the bytes of a column of images, of some rows of the episode at a time."""
-    import pyarrow
-
-    for part in batches(file, ["episode_index", key], episode, IMAGES_AT_ONCE):
-        column = part.column(key)
-        if pyarrow.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0:
-            column = column.field("bytes")
-        if not (pyarrow.types.is_binary(column.type) or pyarrow.types.is_large_binary(column.type)):
-            raise NeecoError(f"{file}: {key}: holds {printable(str(column.type))}, no images; name another feature")
-        yield column.to_pylist()
-
-
-def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np.ndarray:
-    if cell is None:
-        raise NeecoError(f"{where}: has no image in it; write the data set with its images")
-    try:
-        with Image.open(BytesIO(cell), formats=FORMATS) as image:
-            if image.size[0] * image.size[1] > MAX_PIXELS:
-                raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
-            pixels = np.array(image.convert("RGB"))
-    except NeecoError:
-        raise
-    except Exception as error:  # Pillow's decoders raise nearly anything
-        raise NeecoError(f"{where}: cannot be decoded; download the episode again") from error
-    if size is not None and pixels.shape[1::-1] != size:
-        raise NeecoError(f"{where}: is {pixels.shape[1]}x{pixels.shape[0]}, the first {size[0]}x{size[1]}")
-    return pixels
+    def _decoded(self, row: int, cell: bytes | None) -> np.ndarray:
+        where = f"{self.path}: {self.key}: row {row} of episode {self.episode}"
+        try:
+            with Image.open(BytesIO(cell or b""), formats=FORMATS) as image:
+                if image.size[0] * image.size[1] > self.limits.pixels:
+                    raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
+                pixels = np.array(image.convert("RGB"))
+        except NeecoError:
+            raise
+        except Exception as error:  # Pillow's decoders raise nearly anything
+            raise NeecoError(f"{where}: cannot be decoded; download the episode again") from error
+        if self.size not in ((0, 0), pixels.shape[1::-1]):
+            height, width = pixels.shape[:2]
+            raise NeecoError(f"{where}: is {width}x{height}, the first {self.size[0]}x{self.size[1]}; repair it")
+        return pixels
 
 
 def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, the number of
     each row's image in its film: the one nearest to its timestamp where no two share one, and notes."""
-    table = read_scalars(episode.data, ["episode_index", "timestamp", "frame_index"], episode.number)
-    frames, stamps = table["frame_index"], table["timestamp"]
+    table = data.columns(episode, {"timestamp": 1, "frame_index": 1})
+    order = np.argsort(table["frame_index"][:, 0], kind="stable")
+    frames, stamps = table["frame_index"][order, 0], table["timestamp"][order, 0]
     if len(frames) != episode.length:
-        raise NeecoError(
-            f"{episode.data}: has {len(frames)} rows of episode {episode.number}, meta says {episode.length}; download "
-            "the data set again"
-        )
-    order = np.argsort(frames, kind="stable")
-    frames, stamps = frames[order], stamps[order]
-    if not np.array_equal(frames, np.arange(len(frames))):
+        what = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}"
+        raise NeecoError(f"{episode.data}: {what}; download the data set again")
+    rows = np.arange(len(frames))
+    if not np.array_equal(frames, rows):
         raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")
-    rows, steps = np.arange(len(frames)), np.diff(stamps)
-    if np.isfinite(stamps).all() and (steps > 0).all():
-        places = np.rint(stamps * data.fps)
-        if (np.diff(places) > 0).all() and places[0] >= 0 and places[-1] < MAX_IMAGES:
-            return stamps - stamps[0], order, places.astype(np.int64), ()
-        note = f"episode {episode.number}: its timestamps name no images; state i is taken to be of image i"
-        return stamps - stamps[0], order, rows, (f"{data.path.name}: {note}",)
-    note = f"episode {episode.number}: its timestamps do not increase; taken as {data.fps:g} a second"
-    return frames / data.fps, order, rows, (f"{data.path.name}: {note}",)
+    title = f"{data.path.name}: episode {episode.number}: its timestamps"
+    if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
+        return frames / data.fps, order, rows, (f"{title} do not increase; taken as {data.fps:g} a second",)
+    places = np.rint(stamps * data.fps)
+    if (np.diff(places) > 0).all() and places[0] >= 0 and places[-1] < data.limits.film_images:
+        return stamps - stamps[0], order, places.astype(np.int64), ()
+    return stamps - stamps[0], order, rows, (f"{title} name no images; state i is taken to be of image i",)
 
 
 def _kind(feature: Feature) -> str:
@@ -330,36 +297,31 @@ def _meaning(key: str, columns: Sequence[str]) -> NamedFrame:
     return meaning_in([key], dvrk=dvrk) or meaning_in(columns, dvrk=dvrk) or unsaid(dvrk=dvrk)
 
 
-def find_rotations(values: np.ndarray) -> list[tuple[int, str]]:
+def find_rotations(values: np.ndarray, tolerance: float) -> list[tuple[int, str]]:
     """Return (first column, QUATERNION_WXYZ or ROTATION_MATRIX) of rotations among numbers [R, C]: four of unit length
-    in either order, of which more than one changes, or nine that are a rotation matrix in every row."""
-    values = values.astype(np.float64)
-    values = values[np.isfinite(values).all(axis=1)]
-    if not len(values):
-        return []
-    found, place = [], 0
-    while place <= values.shape[1] - 4:
-        four = values[:, place : place + 4]
-        nine = values[:, place : place + 9]
-        if nine.shape[1] == 9 and _are_rotations(nine.reshape(-1, 3, 3)):
-            found.append((place, ROTATION_MATRIX))
+    in either order, of which more than one changes, or nine that are a rotation matrix in every row. tolerance: of a
+    length, and of R^T R - I."""
+    values = values[np.isfinite(values).all(axis=1)].astype(np.float64)
+    rotations, place = [], 0
+    while len(values) and place <= values.shape[1] - 4:
+        four, nine = values[:, place : place + 4], values[:, place : place + 9]
+        matrices = nine.reshape(-1, 3, 3) if nine.shape[1] == 9 else np.zeros((1, 3, 3))
+        if rotation_error(matrices).max() < tolerance and (np.linalg.det(matrices) > 0).all():
+            rotations.append((place, ROTATION_MATRIX))
             place += 9
-        elif np.abs(np.linalg.norm(four, axis=1) - 1).max() < UNIT_TOLERANCE and (np.ptp(four, axis=0) > 0).sum() > 1:
-            found.append((place, QUATERNION_WXYZ))
+        elif np.abs(np.linalg.norm(four, axis=1) - 1).max() < tolerance and (np.ptp(four, axis=0) > 0).sum() > 1:
+            rotations.append((place, QUATERNION_WXYZ))
             place += 4
         else:
             place += 1
-    return found
+    return rotations
 
 
-def _are_rotations(matrices: np.ndarray) -> bool:
-    return bool(rotation_error(matrices).max() < UNIT_TOLERANCE and (np.linalg.det(matrices) > 0).all())
-
-
-def _rotation_asks(values: np.ndarray, columns: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns that may be a rotation by their numbers [R, C], as lines to choose from."""
-    asks = []
-    for place, kind in find_rotations(values):
+def _rotation_asks(data: DataSet, episode: Episode, feature: Feature, columns: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of a feature that may be a rotation by their numbers, as lines to choose from."""
+    values = data.columns(episode, {feature.key: len(feature.names)})[feature.key]
+    values, asks = values[:, [feature.names.index(column) for column in columns]], []
+    for place, kind in find_rotations(values, data.limits.unit_tolerance):
         size, why = 4, "or quaternion_xyzw: their length is 1, nothing says their order"
         if kind == ROTATION_MATRIX:
             size, why = 9, "or column by column: list them so that they stand row by row"

@@ -24,11 +24,21 @@ EPISODES_2, EPISODES_3 = "meta/episodes.jsonl", "meta/episodes"
 VERSIONS = re.compile(r"v?(2)\.[01]|v?(3)\.0")
 FILM_COLUMNS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")  # of each camera, version 3
 FIXED = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns that every data set has
-MAX_NUMBERS = 4096  # of one feature in a row; more are an image or a point cloud
-MAX_BYTES = 2**30  # that the columns read of a row group may unpack to
-BUFFER_BYTES = 2**20  # of a column, read at a time
 _FIELD = re.compile(r"\{(\w+)(?::(0?\d{1,2}d))?\}")
 Record = dict[str, int | float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeRobotLimits:
+    """Limits on what is read of a data set."""
+
+    numbers: int = 4096  # of one feature in a row; more are an image or a point cloud
+    group_bytes: int = 1 << 30  # that the columns read of a row group may unpack to
+    buffer_bytes: int = 1 << 20  # of a column, read at a time
+    pixels: int = 90_000_000  # of an image, as for files of images
+    images_at_once: int = 16  # of those that stand in Parquet
+    film_images: int = 10**7  # timestamps beyond are those of a clock
+    unit_tolerance: float = 1e-3  # of a quaternion's length, and of R^T R - I: rounding of float32 and text
 
 
 class _NotThere(NeecoError):
@@ -47,22 +57,14 @@ class Feature:
 
 
 @dataclass(frozen=True)
-class Film:
-    """The file of an episode's images of one camera, and its part (s, None: all of it)."""
-
-    file: Path
-    part: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
 class Episode:
-    """One episode: its number, how many rows it has, and its files; absent: cameras whose file is not there, and why in
-    words."""
+    """One episode: its number, how many rows it has, and its files; films: the file of each camera's images, and the
+    part of it (s, None: all); absent: cameras whose file is not there, and why in words."""
 
     number: int
     length: int
     data: Path
-    films: Mapping[str, Film]
+    films: Mapping[str, tuple[Path, tuple[float, float] | None]]
     absent: Mapping[str, str]
 
 
@@ -72,6 +74,7 @@ class DataSet:
     stated of each episode, by its number."""
 
     path: Path
+    limits: LeRobotLimits
     version: int
     fps: float
     features: Mapping[str, Feature]
@@ -93,14 +96,13 @@ class DataSet:
 
     def first_present(self) -> Episode:
         """Return the first episode whose states were downloaded. Raises NeecoError."""
-        problem = None
+        problems = []
         for number in self.records:
             try:
                 return self.episode(number)
             except _NotThere as error:
-                problem = problem or error
-        assert problem is not None
-        raise problem
+                problems.append(error)
+        raise problems[0]
 
     def episode(self, number: int) -> Episode:
         """Return one episode. Raises NeecoError when it is not there."""
@@ -118,18 +120,22 @@ class DataSet:
                 absent[key] = str(error)
         return Episode(number, int(record["length"]), self._file("data_path", place), films, absent)
 
-    def _film(self, key: str, record: Record, place: Mapping[str, Any]) -> Film:
+    def _film(self, key: str, record: Record, place: Mapping[str, Any]) -> tuple[Path, tuple[float, float] | None]:
         """Return the place of one camera's images of an episode. Raises _NotThere, and NeecoError for an impossible
         one."""
         if self.version == 2:
-            return Film(self._file("video_path", {**place, "video_key": key}))
-        own = {name: record.get(f"videos/{key}/{name}") for name in FILM_COLUMNS}
-        start, end = own["from_timestamp"], own["to_timestamp"]
-        if None in own.values() or start is None or end is None:
+            return self._file("video_path", {**place, "video_key": key}), None
+        of_film = {name: record.get(f"videos/{key}/{name}") for name in FILM_COLUMNS}
+        start, end = of_film["from_timestamp"], of_film["to_timestamp"]
+        if None in of_film.values() or start is None or end is None:
             raise _NotThere(f"{self.path / EPISODES_3}: states no images of {printable(key)}; download it again")
         if not 0 <= start < end < 1e9:  # NaN compares false
             raise NeecoError(f"{self.path}: {key}: from {start:g} to {end:g} s is no part of a video; correct meta")
-        return Film(self._file("video_path", {**own, "video_key": key}), (start, end))
+        return self._file("video_path", {**of_film, "video_key": key}), (start, end)
+
+    def columns(self, episode: Episode, widths: Mapping[str, int]) -> dict[str, np.ndarray]:
+        """Return columns of an episode as `read_columns` does."""
+        return read_columns(episode.data, {"episode_index": 1, **widths}, self.limits, episode.number)
 
     def _file(self, field: str, values: Mapping[str, Any]) -> Path:
         """Return the file that a template of info.json names. Raises NeecoError when it leads out of the data set."""
@@ -147,16 +153,16 @@ class DataSet:
         return require_inside(self.path / parts, _boundary(self.path))
 
 
-def read_data_set(path: Path) -> DataSet:
+def read_data_set(path: Path, limits: LeRobotLimits) -> DataSet:
     """Read meta/info.json and the list of episodes, once while they stay the same. Raises NeecoError naming field and
     remedy."""
     folder = path / EPISODES_3
     files = [path / INFO, path / EPISODES_2, *(folder.glob("chunk-*/*.parquet") if folder.is_dir() else ())]
-    return _described(path, file_state(*sorted(file for file in files if file.exists())))
+    return _described(path, limits, file_state(*sorted(file for file in files if file.exists())))
 
 
 @lru_cache(maxsize=4)
-def _described(path: Path, state: tuple[object, ...]) -> DataSet:
+def _described(path: Path, limits: LeRobotLimits, state: tuple[object, ...]) -> DataSet:
     file = path / INFO
     require_inside(file, _boundary(path))
     info = read_json(file)
@@ -164,33 +170,33 @@ def _described(path: Path, state: tuple[object, ...]) -> DataSet:
         raise NeecoError(f"{file}: expected an object with codebase_version, fps and features; download it again")
     match = VERSIONS.fullmatch(str(info.get("codebase_version")))
     if match is None:
-        found = printable(info.get("codebase_version"))
-        raise NeecoError(f"{file}: codebase_version: {found} is not read; convert the data set to v2.1 or v3.0")
-    version, fps, chunks = int(match[1] or match[2]), as_float(info.get("fps")), info.get("chunks_size", 1000)
-    features, data, video = info.get("features"), info.get("data_path"), info.get("video_path")
+        version = printable(info.get("codebase_version"))
+        raise NeecoError(f"{file}: codebase_version: {version} is not read; convert the data set to v2.1 or v3.0")
+    fps, chunks = as_float(info.get("fps")) or 0.0, info.get("chunks_size", 1000)
+    stated: dict[str, Any] = {key: info.get(key) for key in ("features", "data_path", "video_path")}
     valid = {
-        "fps": fps is not None and 0 < fps < 1e5,
+        "fps": 0 < fps < 1e5,  # NaN compares false
         "chunks_size": type(chunks) is int and chunks > 0,
-        "features": isinstance(features, dict) and len(features) > 0,
-        "data_path": isinstance(data, str),
-        "video_path": isinstance(video, str | None),
+        "features": isinstance(stated["features"], dict) and len(stated["features"]) > 0,
+        "data_path": isinstance(stated["data_path"], str),
+        "video_path": isinstance(stated["video_path"], str | None),
     }
     if wrong := next((name for name, good in valid.items() if not good), None):
         raise NeecoError(f"{file}: {wrong}: {printable(info.get(wrong))} cannot be; correct it")
-    assert isinstance(fps, float)
-    assert isinstance(features, dict)
-    assert isinstance(data, str)
-    known = {key: _feature(file, key, value) for key, value in features.items()}
-    films = [key for key, feature in known.items() if feature.dtype == "video"]
+    features = {key: _feature(file, key, value, limits) for key, value in stated["features"].items()}
+    films = [key for key, feature in features.items() if feature.dtype == "video"]
+    records = _records_3(path, films, limits) if match[2] else _records_2(path)
+    if not records:
+        raise NeecoError(f"{path}: holds no episode; download the data set again, with all of meta")
     return DataSet(
-        path=path, version=version, fps=fps, features=known, data_path=data, video_path=video,
-        chunks_size=chunks, records=_records_2(path) if version == 2 else _records_3(path, films),
+        path=path, limits=limits, version=3 if match[2] else 2, fps=fps, chunks_size=chunks, records=records,
+        **stated | {"features": features},
     )  # fmt: skip
 
 
 def _records_2(path: Path) -> dict[int, Record]:
     """The length of each episode, by its number."""
-    file, found = path / EPISODES_2, dict[int, Record]()
+    file, records = path / EPISODES_2, dict[int, Record]()
     if file.exists():
         require_inside(file, _boundary(path))
     for line, text in enumerate(read_text(file, "episodes, one a line").splitlines(), 1):
@@ -201,27 +207,24 @@ def _records_2(path: Path) -> dict[int, Record]:
             except (ValueError, TypeError, KeyError, RecursionError):
                 number, length = None, None
             where = f"{file}: line {line}"
-            found[_count(where, number)] = {"length": _count(where, length)}
-    if not found:
-        raise NeecoError(f"{path}: holds no episode; download the data set again")
-    return found
+            records[_count(where, number)] = {"length": _count(where, length)}
+    return records
 
 
-def _records_3(path: Path, films: Sequence[str]) -> dict[int, Record]:
+def _records_3(path: Path, films: Sequence[str], limits: LeRobotLimits) -> dict[int, Record]:
     """The length of each episode, by its number, and the places of its rows and images."""
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
     of_films = [f"videos/{key}/{name}" for key in films for name in FILM_COLUMNS]
-    found: dict[int, Record] = {}
+    records: dict[int, Record] = {}
     for file in visible_entries(path / EPISODES_3, "chunk-*/*.parquet"):
-        held = parquet_names(require_inside(file, _boundary(path)))
-        table = read_scalars(file, [*columns, *(name for name in of_films if name in held)], None)
-        for row in range(len(table["length"])):
-            record = {name: float(values[row]) for name, values in table.items()}
+        there = parquet_names(require_inside(file, _boundary(path)), limits)
+        names = [*columns, *(name for name in of_films if name in there)]
+        table = read_columns(file, dict.fromkeys(names, 1), limits)
+        for row, values in enumerate(np.concatenate([table[name] for name in names], 1).tolist()):
+            record = dict(zip(names, values, strict=True))
             counts = {name: _count(f"{file}: row {row}", value) for name, value in record.items() if "time" not in name}
-            found[counts["episode_index"]] = {**record, **counts}
-    if not found:
-        raise NeecoError(f"{path / EPISODES_3}: holds no Parquet file of episodes; download it, too")
-    return found
+            records[counts["episode_index"]] = {**record, **counts}
+    return records
 
 
 def _count(where: str, value: Any) -> int:
@@ -230,38 +233,39 @@ def _count(where: str, value: Any) -> int:
     return int(value)
 
 
-def parquet_names(path: Path) -> list[str]:
+def parquet_names(path: Path, limits: LeRobotLimits) -> list[str]:
     """Return the columns of a Parquet file. Raises NeecoError."""
-    return list(_fragment(path).physical_schema.names)
+    return list(_fragment(path, limits).physical_schema.names)
 
 
-def read_columns(path: Path, columns: Sequence[str], episode: int | None) -> dict[str, np.ndarray]:
+def read_columns(
+    path: Path, widths: Mapping[str, int], limits: LeRobotLimits, episode: int | None = None
+) -> dict[str, np.ndarray]:
     """Return columns of numbers, or of lists of them, as float64 [R, C], only of the rows of an episode where one is
-    given. Raises NeecoError."""
-    parts = list(batches(path, columns, episode, 2**16))
-    found = {}
-    for name in columns:
-        values = [_numbers(f"{path}: {name}", part.column(name)) for part in parts if len(part)]
-        if len({part.shape[1] for part in values}) > 1:
-            raise NeecoError(f"{path}: {name}: its rows have different lengths; name another feature")
-        found[name] = np.concatenate(values) if values else np.zeros((0, 1))
-    return found
+    given. widths: how many numbers a row of each has. Raises NeecoError."""
+    parts = [part for part in batches(path, list(widths), limits, episode) if len(part)]
+    table = {}
+    for name, width in widths.items():
+        rows = [row for part in parts for row in part.column(name).to_pylist()]
+        try:
+            values = np.array(rows, np.float64).reshape(len(rows), -1 if rows else width)
+        except (ValueError, TypeError):
+            kind = parts[0].column(name).type
+            raise NeecoError(f"{path}: {name}: holds {kind}, no numbers, as many in each row; name another") from None
+        if values.shape[1] != width:
+            problem = f"has {values.shape[1]} numbers a row, not {width}"
+            raise NeecoError(f"{path}: {name}: {problem}; download the data set again")
+        table[name] = values
+    return table
 
 
-def read_scalars(path: Path, columns: Sequence[str], episode: int | None) -> dict[str, np.ndarray]:
-    """Return columns of one number a row [R], as `read_columns` does. Raises NeecoError."""
-    table = read_columns(path, columns, episode)
-    for name, values in table.items():
-        if values.shape[1] != 1:
-            raise NeecoError(f"{path}: {name}: expected one number in each row; download the data set again")
-    return {name: values[:, 0] for name, values in table.items()}
-
-
-def batches(path: Path, columns: Sequence[str], episode: int | None, rows: int) -> Iterator[Any]:
+def batches(
+    path: Path, columns: Sequence[str], limits: LeRobotLimits, episode: int | None, rows: int = 2**16
+) -> Iterator[Any]:
     """Yield columns as pyarrow's record batches of at most so many rows. Raises NeecoError."""
     import pyarrow.dataset
 
-    file = _fragment(path)
+    file = _fragment(path, limits)
     for name in columns:
         if name not in file.physical_schema.names:
             listed = printable(", ".join(file.physical_schema.names), 300).strip("'")
@@ -273,21 +277,22 @@ def batches(path: Path, columns: Sequence[str], episode: int | None, rows: int) 
             data, leaves = file.metadata.row_group(group.id), tuple(f"{name}." for name in columns)
             chunks = [data.column(index) for index in range(data.num_columns)]
             read = [chunk for chunk in chunks if f"{chunk.path_in_schema}.".startswith(leaves)]
-            if sum(chunk.total_uncompressed_size for chunk in read) > MAX_BYTES:
-                raise NeecoError(f"{path}: unpacks to over {MAX_BYTES >> 20} MiB at once; write smaller row groups")
+            if sum(chunk.total_uncompressed_size for chunk in read) > limits.group_bytes:
+                size = f"{limits.group_bytes >> 20} MiB"
+                raise NeecoError(f"{path}: unpacks to over {size} at once; write smaller row groups")
         yield from part.to_batches(
             columns=list(columns), filter=wanted, batch_size=rows, batch_readahead=0, use_threads=False
         )
 
 
-def _fragment(path: Path) -> Any:
+def _fragment(path: Path, limits: LeRobotLimits) -> Any:
     import pyarrow.dataset
     import pyarrow.fs
 
     require_content(path)
     with _damage_named(path):
         # a buffer: else all of a column is taken into memory, and images can stand in it
-        options = pyarrow.dataset.ParquetFragmentScanOptions(use_buffered_stream=True, buffer_size=BUFFER_BYTES)
+        options = pyarrow.dataset.ParquetFragmentScanOptions(use_buffered_stream=True, buffer_size=limits.buffer_bytes)
         kind = pyarrow.dataset.ParquetFileFormat(default_fragment_scan_options=options)
         fragment = kind.make_fragment(str(path), pyarrow.fs.LocalFileSystem())
         fragment.physical_schema  # noqa: B018  # which reads the file's own description
@@ -308,36 +313,18 @@ def _damage_named(path: Path) -> Iterator[None]:
         raise NeecoError(f"{path}: cannot be read as Parquet ({reason}); download it again") from None
 
 
-def _numbers(where: str, column: Any) -> np.ndarray:
-    """Return [R, C] of a column of numbers or of lists of them, all of one length; NaN of what is null."""
-    from pyarrow import ExtensionArray, compute, types
-
-    rows = len(column)
-    while True:
-        column = column.storage if isinstance(column, ExtensionArray) else column
-        kind = column.type
-        if not (types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)):
-            break
-        if len(compute.list_value_length(column).unique()) > 1:
-            raise NeecoError(f"{where}: its rows have different lengths; name another feature")
-        column = column.flatten()
-    if not (types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind)):
-        raise NeecoError(f"{where}: holds {kind}, no numbers; name another feature")
-    return np.asarray(column.to_numpy(zero_copy_only=False), np.float64).reshape(rows, -1)
-
-
 def _boundary(path: Path) -> Path:
     """Return the folder that links may not lead out of: the data set, or the hub's cache that holds its files."""
     return path.resolve().parents[1] if path.resolve().parent.name == "snapshots" else path
 
 
-def _feature(file: Path, key: str, value: Any) -> Feature:
+def _feature(file: Path, key: str, value: Any, limits: LeRobotLimits) -> Feature:
     dtype, shape = (value.get("dtype"), value.get("shape")) if isinstance(value, dict) else (None, None)
     sound = isinstance(shape, list) and all(type(side) is int and 0 <= side < 1e6 for side in shape)
     if not isinstance(dtype, str) or not isinstance(shape, list) or not sound:
         raise NeecoError(f"{file}: features: {printable(key)}: has no dtype and shape; correct it")
     count = math.prod(shape)
-    numeric = re.fullmatch(r"(float|int|uint)\d+|bool", dtype) is not None and count <= MAX_NUMBERS
+    numeric = re.fullmatch(r"(float|int|uint)\d+|bool", dtype) is not None and count <= limits.numbers
     depth = any(isinstance(held, dict) and held.get(name) for held in (value, value.get("info"))
                 for name in ("is_depth_map", "video.is_depth_map"))  # fmt: skip
     return Feature(key, dtype, tuple(shape), _names(key, shape, count, value.get("names")) if numeric else (), depth)

@@ -21,17 +21,26 @@ from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Table, column_index, numbers, parse_number, read_table
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
+from neeco.ingest.readers.delimited import tool_columns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_in, meaning_of, of_dvrk
-from neeco.ingest.readers.ndi import tool_columns
 from neeco.ingest.readers.rows import Rows, drop_stuck, find_gaps, in_order, keep_measured, read_cells, read_times
 
 _FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
 _FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?id)?")
-MAX_DISTANCE_MM = 20_000.0  # no tracker of instruments reaches farther: the unit is wrong
-MAX_ANGLE = 4 * np.pi  # rad, more than any joint turns: the unit is wrong
-CLAMPED_SHARE = 0.05  # of a calibration table's range: readings that far outside it count as its end
-NORM_TOLERANCE = 0.02  # of a quaternion's length: numbers of two decimals pass
-ROUNDED_TOLERANCE = 0.02  # of R^T R - I: loggers round to two decimals
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogSettings:
+    """Limits on the numbers of a log."""
+
+    max_distance_mm: float = 20_000.0  # no tracker of instruments reaches farther: the unit is wrong
+    max_angle: float = 4 * np.pi  # rad, more than any joint turns: the unit is wrong
+    clamped_share: float = 0.05  # of a calibration table's range: readings that far outside it count as its end
+    norm_tolerance: float = 0.02  # of a quaternion's length: numbers of two decimals pass
+    rounded_tolerance: float = 0.02  # of R^T R - I: loggers round to two decimals
+
+
+SETTINGS = LogSettings()
 
 
 @dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
@@ -172,11 +181,11 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     values = read_cells(rows, (value,))[:, 0]
     clamped: tuple[str, ...] = ()
     if source.calibration is not None:
-        values, clamped = _calibrated(rows, value, values, source, source.calibration)
+        values, clamped = _calibrated(rows, value, values, source)
     else:
         hint = " Counts need a calibration table, `calibration`."
         values = values * named.scale_of(table.where, (value,), "angle", source.units.angle, None, hint)
-        impossible = np.abs(np.where(rows.keep, values, 0)) > MAX_ANGLE
+        impossible = np.abs(np.where(rows.keep, values, 0)) > SETTINGS.max_angle
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
         rows.drop_wrong(impossible, reason)
     times, order = in_order(rows, times, source.rate_hz)
@@ -203,7 +212,9 @@ def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[s
 def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
     """Positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
     table = rows.table
-    form, rotation = _rotation_columns(table, source, found)
+    rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
+    if rotation is None or form is None:
+        raise _unclear(table, found, "rotation", "qw, qx, qy, qz columns")
     position = source.position or found.position
     if form == MATRIX:
         position, read = tuple(rotation[i] for i in (3, 7, 11)), rotation
@@ -225,7 +236,7 @@ def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[n
     what = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
     rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {what}; name the right columns")
     distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
-    if distance > MAX_DISTANCE_MM:
+    if distance > SETTINGS.max_distance_mm:
         raise NeecoError(
             f"{table.where}: {', '.join(position)}: half the samples are over {distance / 1000:.3g} m from the tracker"
             "; correct the unit in the header or in units.length"
@@ -239,30 +250,23 @@ def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: 
     form: see `columns.FORMS`; matrices by rows, of 4x4 ones the first 9 rotation cells; convention: of Euler angles;
     scale: of angles, to rad. Rows that are no rotation (or hold NaN) are NaN: scipy would take any numbers for one.
     """
-    quats = np.full((len(cells), 4), np.nan)
-    finite = np.isfinite(cells).all(axis=1)
+    quats, good = np.full((len(cells), 4), np.nan), np.isfinite(cells).all(axis=1)
     if form in (named.QUATERNION_WXYZ, named.QUATERNION_XYZW):
         norms = np.linalg.norm(cells, axis=1)
-        good = finite & (np.abs(norms - 1) <= NORM_TOLERANCE)
+        good &= np.abs(norms - 1) <= SETTINGS.norm_tolerance
         wxyz = cells if form == named.QUATERNION_WXYZ else cells[:, [3, 0, 1, 2]]
         quats[good] = wxyz[good] / norms[good, None]
         return quats, good
-    if form in (named.ROTATION_MATRIX, MATRIX):
-        matrices = cells.reshape(-1, 3, 3)
-        with np.errstate(all="ignore"):
-            good = finite & (rotation_error(matrices) <= ROUNDED_TOLERANCE)
-            good &= np.linalg.det(np.where(finite[:, None, None], matrices, 0)) > 0
+    if form in (EULER, ROTATION_VECTOR):
+        good &= (np.abs(cells * scale) < 1e4).all(axis=1)  # beyond, they are no angles, or their sine is noise
+        angles = cells[good] * scale
+        turns = Rotation.from_euler(convention or "", angles) if form == EULER else Rotation.from_rotvec(angles)
     else:
-        # beyond this, angles are something else (or the sine of them is noise)
-        good = finite & (np.abs(cells * scale) < 1e4).all(axis=1)
-    if good.any():
-        if form in (named.ROTATION_MATRIX, MATRIX):
-            rotations = Rotation.from_matrix(matrices[good])
-        elif form == EULER:
-            rotations = Rotation.from_euler(convention or "", cells[good] * scale)
-        else:
-            rotations = Rotation.from_rotvec(cells[good] * scale)
-        quats[good] = rotations.as_quat(scalar_first=True)
+        matrices = np.where(good[:, None], cells, 0).reshape(-1, 3, 3)
+        with np.errstate(all="ignore"):
+            good &= (rotation_error(matrices) <= SETTINGS.rounded_tolerance) & (np.linalg.det(matrices) > 0)
+        turns = Rotation.from_matrix(matrices[good])
+    quats[good] = turns.as_quat(scalar_first=True)
     return quats, good
 
 
@@ -271,20 +275,6 @@ def continuous(quats: np.ndarray) -> tuple[np.ndarray, int]:
     flips = np.concatenate([[False], (quats[1:] * quats[:-1]).sum(axis=1) < 0])
     signs = np.where(np.cumsum(flips) % 2, -1.0, 1.0)
     return quats * signs[:, None], int(flips.sum())
-
-
-def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumns) -> tuple[str, tuple[str, ...]]:
-    """Form and columns of the rotation."""
-    rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
-    if rotation is None or form is None:
-        raise _unclear(table, found, "rotation", "qw, qx, qy, qz columns")
-    if len(rotation) not in named.FORMS[form]:
-        wanted = " or ".join(map(str, named.FORMS[form]))
-        raise NeecoError(f"{table.where}: {form}: takes {wanted} columns, not {len(rotation)}; list them all")
-    if form == EULER and not source.euler_convention:
-        listed = ", ".join(rotation)
-        raise NeecoError(f"{table.where}: {listed}: say their euler_convention in the recording (like XYZ)")
-    return form, rotation
 
 
 def _unclear(table: Table, found: RecognisedColumns, what: str, expected: str) -> NeecoError:
@@ -340,22 +330,23 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
         raise NeecoError(
             f"{path}: {place}: expected two points or more, whose angles rise (or fall) as the counts do; measure again"
         )
-    if np.abs(angles).max() > MAX_ANGLE:
+    if np.abs(angles).max() > SETTINGS.max_angle:
         raise NeecoError(f"{path}: {angle_name}: goes beyond two turns; correct the column's unit")
     return counts, angles
 
 
 def _calibrated(
-    rows: Rows, name: str, readings: np.ndarray, source: JointColumns, path: Path
+    rows: Rows, name: str, readings: np.ndarray, source: JointColumns
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Angles [R] rad of a column of counts, by PCHIP through the table (Fritsch & Carlson 1980), which is as monotone
     as its points. Just outside the table, its end is taken, with a note; rows farther outside are dropped."""
-    table = rows.table
+    table, path = rows.table, source.calibration
+    assert path is not None
     counts, angles = read_calibration(path, source.units.angle)
     low, high = counts[0], counts[-1]
     readings = np.where(rows.keep, readings, low)
     excess = np.maximum(low - readings, readings - high)
-    outside = excess > CLAMPED_SHARE * (high - low)
+    outside = excess > SETTINGS.clamped_share * (high - low)
     values = PchipInterpolator(counts, angles)(np.clip(readings, low, high))
     clamped = (excess > 0) & ~outside
     notes: tuple[str, ...] = ()

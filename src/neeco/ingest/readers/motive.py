@@ -49,7 +49,7 @@ class MotiveExport(RecordingFormat):
         if start + 1 == len(text.lines):
             raise NeecoError(f"{path}: has a header but no rows; export the take again")
         cells, lines = text.cells[start + 1 :], text.lines[start + 1 :]
-        raw = Table(path, tuple(map(str, range(len(axes)))), cells, lines, decimal_comma=text.decimal_comma)
+        raw = Table(path, tuple(map(str, range(len(axes)))), cells, lines)
 
         def values(name: str, part: str, letters: str) -> np.ndarray:
             """[R, A] of a body's columns; NaN where it was not tracked."""

@@ -1,16 +1,23 @@
-"""Sequences that the PLUS toolkit and 3D Slicer record: transforms of tools by name, and images."""
+"""Sequences that the PLUS toolkit and 3D Slicer record: transforms of tools by name, and images, in MetaImage or NRRD.
+
+The text stands before the data, and the images one after the other. A header may promise anything: nothing is allocated
+for what it says, and compressed data is unpacked frame by frame.
+"""
 
 from __future__ import annotations
 
 import re
-from dataclasses import replace
-from functools import lru_cache
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from neeco.base.errors import NeecoError, counted
-from neeco.base.files import require_content
+from neeco.base.files import open_file, require_content
 from neeco.capture.documents import printable
 from neeco.ingest.readers import (
     IMAGES,
@@ -24,20 +31,256 @@ from neeco.ingest.readers import (
     file_state,
     parse_number,
 )
-from neeco.ingest.readers._sequencefile import META, NRRD, FrameSequence, SequenceImages, read_sequence
 from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_of, of_dvrk
 
-TRANSFORM, STATUS, TIME = "Transform", "Status", "Timestamp"
-IMAGE_STATUSES = ("ImageStatus", "Status")  # of MetaImage and NRRD files
-GOOD = "ok"
 IMAGE_STREAM = "images"
-MIN_IMAGES = 2
-_ENDS = re.compile(r"(\w+?)To([A-Z0-9]\w*)")
 HEADER = (
     "t_s",
     *(f"m{row}{column}{'_mm' if column == 3 and row < 3 else ''}" for row in range(4) for column in range(4)),
 )
+META, NRRD = (".mha", ".mhd"), (".nrrd", ".nhdr")
+TRANSFORM, STATUS, TIME = "Transform", "Status", "Timestamp"
+IMAGE_STATUSES = ("ImageStatus", "Status")  # of MetaImage and NRRD files
+GOOD = "ok"
+_ENDS = re.compile(r"(\w+?)To([A-Z0-9]\w*)")
+_FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w{1,200})")
+_UCHAR = ("uchar", "unsigned char", "uint8", "uint8_t", "met_uchar")
+_META_READ = {
+    "ElementType": _UCHAR, "BinaryData": ("", "true"), "HeaderSize": ("", "0"), "CompressedData": ("", "true", "false"),
+}  # fmt: skip
+_SKIPS = dict.fromkeys(("line skip", "lineskip", "byte skip", "byteskip"), ("", "0"))
+_NRRD_READ = {"type": _UCHAR, "encoding": ("raw", "gzip", "gz"), **_SKIPS}  # the values of fields that can be read
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceLimits:
+    """Limits on what a sequence's header may promise."""
+
+    line_bytes: int = 1 << 16
+    header_bytes: int = 1 << 29  # 100 000 frames of 20 transforms
+    frames: int = 10_000_000
+    min_images: int = 2
+    side_px: int = 8192
+    zlib_ratio: int = 1032  # of unpacked to packed bytes
+    chunk_bytes: int = 1 << 20  # that are read, and unpacked, at once
+
+
+LIMITS = SequenceLimits()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameSequence:
+    """The header of a sequence. size: (width, height) px, (0, 0) without images; count: of its frames; channels: 1
+    or 3; fields: by name, each frame's text by its number; data: the file that holds the images, and from which byte;
+    packed: are the images compressed?"""
+
+    path: Path
+    size: tuple[int, int]
+    count: int
+    channels: int
+    fields: dict[str, dict[int, str]]
+    data: tuple[Path, int]
+    packed: bool
+
+    @property
+    def has_images(self) -> bool:
+        return min(self.size) > 1  # where nothing but poses is recorded, images are 0 x 0 or 1 x 1
+
+    @property
+    def frame_bytes(self) -> int:
+        return self.size[0] * self.size[1] * self.channels
+
+    @property
+    def transforms(self) -> list[str]:
+        """Names of the transforms, without the word."""
+        return sorted(name.removesuffix(TRANSFORM) for name in self.fields if name.endswith(TRANSFORM))
+
+    @cached_property
+    def images(self) -> tuple[list[int], tuple[str, ...]]:
+        """The frames whose images can be used, in order, and notes on the others."""
+        statuses = next((self.fields[name] for name in IMAGE_STATUSES if name in self.fields), {})
+        good = [frame for frame in range(self.count) if statuses.get(frame, GOOD).lower() == GOOD]
+        frames, latest = [], -np.inf
+        for frame in good:
+            if (stamp := self._stamps.get(frame, -np.inf)) > latest:
+                frames.append(frame)
+                latest = stamp
+        bad, unstamped = self.count - len(good), len(good) - len(frames)
+        notes = [f"{bad} images are not OK and left out"] if bad else []
+        notes += [f"{unstamped} images have no {TIME} later than the one before; left out"] if unstamped else []
+        return frames, tuple(f"{self.path.name}: {note}" for note in notes)
+
+    @cached_property
+    def times(self) -> dict[int, float]:
+        """Times s by frame, from the first usable image on where there are images. Raises NeecoError."""
+        if not self._stamps:
+            raise NeecoError(f"{self.path}: {TIME}: no frame has one (Seq_Frame0000_{TIME}); record again")
+        frames = self.images[0] if self.has_images else []
+        first = self._stamps[frames[0]] if frames else 0.0
+        return {frame: stamp - first for frame, stamp in self._stamps.items()}
+
+    @cached_property
+    def _stamps(self) -> dict[int, float]:
+        """PLUS's timestamps s, by frame."""
+        numbers = ((frame, parse_number(text)) for frame, text in self.fields.get(TIME, {}).items())
+        return {frame: stamp for frame, stamp in numbers if stamp is not None and np.isfinite(stamp)}
+
+    def statuses(self, name: str) -> dict[int, str]:
+        """Return the status of each frame that has a transform."""
+        stated = self.fields.get(name + TRANSFORM + STATUS, {})
+        return {frame: stated.get(frame, GOOD) for frame in self.fields[name + TRANSFORM]}
+
+
+@dataclass
+class _Header:
+    """Fields of the file, in small letters, and of its frames; end: the byte where the data begins."""
+
+    path: Path
+    plain: dict[str, str] = field(default_factory=dict)
+    frames: dict[str, dict[int, str]] = field(default_factory=dict)
+    end: int = 0
+
+    def integers(self, name: str) -> list[int]:
+        words = self.plain.get(name.lower(), "").split()
+        if not words or not all(re.fullmatch(r"\d{1,12}", word) for word in words):
+            raise self.fault(f"{name}: expected whole numbers, found {printable(' '.join(words) or 'nothing')}")
+        return [int(word) for word in words]
+
+    def fault(self, what: str) -> NeecoError:
+        return NeecoError(f"{self.path}: {what}; copy or export the sequence again")
+
+
+def read_sequence(path: Path) -> FrameSequence:
+    """The header of a sequence. Raises NeecoError where it is none, is damaged, or says what the file does not hold."""
+    is_nrrd = path.suffix.lower() in NRRD
+    try:
+        with open_file(path, "a sequence") as stream:
+            header = _read_header(path, stream, is_nrrd)
+    except OSError as error:
+        raise NeecoError(f"{path}: cannot read: {error.strerror or error}; correct the path") from None
+    if not header.frames:
+        raise header.fault("holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence")
+    plain, sizes = header.plain, header.integers("sizes" if is_nrrd else "DimSize")
+    usual = "" if is_nrrd else " ".join(["domain"] * (len(sizes) - 1) + ["list"])
+    size, count, channels = _dimensions(header, sizes, plain.get("kinds", usual).lower().split())
+    if "elementnumberofchannels" in plain:
+        channels = header.integers("ElementNumberOfChannels")[0]
+    if min(size) > 1:
+        for name, allowed in (_NRRD_READ if is_nrrd else _META_READ).items():
+            if (value := plain.get(name.lower(), "")).lower() not in allowed:
+                raise header.fault(f"{name}: is {printable(value or 'nothing')}, and {allowed[-1]} is read")
+        if channels not in (1, 3):
+            raise header.fault(f"has {channels} channels, and grey or RGB is read")
+    name = plain.get("data file", plain.get("datafile", plain.get("elementdatafile", "LOCAL")))
+    file, start = path, header.end
+    if name.upper() != "LOCAL":
+        file, start = path.parent / name, 0
+        if Path(name).name != name or not file.is_file():
+            raise header.fault(f"{printable(name)} is no file next to {path.name}")
+    packed = plain.get("encoding", "raw").lower() != "raw" or plain.get("compresseddata", "").lower() == "true"
+    sequence = FrameSequence(
+        path=path, size=size, count=count, channels=channels, fields=header.frames, data=(file, start), packed=packed
+    )
+    if sequence.has_images:
+        require_content(file)
+        held, promised = file.stat().st_size - start, sequence.frame_bytes * count
+        stored = plain.get("compresseddatasize", "")
+        if not packed and held != promised:
+            raise header.fault(f"holds {held / sequence.frame_bytes:.4g} images, its header states {count}")
+        if packed and re.fullmatch(r"\d{1,18}", stored) and held < int(stored):
+            raise header.fault(f"holds {held} bytes of compressed images, its header states {stored}")
+        if packed and promised > LIMITS.zlib_ratio * (held + 64):
+            raise header.fault(f"holds {held} bytes, of which no {count} images of {size} can come")
+    return sequence
+
+
+def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> _Header:
+    """MetaImage: `Name = value` lines, of which ElementDataFile is the last; NRRD: `field: value` and `key:=value`
+    lines up to an empty one, or to the end of a header by itself."""
+    header, ended = _Header(path), False
+    if is_nrrd and not stream.readline(LIMITS.line_bytes).startswith(b"NRRD000"):
+        raise header.fault("does not begin with NRRD000")
+    for line in iter(partial(stream.readline, LIMITS.line_bytes), b""):
+        if len(line) == LIMITS.line_bytes or stream.tell() > LIMITS.header_bytes:
+            raise header.fault("its header does not end")
+        text = line.decode("utf-8", "replace").strip()
+        name, sign, value = (part.strip() for part in text.partition(":" if is_nrrd else "="))
+        if text and not sign and not text.startswith("#"):
+            raise header.fault(f"{printable(text, 40)} is no {'`field: value`' if is_nrrd else '`Name = value`'}")
+        if match := _FRAME_FIELD.fullmatch(name):
+            header.frames.setdefault(match[2], {})[int(match[1])] = value.removeprefix("=").strip()
+        elif text:
+            header.plain[name.lower()] = value.removeprefix("=").strip()
+        ended = not text if is_nrrd else name.lower() == "elementdatafile"
+        if ended:
+            break
+    if not ended and not header.plain.keys() & {"data file", "datafile"}:
+        raise header.fault("its header does not end")
+    header.end = stream.tell()
+    return header
+
+
+def _dimensions(header: _Header, sizes: list[int], kinds: list[str]) -> tuple[tuple[int, int], int, int]:
+    """(width, height), how many frames, and channels, of axes of which the last counts the frames."""
+    channels = 1
+    if len(kinds) == len(sizes) and kinds and (kinds[0] == "vector" or kinds[0].endswith("color")):
+        channels, sizes, kinds = sizes[0], sizes[1:], kinds[1:]
+    if kinds != [*["domain"] * (len(sizes) - 1), kinds[-1] if kinds else ""] or kinds[-1] not in ("list", "time"):
+        raise header.fault("kinds: are not domain ... list, with the frames last")
+    if len(sizes) not in (3, 4) or (len(sizes) == 4 and sizes[2] > 1):
+        raise header.fault(f"{sizes} is no sequence of images; expected width, height, frames")
+    if max(sizes[:2]) > LIMITS.side_px or sizes[-1] > LIMITS.frames:
+        raise header.fault(f"{sizes} is too large")
+    return (sizes[0], sizes[1]), sizes[-1], channels
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceImages(VideoSource):
+    """Images of a sequence; frames: the number in the file of each."""
+
+    sequence: FrameSequence
+    frames: tuple[int, ...]
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        sequence, wanted = self.sequence, {self.frames[int(index)]: int(index) for index in indices}
+        (file, start), length, last = sequence.data, sequence.frame_bytes, max(wanted, default=-1)
+        shape = (sequence.size[1], sequence.size[0], sequence.channels)
+        try:
+            with open_file(file, "images of a sequence") as stream:
+                contents = _packed_frames(stream, start, length) if sequence.packed else iter(())
+                for number in range(last + 1) if sequence.packed else sorted(wanted):
+                    if not sequence.packed:
+                        stream.seek(start + number * length)
+                        contents = iter((stream.read(length),))
+                    content = next(contents, b"")
+                    if len(content) < length:
+                        raise NeecoError(f"{file}: its images end early; copy or export the sequence again")
+                    if number in wanted:
+                        pixels = np.frombuffer(content, np.uint8).reshape(shape)
+                        yield wanted[number], np.broadcast_to(pixels, (*shape[:2], 3)).copy()
+                if last == sequence.count - 1 and next(contents, b""):
+                    raise NeecoError(f"{file}: holds more images than its header says; export the sequence again")
+        except (zlib.error, OSError) as error:
+            raise NeecoError(f"{file}: its images are damaged ({error}); copy or export the sequence again") from None
+
+
+def _packed_frames(stream: BinaryIO, start: int, length: int) -> Iterator[bytes]:
+    """Yield frames of so many bytes, which streams of zlib or gzip, one after the other, unpack to piece by piece; what
+    is left at the end as a last, shorter one."""
+    stream.seek(start)
+    machine, packed, unpacked = zlib.decompressobj(zlib.MAX_WBITS | 32), b"", bytearray()  # of either kind
+    while packed := packed or stream.read(LIMITS.chunk_bytes):
+        unpacked += machine.decompress(packed, LIMITS.chunk_bytes)
+        packed = machine.unconsumed_tail
+        if machine.eof:
+            packed = machine.unused_data
+            machine = zlib.decompressobj(zlib.MAX_WBITS | 32)
+        while len(unpacked) >= length:
+            yield bytes(unpacked[:length])
+            del unpacked[:length]
+    if unpacked:
+        yield bytes(unpacked)
 
 
 class PlusSequence(RecordingFormat):
@@ -50,55 +293,56 @@ class PlusSequence(RecordingFormat):
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         sequence = _sequence_of(path)
-        times = _times(sequence)
-        found = []
+        span = np.ptp([*sequence.times.values()])
+
+        def rate(count: int) -> float | None:
+            return (count - 1) / span if span > 0 and count > 1 else None
+
+        streams = []
         if sequence.has_images:
-            frames, notes = _image_frames(sequence)
+            frames, notes = sequence.images
+            title = f"{'grey' if sequence.channels == 1 else 'RGB'} images of {sequence.size[0]}x{sequence.size[1]}"
             why = f" ({notes[0].partition(': ')[2]})" if notes else ""
             few = f"{len(frames)} of {sequence.count} images can be used{why}; record again"
-            color = "grey" if sequence.channels == 1 else "RGB"
-            title = f"{color} images of {sequence.size[0]}x{sequence.size[1]}"
-            problem = None if len(frames) >= MIN_IMAGES else few
-            rate = _rate(times, sequence.count)
-            found.append(Stream(IMAGE_STREAM, IMAGES, title, len(frames), rate, problem=problem))
-        for name in _transforms(sequence):
-            texts, meaning = sequence.fields[name + TRANSFORM], _meaning(name)
+            problem = few if len(frames) < LIMITS.min_images else None
+            streams.append(Stream(IMAGE_STREAM, IMAGES, title, len(frames), rate(sequence.count), problem=problem))
+        for name in sequence.transforms:
+            texts, (body, _, meaning) = sequence.fields[name + TRANSFORM], _ends(name)
             # what is the same in every frame is a calibration (ImageToProbe), no motion
             fixed = len(texts) > 1 and len(set(texts.values())) == 1
-            statuses = list(_statuses(sequence, name).values())
-            why = f"{name}{TRANSFORM}{STATUS} is {printable(statuses[0], 20)} in all"
-            problem = None if GOOD in map(str.lower, statuses) else _unusable(why)
-            found.append(
+            statuses = [status.lower() for status in sequence.statuses(name).values()]
+            problem = None if GOOD in statuses else _unusable(_status_words(name, statuses[0]))
+            kind, title = (OTHER, "fixed transform") if fixed else (POSES, "transform")
+            streams.append(
                 Stream(
-                    name, OTHER if fixed else POSES, "fixed transform" if fixed else "transform", len(texts),
-                    _rate(times, len(texts)), body=_ends(name)[0], hints=meaning.hints, asks=meaning.asks,
+                    name, kind, title, len(texts), rate(len(texts)), body=body, hints=meaning.hints, asks=meaning.asks,
                     problem=problem,
                 )
             )  # fmt: skip
-        return tuple(found)
+        return tuple(streams)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         sequence = _sequence_of(path)
-        if not _transforms(sequence):
+        if not sequence.transforms:
             raise NeecoError(
                 f"{path}: holds no transforms (Seq_Frame0000_StylusToTrackerTransform); name a log of poses"
             )
         wanted = None if stream is None else stream.removesuffix(TRANSFORM)
         name = choose_stream(path, self.streams(path), wanted, (POSES,)).name
-        times, statuses, dropped = _times(sequence), _statuses(sequence, name), dict[str, list[int]]()
-        rows, frames = [], []
+        statuses, dropped = sequence.statuses(name), dict[str, list[int]]()
+        rows, frames, (_, stated_in, meaning) = [], [], _ends(name)
         for frame, text in sorted(sequence.fields[name + TRANSFORM].items()):
             numbers = [parse_number(word) for word in text.split()]
             if statuses[frame].lower() != GOOD:
-                dropped.setdefault(f"{name}{TRANSFORM}{STATUS} is {printable(statuses[frame], 20)}", []).append(frame)
-            elif frame not in times or len(numbers) != 16 or not np.isfinite(np.array(numbers, np.float64)).all():
+                dropped.setdefault(_status_words(name, statuses[frame]), []).append(frame)
+            elif frame not in sequence.times or len(numbers) != 16 or not np.isfinite(np.array(numbers, float)).all():
                 dropped.setdefault(f"they have no {TIME}, or no 16 numbers", []).append(frame)
             else:
-                rows.append([times[frame], *numbers])
+                rows.append([sequence.times[frame], *numbers])
                 frames.append(frame)
         table = Table(
             path, HEADER, np.array(rows, np.float64).reshape(-1, 17), np.array(frames, np.int64), stream=name,
-            record="frame", stated_in=_ends(name)[1], meaning=_meaning(name),
+            record="frame", stated_in=stated_in, meaning=meaning,
         )  # fmt: skip
         if not rows:
             raise NeecoError(f"{table.where}: {_unusable(next(iter(dropped)))}")
@@ -111,10 +355,9 @@ class PlusSequence(RecordingFormat):
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         sequence = _sequence_of(path)
         choose_stream(path, self.streams(path), stream, (IMAGES,))
-        frames, notes = _image_frames(sequence)
-        times = _times(sequence)
-        seconds = np.array([times[frame] for frame in frames])
-        return SequenceImages(path, sequence.size, tuple(notes), seconds, sequence=sequence, frames=tuple(frames))
+        frames, notes = sequence.images
+        seconds = np.array([sequence.times[frame] for frame in frames])
+        return SequenceImages(path, sequence.size, notes, seconds, sequence=sequence, frames=tuple(frames))
 
 
 def _sequence_of(path: Path) -> FrameSequence:
@@ -127,71 +370,19 @@ def _cached(path: Path, state: tuple[object, ...]) -> FrameSequence:
     return read_sequence(path)
 
 
+def _status_words(name: str, status: str) -> str:
+    return f"{name}{TRANSFORM}{STATUS} is {printable(status.upper(), 20)}"
+
+
 def _unusable(why: str) -> str:
     return f"no frame can be used: {why}; record again, or name another transform"
 
 
-def _statuses(sequence: FrameSequence, name: str) -> dict[int, str]:
-    """The status of each frame that has a transform."""
-    stated = sequence.fields.get(name + TRANSFORM + STATUS, {})
-    return {frame: stated.get(frame, GOOD) for frame in sequence.fields[name + TRANSFORM]}
-
-
-def _transforms(sequence: FrameSequence) -> list[str]:
-    return sorted(name.removesuffix(TRANSFORM) for name in sequence.fields if name.endswith(TRANSFORM))
-
-
-def _ends(name: str) -> tuple[str, str]:
-    """Return the ends of a transform: Stylus and Tracker of StylusToTracker; without a "To", as 3D Slicer names
-    transforms (LinearTransform_3), the whole name and nothing."""
+def _ends(name: str) -> tuple[str, str, NamedFrame]:
+    """Return the ends of a transform, Stylus and Tracker of StylusToTracker, and the meaning of the frame that it maps
+    to; without a "To", as 3D Slicer names transforms (LinearTransform_3), the whole name and nothing."""
     match = _ENDS.fullmatch(name)
-    return (name, "") if match is None else (match[1], match[2])
-
-
-def _meaning(name: str) -> NamedFrame:
-    """Return the meaning of the frame that a transform maps to."""
-    body, frame = _ends(name)
-    if not frame:
+    if match is None:
         why = f"{printable(name)} names no frame (StylusToTracker does)"
-        return NamedFrame(None, why, (BASE, CAMERA))
-    return meaning_of(frame, dvrk=of_dvrk(body))
-
-
-def _stamps(sequence: FrameSequence) -> dict[int, float]:
-    """PLUS's timestamps s, by frame."""
-    found = {frame: parse_number(text) for frame, text in sequence.fields.get(TIME, {}).items()}
-    stamps = {frame: stamp for frame, stamp in found.items() if stamp is not None and np.isfinite(stamp)}
-    if not stamps:
-        raise NeecoError(f"{sequence.path}: {TIME}: no frame has one (Seq_Frame0000_{TIME}); record again")
-    return stamps
-
-
-def _image_frames(sequence: FrameSequence) -> tuple[list[int], list[str]]:
-    """The frames whose images can be used, in order, and notes on the others."""
-    stamps, latest = _stamps(sequence), -np.inf
-    statuses = next((sequence.fields[name] for name in IMAGE_STATUSES if name in sequence.fields), {})
-    good = [frame for frame in range(sequence.count) if statuses.get(frame, GOOD).lower() == GOOD]
-    frames: list[int] = []
-    for frame in good:
-        if stamps.get(frame, -np.inf) > latest:
-            frames.append(frame)
-            latest = stamps[frame]
-    name, notes = sequence.path.name, []
-    if bad := sequence.count - len(good):
-        notes.append(f"{name}: {bad} images are not OK and left out")
-    if unstamped := len(good) - len(frames):
-        notes.append(f"{name}: {unstamped} images have no {TIME} later than the one before; left out")
-    return frames, notes
-
-
-def _times(sequence: FrameSequence) -> dict[int, float]:
-    """Times s by frame, from the first usable image on where there are images."""
-    stamps = _stamps(sequence)
-    frames = _image_frames(sequence)[0] if sequence.has_images else []
-    first = stamps[frames[0]] if frames else 0.0
-    return {frame: stamp - first for frame, stamp in stamps.items()}
-
-
-def _rate(times: dict[int, float], count: int) -> float | None:
-    span = max(times.values()) - min(times.values())
-    return (count - 1) / span if span > 0 and count > 1 else None
+        return name, "", NamedFrame(None, why, (BASE, CAMERA))
+    return match[1], match[2], meaning_of(match[2], dvrk=of_dvrk(match[1]))

@@ -7,8 +7,9 @@ header has none, the time of receipt. Lengths come in m and angles in rad, as RO
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,16 +40,15 @@ from neeco.ingest.readers import (
 from neeco.ingest.readers.columns import BASE, CAMERA, PoseColumns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, meaning_of, of_dvrk
 from neeco.ingest.readers.interpolate import poses_at
-from neeco.ingest.readers.logs import NORM_TOLERANCE, read_pose_log
+from neeco.ingest.readers.logs import SETTINGS, read_pose_log
 
 if TYPE_CHECKING:
-    from neeco.ingest.readers._bagfile import Joints, Samples, Survey
+    from neeco.ingest.readers._bagfile import BagLimits, Samples, Survey
 
 DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
 CHAIN_HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 POSE_HEADER = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 MM_PER_M = 1000.0
-OTHER_CLOCK_S = 1.0  # between stamps and receipt: they are of different clocks
 _DVRK = re.compile(r"(?:^|/)(PSM\d|ECM|MTM[LR]|SUJ)(?:/|$)", re.IGNORECASE)
 _DVRK_POSE = re.compile(r"(^|/)(PSM\d|ECM)/(measured_cp|position_cartesian_current)$", re.IGNORECASE)
 _DVRK_JOINTS = re.compile(r"(^|/)PSM\d/((jaw/)?measured_js|state_joint_current|state_jaw_current)$", re.IGNORECASE)
@@ -73,34 +73,31 @@ class RosBag(RecordingFormat):
             return super().claims(path)
         return b"rosbag2_bagfile_information" in read_head(path / "metadata.yaml", 4096)
 
+    limits: BagLimits | None = None  # the usual ones
+
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        survey = self._survey(path)
-        images = [self._image_stream(survey, name) for name in sorted(survey.images, key=_camera_order)]
-        poses = [self._pose_stream(survey, name) for name in sorted(survey.poses)]
-        joints = [self._joint_stream(survey, name) for name in sorted(survey.joints)]
-        return (*images, *poses, *joints, *survey.others)
+        return _streams(self._survey(path))
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         survey = self._survey(path)
         if stream is not None and stream.startswith("tf:") and stream not in survey.poses:
             return _chained(survey, stream)
-        chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS)).name
+        chosen = choose_stream(path, _streams(survey), stream, (POSES, READINGS)).name
         if chosen in survey.joints:
             readings = survey.joints[chosen]
             header = ("t_s", *map(joint_column, _joint_names(chosen, readings)))
             return _table(survey, chosen, readings, header, readings.table())
         poses = survey.poses[chosen]
-        names = poses.frames
-        if len(names) > 1:
-            listed = ", ".join(sorted(names)[:4])
+        if len(poses.frames) > 1:
+            listed = ", ".join(sorted(poses.frames)[:4])
             raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
-        stated_in = next(iter(names), None) or None
-        values, meaning, fixed = poses.table(), _meaning(survey, chosen), _camera_from_stated(survey, chosen)
-        if fixed is not None:
+        values, (meaning, turned) = poses.table(), _meaning(survey, chosen)
+        if turned is not None:
             known = np.linalg.norm(values[:, 3:], axis=1) > 0
-            turn = Rotation.from_matrix(fixed[:3, :3])
-            values[:, :3] = turn.apply(values[:, :3]) + fixed[:3, 3] / MM_PER_M
+            turn = Rotation.from_matrix(turned[:3, :3])
+            values[:, :3] = turn.apply(values[:, :3]) + turned[:3, 3] / MM_PER_M
             values[known, 3:] = (turn * Rotation.from_quat(values[known, 3:])).as_quat()
+        stated_in = next(iter(poses.frames), None) or None
         return replace(_table(survey, chosen, poses, POSE_HEADER, values), stated_in=stated_in, meaning=meaning)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
@@ -108,12 +105,12 @@ class RosBag(RecordingFormat):
 
         survey = self._survey(path)
         if stream not in survey.images:
-            stream = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
-        return open_topic(survey, stream, _time_notes(f"{path.name}: {stream}", survey.images[stream]))
+            stream = choose_stream(path, _streams(survey), stream, (IMAGES,)).name
+        return open_topic(survey, stream, _time_notes(survey, stream, survey.images[stream]))
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         survey = self._survey(path)
-        chosen = stream if stream else choose_stream(path, self.streams(path), None, (IMAGES,)).name
+        chosen = stream if stream else choose_stream(path, _streams(survey), None, (IMAGES,)).name
         camera = _camera(survey, _info_topic(survey, chosen, of_right=False), chosen)
         return None if camera is None else camera.lens()
 
@@ -134,71 +131,79 @@ class RosBag(RecordingFormat):
 
     def _survey(self, path: Path) -> Survey:
         self.require_package(path)
-        from neeco.ingest.readers._bagfile import survey_of
+        from neeco.ingest.readers._bagfile import BagLimits, survey_of
 
-        return survey_of(path, file_state(*(visible_entries(path) if path.is_dir() else [path])))
+        files = visible_entries(path) if path.is_dir() else [path]
+        return survey_of(path, file_state(*files), self.limits or BagLimits())
 
-    def _image_stream(self, survey: Survey, name: str) -> Stream:
-        log = survey.images[name]
-        kind = f"{log.type}{f' ({log.description})' if log.stamps else ''}"
-        rate, used = rate_of(survey.seconds(log)), log.stamps or log.bad
-        return Stream(name, IMAGES if used else OTHER, kind, len(log.arrived), rate, problem=log.problem)
 
-    def _pose_stream(self, survey: Survey, name: str) -> Stream:
-        log, meaning = survey.poses[name], _meaning(survey, name)
-        frames, dvrk = log.frames, {topic for topic in survey.poses if _DVRK_POSE.search(topic)}
-        if dvrk:
-            offered = name in dvrk
-        elif name.startswith("tf:"):
-            offered = not log.static and all(topic.startswith("tf:") for topic in survey.poses)
-        else:
-            offered = not _COMMANDS.search(name)
-        frame = ", ".join(sorted(frames)) or "no named frame"
-        title = f"{log.type} in {frame}{', static' if log.static else ''}"
-        hints = list(meaning.hints or (f"poses are stated in {frame}",))
-        if name in dvrk and _body(name) == DVRK_CAMERA:
-            bases = [topic for topic in dvrk - {name} if _meaning(survey, topic).frame not in CAMERA_FRAMES]
-            of_arms = {base for topic in bases for base in survey.poses[topic].frames}
-            if of_arms - frames:  # these would not register them
-                offered, title = False, f"{title}, the arms' in {', '.join(sorted(of_arms))}"
-        elif name in dvrk:
-            hints.append(DVRK_HINT)
-        rate = rate_of(survey.seconds(log))
-        return Stream(
-            name, OTHER if log.static else POSES, title, len(log.stamps), rate, offered=offered, body=_body(name),
-            hints=tuple(hints), asks=meaning.asks, problem=log.problem,
-        )  # fmt: skip
+@lru_cache(maxsize=4)
+def _streams(survey: Survey) -> tuple[Stream, ...]:
+    images = [
+        Stream(
+            name, IMAGES if log.stamps or log.bad else OTHER, log.title, len(log.arrived),
+            rate_of(survey.seconds(log)), problem=log.problem,
+        )
+        for name, log in sorted(survey.images.items(), key=lambda item: _camera_order(item[0]))
+    ]  # fmt: skip
+    meanings = {name: _meaning(survey, name)[0] for name in sorted(survey.poses)}
+    arms = {name for name in meanings if _DVRK_POSE.search(name)}
+    poses = [_pose_stream(survey, name, meanings, arms) for name in meanings]
+    return (*images, *poses, *(_joint_stream(survey, name) for name in sorted(survey.joints)), *survey.others)
 
-    def _joint_stream(self, survey: Survey, name: str) -> Stream:
-        log, offered, wrist = survey.joints[name], not _COMMANDS.search(name), None
-        if _DVRK.search(name):
-            offered = bool(_DVRK_JOINTS.search(name))
-            names = _joint_names(name, log)
-            wrist = wrist_joints(names, "jaw" in name)
-        rate = rate_of(survey.seconds(log))
-        return Stream(
-            name, READINGS, log.type, len(log.stamps), rate, offered=offered, body=_body(name), joints=wrist,
-            problem=log.problem,
-        )  # fmt: skip
+
+def _pose_stream(survey: Survey, name: str, meanings: Mapping[str, NamedFrame], arms: Collection[str]) -> Stream:
+    """Return a stream of poses. arms: the streams of a dVRK's."""
+    log, meaning = survey.poses[name], meanings[name]
+    if arms:
+        offered = name in arms
+    elif name.startswith("tf:"):
+        offered = not log.static and all(topic.startswith("tf:") for topic in survey.poses)
+    else:
+        offered = not _COMMANDS.search(name)
+    frame = ", ".join(sorted(log.frames)) or "no named frame"
+    title = f"{log.type} in {frame}{', static' if log.static else ''}"
+    hints = meaning.hints or (f"poses are stated in {frame}",)
+    if name in arms and _body(name) == DVRK_CAMERA:
+        bases = (topic for topic in arms if topic != name and meanings[topic].frame not in CAMERA_FRAMES)
+        of_arms = {base for topic in bases for base in survey.poses[topic].frames}
+        if of_arms - log.frames:  # these would not register them
+            offered, title = False, f"{title}, the arms' in {', '.join(sorted(of_arms))}"
+    elif name in arms:
+        hints = (*hints, DVRK_HINT)
+    return Stream(
+        name, OTHER if log.static else POSES, title, len(log.stamps), rate_of(survey.seconds(log)), offered=offered,
+        body=_body(name), hints=hints, asks=meaning.asks, problem=log.problem,
+    )  # fmt: skip
+
+
+def _joint_stream(survey: Survey, name: str) -> Stream:
+    log, offered, wrist = survey.joints[name], not _COMMANDS.search(name), None
+    if _DVRK.search(name):
+        offered, wrist = bool(_DVRK_JOINTS.search(name)), wrist_joints(_joint_names(name, log), "jaw" in name)
+    return Stream(
+        name, READINGS, log.type, len(log.stamps), rate_of(survey.seconds(log)), offered=offered, body=_body(name),
+        joints=wrist, problem=log.problem,
+    )  # fmt: skip
 
 
 def _table(survey: Survey, name: str, log: Samples, header: tuple[str, ...], values: np.ndarray) -> Table:
-    title = f"{survey.path.name}: {name}"
-    notes = _time_notes(title, log)
-    notes += [f"{title}: {counted(count, 'message')} left out: one {why}" for why, count in log.bad.items()]
+    notes = _time_notes(survey, name, log)
+    left_out = (f"{counted(count, 'message')} left out: one {why}" for why, count in log.bad.items())
+    notes += [f"{survey.path.name}: {name}: {what}" for what in left_out]
     rows, numbers = np.column_stack([survey.seconds(log), values]), np.arange(1, len(values) + 1)
     return Table(survey.path, header, rows, numbers, stream=name, record="message", notes=tuple(notes))
 
 
-def _time_notes(title: str, log: Samples) -> list[str]:
+def _time_notes(survey: Survey, name: str, log: Samples) -> list[str]:
     """Return notes on missing stamps and on stamps of another clock."""
-    given, received = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
-    none, notes = given == 0, []
+    stamps, received = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
+    none, notes, title = stamps == 0, [], f"{survey.path.name}: {name}"
     if none.any():
         what = "its headers have no times" if none.all() else f"{int(none.sum())} headers have no time"
         notes.append(f"{title}: {what}; those of receipt are taken")
-    late = 0.0 if none.all() else float(np.median((received - given)[~none])) * 1e-9
-    if abs(late) > OTHER_CLOCK_S:
+    late = 0.0 if none.all() else float(np.median((received - stamps)[~none])) * 1e-9
+    if abs(late) > survey.limits.other_clock_s:
         notes.append(
             f"{title}: its headers' times are {late:.2f} s before those of receipt, on another clock; where "
             "the streams do not share one, name its `clock` and give `sync`"
@@ -212,53 +217,40 @@ def _image_frames(survey: Survey) -> set[str]:
     return set() if first is None else survey.images[first].frames - {""}
 
 
-def _meaning(survey: Survey, name: str) -> NamedFrame:
-    """Return the meaning of the frame of a stream's poses; BASE for several frames, which are refused when read."""
+def _meaning(survey: Survey, name: str) -> tuple[NamedFrame, np.ndarray | None]:
+    """Return the meaning of the frame of a stream's poses (BASE for several frames, which are refused when read), and
+    the transform from there to the images' frame, [4, 4] mm, where the name leaves the axes open but static transforms
+    state them."""
     frames, images = survey.poses[name].frames, _image_frames(survey)
     if len(frames) != 1:
-        return NamedFrame(BASE)
-    frame = next(iter(frames))
-    if _camera_from_stated(survey, name) is None:
-        return meaning_of(frame, images, dvrk=of_dvrk(name))
-    return NamedFrame(
-        CAMERA, f"{frame}, and turned by static transforms of the bag to {next(iter(images))}, the images'"
-    )
-
-
-def _camera_from_stated(survey: Survey, name: str) -> np.ndarray | None:
-    """Return [4, 4] mm from the frame of a stream's poses to the images', where the name leaves the axes open
-    but static transforms state them; else None."""
-    frame, images = next(iter(survey.poses[name].frames), ""), _image_frames(survey)
-    if len(survey.poses[name].frames) != 1 or len(images) != 1 or frame in images:
-        return None
-    own = next(iter(images))
-    certain = meaning_of(frame, images, dvrk=of_dvrk(name)).frame is not None
-    return None if certain or meaning_of(own, images).frame is None else _fixed_transform(survey, frame, own)
+        return NamedFrame(BASE), None
+    frame, meaning = next(iter(frames)), meaning_of(next(iter(frames)), images, dvrk=of_dvrk(name))
+    if meaning.frame is None and len(images) == 1 and frame not in images:
+        own = next(iter(images))
+        if meaning_of(own, images).frame is not None and (turned := _fixed_transform(survey, frame, own)) is not None:
+            why = f"{frame}, and turned by static transforms of the bag to {own}, the images'"
+            return NamedFrame(CAMERA, why), turned
+    return meaning, None
 
 
 def _info_topic(survey: Survey, stream: str | None, of_right: bool) -> str | None:
     """Return the topic of the camera_info of a stream of images, which is in their namespace; of another bag's stream,
     whose topic is not in this one, that of its only right camera (with a baseline) or left one."""
-    from neeco.ingest.readers._bagfile import matrix_of
-
     plain = (stream or "").removesuffix("/compressed")
     topic = f"{plain.rpartition('/')[0]}/camera_info" if stream else None
     if topic in survey.lenses or stream in survey.images:
         return topic
-    sided = [name for name, info in survey.lenses.items() if bool(matrix_of(info, "P")[3]) == of_right]
+    sided = [name for name, (_, numbers) in survey.lenses.items() if bool(numbers["P"][3]) == of_right]
     return sided[0] if len(sided) == 1 else topic
 
 
 def _camera(survey: Survey, topic: str | None, stream: str) -> RosCamera | None:
     """Return the camera that a topic states, as it takes the images of a stream; None where it is not calibrated.
     Raises NeecoError."""
-    from neeco.ingest.readers._bagfile import matrix_of, plain
-
     if topic not in survey.lenses:
         return None
-    info, where = survey.lenses[topic], f"{survey.path}: {topic}"
+    (info, numbers), where, region = survey.lenses[topic], f"{survey.path}: {topic}", survey.lenses[topic][0].roi
     rectified = stream.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
-    numbers, region = {name: matrix_of(info, name) for name in "KDRP"}, info.roi
     cut = region.height not in (0, info.height) or region.width not in (0, info.width)
     if max(info.binning_x, info.binning_y) > 1 or cut:
         raise NeecoError(f"{where}: states binning or a part of the image; give the images' own `intrinsics`")
@@ -271,7 +263,7 @@ def _camera(survey: Survey, topic: str | None, stream: str) -> RosCamera | None:
         "projection_matrix": numbers["P"],
         "image_width": int(info.width),
         "image_height": int(info.height),
-        "distortion_model": "" if rectified else plain(info.distortion_model),
+        "distortion_model": "" if rectified else info.distortion_model,
     }
     return RosCamera(where, cameras_in(where, document)[0], rectified)
 
@@ -296,10 +288,8 @@ def _chained(survey: Survey, stream: str) -> Table:
     known_rows = np.isfinite(frame_from_child).all(axis=(1, 2))
     quats = np.full((len(seconds), 4), np.nan)
     quats[known_rows] = Rotation.from_matrix(frame_from_child[known_rows, :3, :3]).as_quat()
-    rows, meaning = (
-        np.column_stack([seconds, frame_from_child[:, :3, 3], quats]),
-        meaning_of(frame, _image_frames(survey), dvrk=of_dvrk(child)),
-    )
+    rows = np.column_stack([seconds, frame_from_child[:, :3, 3], quats])
+    meaning = meaning_of(frame, _image_frames(survey), dvrk=of_dvrk(child))
     return Table(
         survey.path, CHAIN_HEADER, rows, np.arange(1, len(rows) + 1), stream=stream, record="message",
         stated_in=frame, meaning=meaning,
@@ -321,25 +311,22 @@ def _fixed_transform(survey: Survey, child: str, frame: str) -> np.ndarray | Non
 def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str], list[str]]:
     """Return the transforms from a child and from a frame up to their common ancestor, each by its child. Raises
     NeecoError."""
-    ends, paths = [], []
+    roots, paths = [], []
     for name in (child, frame):
         edges: list[str] = []
         while f"tf:{name}" in survey.poses:
-            parents = survey.poses[f"tf:{name}"].frames
+            parents = sorted(survey.poses[f"tf:{name}"].frames)
             if len(parents) > 1 or name in edges:
-                what = (
-                    f"has several parents ({', '.join(sorted(parents)[:4])})"
-                    if len(parents) > 1
-                    else "is its own parent"
-                )
+                loop = "is its own parent"
+                what = f"has several parents ({', '.join(parents[:4])})" if len(parents) > 1 else loop
                 raise NeecoError(f"{where}: {name} {what}; name another, or record the transforms anew")
             edges.append(name)
-            name = next(iter(parents))
-        ends.append(name)
+            name = parents[0]
+        roots.append(name)
         paths.append(edges)
     ups, downs = paths
-    if ends[0] != ends[1]:
-        raise NeecoError(f"{where}: nothing joins {child} to {frame}; their roots are {ends[0]} and {ends[1]}")
+    if roots[0] != roots[1]:
+        raise NeecoError(f"{where}: nothing joins {child} to {frame}; their roots are {roots[0]} and {roots[1]}")
     while ups and downs and ups[-1] == downs[-1]:
         ups.pop()
         downs.pop()
@@ -353,7 +340,7 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
         log = survey.poses[f"tf:{edge}"]
         if log.static:
             values = log.table()[-1]
-            if not (np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < NORM_TOLERANCE):
+            if not (np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < SETTINGS.norm_tolerance):
                 raise NeecoError(f"{survey.path}: tf:{edge}: is no rotation and translation; record it anew")
             pose = rigid(Rotation.from_quat(values[3:]).as_matrix(), 1000 * values[:3])
             poses = np.tile(pose, (len(seconds), 1, 1))
@@ -381,7 +368,7 @@ def _body(topic: str) -> str | None:
     return topic.strip("/").rpartition("/")[0].replace("/", "_") or None
 
 
-def _joint_names(topic: str, log: Joints) -> list[str]:
+def _joint_names(topic: str, log: Samples) -> list[str]:
     """Return the joints' names; where a dVRK's messages have none, its own."""
     names, usual = list(log.columns), {6: DVRK_JOINTS, 1: ("jaw",)}
     unnamed = names == [f"joint_{number + 1}" for number in range(len(names))]

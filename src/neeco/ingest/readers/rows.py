@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import dataclass
+
 import numpy as np
 
 from neeco.base.errors import NeecoError, counted
@@ -9,15 +12,27 @@ from neeco.ingest.readers import Table, column_index, numbers
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import JointColumns, PoseColumns, RecognisedColumns
 
-MIN_SAMPLES = 4  # of a usable log
-MAX_WRONG = 0.05  # share of rows that may be wrong (not missing) before the file is refused
-MAX_LISTED_STATES = 8  # of those that drop rows, in the notes
-MAX_SAME_TIME = 0.5  # share of rows at the time of another: more, and times are too coarse
-STUCK_S, STUCK_SAMPLES = 0.5, 10  # a tracker's noise leaves no pose unchanged for as long
-GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
-RESTART_STEPS = 10.0  # usual steps back in time, beyond which rows are not out of order: time begins anew
 DAY_S = 86400.0  # a clock that shows the time of day begins anew
 COUNTERS = (2.0**32, 2.0**16)  # values at which unsigned counters begin anew
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowSettings:
+    """Limits on the rows of a log."""
+
+    min_samples: int = 4  # of a usable log
+    max_wrong: float = 0.05  # share of rows that may be wrong (not missing) before the file is refused
+    max_unreadable: float = 0.5  # share of rows whose cells may be no numbers
+    states: int = 8  # of those that drop rows, in the notes
+    max_same_time: float = 0.5  # share of rows at the time of another: more, and times are too coarse
+    stuck_s: float = 0.5  # a tracker's noise leaves no pose unchanged for as long,
+    stuck_samples: int = 10  # and for as many samples
+    gap_steps: float = 4.0  # a step in time longer than so many usual ones,
+    gap_s: float = 0.15  # and than this, is a gap
+    restart_steps: float = 10.0  # usual steps back, beyond which rows are not out of order: time begins anew
+
+
+SETTINGS = RowSettings()
 
 
 class Rows:
@@ -39,7 +54,7 @@ class Rows:
     def drop_wrong(self, wrong: np.ndarray, reason: str) -> None:
         """Leave out a few rows that are wrong (bool [R]). Raises NeecoError when they are more than a few."""
         lines, count = self.table.lines[wrong & self.keep], int(self.keep.sum())
-        if len(lines) > max(1, MAX_WRONG * count):
+        if len(lines) > max(1, SETTINGS.max_wrong * count):
             share = f"{self.table.list_rows(lines)} ({len(lines)} of {counted(count, 'row')})"
             raise NeecoError(f"{self.table.where}: {share}: {reason}")
         self.drop(wrong, reason.split(";")[0])
@@ -54,22 +69,18 @@ class Rows:
         return (*self.table.notes, *dropped, *(f"{name}: {repair}" for repair in self.repairs))
 
 
-def keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
+def keep_measured(rows: Rows, source: PoseColumns, recognised: str | None) -> None:
     """Drop the rows whose state does not say that they were measured."""
-    table, name = rows.table, source.state or found
+    table, name = rows.table, source.state or recognised
     if name is None:
         return
-    index = column_index(table, name)
+    states = [str(cell) for cell in table.rows[:, column_index(table, name)]]
     good = {value.lower() for value in source.good}
-    states = [str(cell) for cell in table.rows[:, index]]
-    by_state: dict[str, list[int]] = {}
-    for row, state in enumerate(states):
-        if state.lower() not in good:
-            by_state.setdefault(state[:20], []).append(row)
-    for number, (state, members) in enumerate(by_state.items()):
-        if number < MAX_LISTED_STATES:
-            rows.drop(members, f"{name} is {state or 'empty'!r}")
-        rows.keep[members] = False
+    bad = Counter(state for state in states if state.lower() not in good)
+    listed = [state for state, _ in bad.most_common(SETTINGS.states)]
+    for state in listed:
+        rows.drop(np.array([state == other for other in states]), f"{name} is {state[:20] or 'empty'!r}")
+    rows.keep &= [state not in bad for state in states]
     if not rows.keep.any():
         raise NeecoError(
             f"{table.where}: {name}: no row is {' or '.join(source.good)} ({table.list_rows(table.lines[:1])} has "
@@ -82,31 +93,26 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, found: Recognised
     table, names, rate = rows.table, source.time or found.time, source.rate_hz
     if names is None and rate is not None:
         if headers := _headers(table, range(len(table.rows))):
-            raise NeecoError(
-                f"{table.where}: line {headers[0]} repeats the header, and its rows have no times; keep those of one "
-                "run in a file"
-            )
+            what = f"line {headers[0]} repeats the header, and its rows have no times"
+            raise NeecoError(f"{table.where}: {what}; keep those of one run in a file")
         return np.arange(len(table.rows)) / rate
     if names is None:
-        raise NeecoError(
-            f"{table.where}: header: no column of times found; name it as columns.time (or add t_s), or say rate_hz "
-            "where its rows come at a fixed rate"
-        )
-    cells = read_cells(rows, names)
-    known = named.recognise_time(names)
+        what = "no column of times found; name it as columns.time (or add t_s), or say rate_hz"
+        raise NeecoError(f"{table.where}: header: {what} where its rows come at a fixed rate")
+    cells, known = read_cells(rows, names), named.recognise_time(names)
     if rate is not None and (len(names) == 2 or known.time_unit or named.split_unit(names[0], "time")[1]):
+        what = f"{', '.join(names)} holds times and counts no frames"
         raise NeecoError(
-            f"{table.where}: rate_hz: {', '.join(names)} holds times and counts no frames; leave rate_hz out, or name "
-            "the column that counts as columns.time"
+            f"{table.where}: rate_hz: {what}; leave rate_hz out, or name the column that counts as columns.time"
         )
     if len(names) == 2:
         return cells[:, 0] + cells[:, 1] * 1e-9
     if rate is not None:
         return cells[:, 0] / rate
     if known.counts_frames:
+        what = "counts frames, and nothing says how many a second; say rate_hz in the recording"
         raise NeecoError(
-            f"{table.where}: {names[0]}: counts frames, and nothing says how many a second; say rate_hz in the "
-            "recording (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
+            f"{table.where}: {names[0]}: {what} (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
         )
     return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, known.time_unit, "")
 
@@ -117,18 +123,15 @@ def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
     values, missing, bad = numbers(table, names)
     rows.drop(missing, f"no value for {', '.join(names)}" if len(names) < 3 else "values are missing")
     bad = [(row, what) for row, what in bad if rows.keep[row]]
-    if len(bad) > max(3, 0.5 * rows.keep.sum()):
+    if len(bad) > max(3, SETTINGS.max_unreadable * rows.keep.sum()):
+        first = f"{table.record} {table.lines[bad[0][0]]}: {bad[0][1]}"
         similar = f"{len(bad)} of {counted(len(table.rows), 'row')} like it"
-        raise NeecoError(
-            f"{table.where}: {table.record} {table.lines[bad[0][0]]}: {bad[0][1]} ({similar}); name other columns or "
-            "repair the file"
-        )
+        raise NeecoError(f"{table.where}: {first} ({similar}); name other columns or repair the file")
     if bad:
         rows.drop([row for row, _ in bad], f"not readable, first: {bad[0][1]}")
     if not rows.keep.any():
-        raise NeecoError(
-            f"{table.where}: {', '.join(names)}: no row has values; name other columns or another file in the recording"
-        )
+        what = f"{', '.join(names)}: no row has values"
+        raise NeecoError(f"{table.where}: {what}; name other columns or another file in the recording")
     return values
 
 
@@ -136,20 +139,16 @@ def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
     """Drop the rows of a tracker that repeats its last pose [R, 7] after it lost its tool: exactly the same pose for
     long, and a jump at an end. What comes to rest slows down before."""
     used = np.flatnonzero(rows.keep)
-    if len(used) < MIN_SAMPLES:
-        return
     steps = np.linalg.norm(np.diff(poses[used, :3], axis=0), axis=1)
-    same = np.concatenate([[False], (np.diff(poses[used], axis=0) == 0).all(axis=1), [False]])
-    edges = np.diff(same.astype(int))
-    moving = steps[steps > 0]
-    if not len(moving):
+    if not (steps > 0).any():
         return
+    usual = np.median(steps[steps > 0])
+    edges = np.diff(np.concatenate([[0], (np.diff(poses[used], axis=0) == 0).all(axis=1), [0]]))
     for first, last in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
         # the pose of row `first` is repeated until `last`
-        around = [steps[first - 1]] if first > 0 else []
-        around += [steps[last]] if last < len(steps) else []
+        jump = max([*steps[max(first - 1, 0) : first], *steps[last : last + 1]], default=0.0)
         lasted = times[used[last]] - times[used[first]]
-        if last - first >= STUCK_SAMPLES and lasted > STUCK_S and max(around, default=0.0) > np.median(moving):
+        if last - first >= SETTINGS.stuck_samples and lasted > SETTINGS.stuck_s and jump > usual:
             rows.drop(used[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
 
 
@@ -161,14 +160,14 @@ def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tup
     order = usable[np.argsort(times[usable], kind="stable")]
     late = usable[1:][times[usable][1:] < np.maximum.accumulate(times[usable])[:-1]]
     doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
-    if doubled.sum() > max(MIN_SAMPLES, MAX_SAME_TIME * len(order)):
+    if doubled.sum() > max(SETTINGS.min_samples, SETTINGS.max_same_time * len(order)):
         raise NeecoError(
             f"{table.where}: {counted(int(doubled.sum()), 'row')} of {len(order)} have the time of another; its times "
             "are too coarse, or of several tools: name a finer column as columns.time"
         )
     rows.drop(np.sort(order[doubled]), "a second row at one time")
     order = order[~doubled]
-    if len(order) < MIN_SAMPLES:
+    if len(order) < SETTINGS.min_samples:
         why = "; ".join(note.partition(": ")[2] for note in rows.notes()[:2])
         raise NeecoError(
             f"{table.where}: {counted(len(order), 'row')} of {len(table.rows)} can be used{f' ({why})' if why else ''}"
@@ -185,7 +184,7 @@ def restarts(times: np.ndarray) -> tuple[float, list[int]]:
     which no single time out of its place explains."""
     steps = np.diff(times)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
-    far = np.flatnonzero(steps < -RESTART_STEPS * usual).tolist()
+    far = np.flatnonzero(steps < -SETTINGS.restart_steps * usual).tolist()
     held = [back for back in far if (times[max(back - 1, 0) : back] > times[back + 1]).all()]
     return usual, [back for back in held if (times[back + 2 : back + 3] < times[back]).all()]
 
@@ -200,7 +199,7 @@ def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float
     times = times.copy()
     for back in places:
         before, after = float(taken[back]), float(taken[back + 1])
-        tolerance, line = GAP_STEPS * usual, table.lines[usable[back + 1]]
+        tolerance, line = SETTINGS.gap_steps * usual, table.lines[usable[back + 1]]
         wraps = [
             period
             for period in periods  # unsigned, or signed
@@ -227,7 +226,7 @@ def _headers(table: Table, rows: range) -> list[int]:
 def find_gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:
     """Return the gaps in time (steps longer than 4 usual ones and 0.15 s), and a note of them."""
     steps = np.diff(times)
-    longest = max(GAP_STEPS * float(np.median(steps)), GAP_SECONDS)
+    longest = max(SETTINGS.gap_steps * float(np.median(steps)), SETTINGS.gap_s)
     gaps = tuple((float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest))
     if not gaps:
         return (), ()

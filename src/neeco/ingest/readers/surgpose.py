@@ -35,7 +35,7 @@ from neeco.ingest.readers import (
     file_state,
 )
 from neeco.ingest.readers.rosbag import DVRK_HINT
-from neeco.ingest.readers.rows import MAX_WRONG
+from neeco.ingest.readers.rows import SETTINGS as ROWS
 from neeco.ingest.readers.video import open_images, open_video
 
 POSE_FILE, JOINT_FILE = "api_cp_data.yaml", "api_jp_data.yaml"
@@ -140,25 +140,21 @@ def _cached(path: Path, state: tuple[object, ...]) -> _Arms:
 def _by_arm(file: Path, parse: Callable[[Any], np.ndarray], expected: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Frames [T] and rows [T, C] of each arm, from {frame: {arm: values}}."""
     document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", FastYamlLoader)
-    found: dict[str, dict[int, np.ndarray | None]] = {}
+    arms: dict[str, dict[int, np.ndarray | None]] = {}
     try:
-        numbers = [key for key in document if re.fullmatch(r"\d{1,9}", str(key), re.ASCII)]
-        states = {int(key): document[key].items() for key in numbers}
-        if not 0 < len(states) == len(document):
-            raise ValueError("not the numbers of frames")
+        for key in document if all(re.fullmatch(r"\d{1,9}", str(key), re.ASCII) for key in document) else ():
+            for arm, value in document[key].items():
+                rows = arms.setdefault(str(arm), {})
+                rows[int(key)] = None  # missing, unless it can be parsed
+                with suppress(KeyError, IndexError, TypeError, ValueError, OverflowError):
+                    rows[int(key)] = parse(value)
     except (AttributeError, ValueError, TypeError):
-        states = {}
-    for frame, arms in states.items():
-        for arm, value in arms:
-            row = None
-            with suppress(KeyError, IndexError, TypeError, ValueError, OverflowError):  # else it is missing
-                row = parse(value)
-            found.setdefault(str(arm), {})[frame] = row
+        arms = {}
     tables = {}
-    for arm, rows in found.items():
+    for arm, rows in arms.items():
         frames, sound = sorted(rows), [row for row in rows.values() if row is not None]
         bad = [frame for frame in frames if rows[frame] is None]
-        if len(bad) > MAX_WRONG * len(rows) or len({len(row) for row in sound}) != 1:
+        if len(bad) > ROWS.max_wrong * len(rows) or len({len(row) for row in sound}) != 1:
             where = f"{file}: frame {(bad or frames)[0]}: {printable(arm)}"
             raise NeecoError(f"{where}: expected {expected} in every frame; copy it again")
         missing = np.full(len(sound[0]), np.nan)

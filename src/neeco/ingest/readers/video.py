@@ -25,12 +25,22 @@ from neeco.ingest.readers.columns import recognise_time, scale_of
 FURTHER_FORMATS = {".bmp": "BMP", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}  # opened under these names alone
 IMAGES = (".png", ".jpg", ".jpeg", *FURTHER_FORMATS)
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
-MIN_IMAGES = 2
-SQUARE = 0.005  # by which a square pixel's width and height may differ: 1 px of 200
-MAX_RATE = 1000.0  # frames a second, beyond which a file's own number is no rate
-MAX_LEFT_OUT = 0.1  # of a folder's images (or one): more that are missing or of another size are no slip
-SAME_RATE = 2e-4  # relative difference of frame rates that is none
-MAX_BUFFERED_BYTES = 512 * 2**20  # of a video's decoded frames; those of a larger one are decoded at every reading
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoSettings:
+    """Limits on videos and folders of images."""
+
+    min_images: int = 2
+    square: float = 0.005  # by which a square pixel's width and height may differ: 1 px of 200
+    max_rate: float = 1000.0  # frames a second, beyond which a file's own number is no rate
+    max_left_out: float = 0.1  # of a folder's images (or one): more that are missing or of another size are no slip
+    same_rate: float = 2e-4  # relative difference of frame rates that is none
+    max_corrupt: int = 1000  # frames, after which a video is given up
+    buffered_bytes: int = 512 << 20  # of a video's decoded frames; those of a larger one are decoded at every reading
+
+
+SETTINGS = VideoSettings()
 
 
 def require_installed(name: str) -> None:
@@ -41,7 +51,7 @@ def require_installed(name: str) -> None:
 
 def open_video(path: Path, fps: float | None = None, part: tuple[float, float] | None = None) -> VideoSource:
     """A video file, or the part of it from one time s to another, without it. Its frames are decoded once to find
-    those that can be, with their own times (`fps`: overrides them), and buffered up to MAX_BUFFERED_BYTES. What is
+    those that can be, with their own times (`fps`: overrides them), and buffered where they fit into memory. What is
     damaged is left out and noted; raises NeecoError when nothing can be read."""
     path = Path(path)
     require_content(path)
@@ -66,7 +76,7 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
         (file for file in visible_entries(folder) if file.suffix.lower() in IMAGES),
         key=lambda file: natural_order(file.name),
     )
-    if len(files) < MIN_IMAGES:
+    if len(files) < SETTINGS.min_images:
         raise NeecoError(f"{folder}: holds {len(files)} images; expected frames as {', '.join(IMAGES[:3])} files")
     notes: list[str] = []
     if times is not None:
@@ -82,7 +92,7 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
         except NeecoError:
             sizes.append(None)
     known = Counter(size for size in sizes if size is not None)
-    if known.total() < MIN_IMAGES:
+    if known.total() < SETTINGS.min_images:
         raise NeecoError(f"{folder}: {known.total()} of {len(files)} images can be read; replace the damaged files")
     size, count = known.most_common(1)[0]
     other = [file for file, found in zip(files, sizes, strict=True) if found not in (None, size)]
@@ -101,7 +111,7 @@ def _open(file: Path) -> Image.Image:
 
 
 def _are_few(count: int, total: int) -> bool:
-    return count <= max(1, MAX_LEFT_OUT * total)
+    return count <= max(1, SETTINGS.max_left_out * total)
 
 
 def _left_out(folder: Path, why: str, files: Sequence[Path]) -> list[str]:
@@ -211,7 +221,7 @@ class _Scan:
     promised: int = 0  # frames the file's header speaks of
     packets: int = 0  # coded frames that were read
     end: int | None = None  # of the stream by the file's header, in its time base
-    buffered: list[Any] = field(default_factory=list)  # the frames, up to MAX_BUFFERED_BYTES in all
+    buffered: list[Any] = field(default_factory=list)  # the frames, as far as they fit into memory
     buffered_bytes: int = 0
 
     def decoded(self) -> Iterator[Any]:
@@ -224,9 +234,8 @@ class _Scan:
         try:
             container = av.open(str(self.path))
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            raise NeecoError(
-                f"{self.path}: cannot be opened as a video ({_reason(error)}); give an intact video file"
-            ) from None
+            what = f"cannot be opened as a video ({_reason(error)})"
+            raise NeecoError(f"{self.path}: {what}; give an intact video file") from None
         with container:
             if not container.streams.video:
                 raise NeecoError(f"{self.path}: holds no video stream; give the recording's video")
@@ -235,14 +244,17 @@ class _Scan:
             stream, *others = films or container.streams.video
             self.others = tuple(f"{film.width}x{film.height}" for film in others)
             aspect = float(stream.sample_aspect_ratio or 1)
-            self.pixel_aspect = 1.0 if abs(aspect - 1) < SQUARE else aspect
+            self.pixel_aspect = 1.0 if abs(aspect - 1) < SETTINGS.square else aspect
             stream.thread_type = self.threads
             self.promised = int(stream.frames or 0)
             self.packets, self.end = 0, stream.duration and (stream.start_time or 0) + stream.duration
             self.rate = float(stream.average_rate) if stream.average_rate else None
             self.time_base = float(stream.time_base) if stream.time_base else None
-            first, last = self._bounds(stream)
-            if first is not None:
+            first, last = -np.inf, np.inf  # the part's first stamp and the one that ends it
+            if self.part is not None and self.time_base:
+                early = 0.5 / self.rate if self.rate else 0.0  # s: times in other files are rounded
+                stamps = (round((time - early) / self.time_base) for time in self.part)
+                first, last = ((stream.start_time or 0) + stamp for stamp in stamps)
                 with suppress(av.error.FFmpegError):  # of a damaged index: then from the film's beginning on
                     container.seek(first, stream=stream)  # to the key frame before it
             packets = container.demux(stream)
@@ -255,32 +267,22 @@ class _Scan:
                     return
                 except (av.error.FFmpegError, ValueError) as error:
                     self.failure = self.failure or _reason(error)
-                    if isinstance(error, av.error.EOFError) or self.corrupt > 1000:
+                    if isinstance(error, av.error.EOFError) or self.corrupt > SETTINGS.max_corrupt:
                         return
                     self.corrupt += 1
                     continue
                 for frame in frames:
-                    if first is not None and (frame.pts is None or frame.pts < first):
+                    if (-np.inf if frame.pts is None else frame.pts) < first:
                         continue
-                    if last is not None and frame.pts is not None and frame.pts >= last:
+                    if frame.pts is not None and frame.pts >= last:
                         return
-                    if frame.is_corrupt:
-                        self.corrupt += 1
-                    else:
+                    self.corrupt += frame.is_corrupt
+                    if not frame.is_corrupt:
                         yield frame
 
-    def _bounds(self, stream: Any) -> tuple[int | None, int | None]:
-        """The part's first stamp and the one that ends it, in the stream's time base: half a frame early, as times in
-        other files are rounded."""
-        if self.part is None or not self.time_base:
-            return None, None
-        early = 0.5 / self.rate if self.rate else 0.0
-        begin = stream.start_time or 0
-        first, last = (begin + round((time - early) / self.time_base) for time in self.part)
-        return first, last
-
     def run(self) -> _Scan:
-        """Decode all frames. Raises NeecoError when the file cannot be opened or its frames differ in size."""
+        """Decode all frames, and keep them for later readings where they are not too large. Raises NeecoError when the
+        file cannot be opened or its frames differ in size."""
         for frame in self.decoded():
             size = (frame.width, frame.height)
             if self.size not in (None, size):
@@ -289,81 +291,67 @@ class _Scan:
             self.stamps.append(frame.pts)
             self.interlaced |= bool(frame.interlaced_frame)
             self.turned = self.turned or int(getattr(frame, "rotation", 0) or 0)
-            self._buffer(frame)
+            self.buffered_bytes += sum(plane.buffer_size for plane in frame.planes)
+            self.buffered.append(frame)
+            if self.buffered_bytes > SETTINGS.buffered_bytes:
+                self.buffered.clear()
         return self
 
-    def _buffer(self, frame: Any) -> None:
-        """Keep a frame for later readings; none of a video whose frames are too large."""
-        self.buffered_bytes += sum(plane.buffer_size for plane in frame.planes)
-        if self.buffered_bytes <= MAX_BUFFERED_BYTES:
-            self.buffered.append(frame)
-        else:
-            self.buffered.clear()
-
     def finish(self, fps: float | None) -> _Video:
-        if self.size is None or len(self.stamps) < MIN_IMAGES:
+        if self.size is None or len(self.stamps) < SETTINGS.min_images:
             why = f" ({self.failure})" if self.failure else ""
             raise NeecoError(f"{self.path}: {len(self.stamps)} frames can be decoded{why}; give an intact video file")
-        notes = self._notes()
         stamps = [stamp for stamp in self.stamps if stamp is not None]
-        order = sorted(set(stamps))
-        numbered, own = False, None
+        order, numbered, own, notes = sorted(set(stamps)), False, None, self._notes(stamps)
         if len(stamps) == len(self.stamps) and self.time_base and len(order) > 0.9 * len(stamps):
             times = (np.array(order, dtype=np.float64) - order[0]) * self.time_base
             if any(later < stamp for stamp, later in pairwise(stamps)):
                 # AVI and ASF store no times of display: these are of decoding, and frames come in order of display
                 ranked, numbered = sorted(stamps), True
                 order = [place for place, stamp in enumerate(ranked) if place == 0 or stamp > ranked[place - 1]]
-                notes.append(f"{self.path.name}: its frames' times fall; frames are taken in the order they are shown")
+                notes.append("its frames' times fall; frames are taken in the order they are shown")
             if fps is not None:
-                own = 1 / float(np.median(np.diff(times)))
-                own = None if abs(own / fps - 1) < SAME_RATE else own
+                rate = 1 / float(np.median(np.diff(times)))
                 times = np.arange(len(order)) / fps
-            if own is not None:
-                notes.append(f"{self.path.name}: states {own:.4g} frames a second itself, the recording {fps:g}")
+                if abs(rate / fps - 1) >= SETTINGS.same_rate:
+                    own = rate
+                    notes.append(f"states {own:.4g} frames a second itself, the recording {fps:g}")
             if len(order) < len(stamps):
-                notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
+                notes.append(f"{len(stamps) - len(order)} frames share a time with another; left out")
         else:
-            rate, order, numbered = fps or self.rate, list(range(len(self.stamps))), True
-            if not rate or rate > MAX_RATE:
+            stated, order, numbered = fps or self.rate, list(range(len(self.stamps))), True
+            if not stated or stated > SETTINGS.max_rate:
                 raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
             if fps is None:
-                notes.append(f"{self.path.name}: its frames have no times; taken as {rate:g} a second")
-            times = np.array(order) / rate
+                notes.append(f"its frames have no times; taken as {stated:g} a second")
+            times = np.array(order) / stated
         return _Video(
-            self.path, self.size, tuple(notes), times, stamps=tuple(order), numbered=numbered, threads=self.threads,
-            part=self.part, stated_fps=own, pixel_aspect=self.pixel_aspect, buffered=tuple(self.buffered),
+            self.path, self.size, tuple(f"{self.path.name}: {note}" for note in notes), times, stamps=tuple(order),
+            numbered=numbered, threads=self.threads, part=self.part, stated_fps=own, pixel_aspect=self.pixel_aspect,
+            buffered=tuple(self.buffered) if len(self.buffered) == len(self.stamps) else (),
         )  # fmt: skip
 
-    def _is_complete(self) -> bool:
-        """Whether frames reach the end that the file states, or those missing are decoded and not shown (edit list)."""
-        if self.packets >= self.promised:
-            return True
-        shown = [stamp for stamp in self.stamps if stamp is not None]
-        if self.end is None or not self.time_base or len(shown) < MIN_IMAGES:
-            return False
-        step = float(np.median(np.diff(sorted(shown))))
-        return max(shown) + 1.5 * step >= self.end
-
-    def _notes(self) -> list[str]:
+    def _notes(self, stamps: list[int]) -> list[str]:
         notes, read = [], len(self.stamps)
         if self.failure or self.corrupt:
             what = f"{self.failure or 'corrupt frames'}; {read} frames could be read, the others are left out"
-            notes.append(f"{self.path.name}: is damaged: {what}")
-        elif self.promised > read and self.part is None and not self._is_complete():
-            notes.append(f"{self.path.name}: ends early: {read} of {self.promised} frames are there")
+            notes.append(f"is damaged: {what}")
+        elif self.promised > max(read, self.packets) and self.part is None:
+            # unless frames reach the end that the file states: those missing are decoded and not shown (edit list)
+            step = float(np.median(np.diff(sorted(stamps)))) if len(stamps) > 1 else 0.0
+            if self.end is None or not self.time_base or not stamps or max(stamps) + 1.5 * step < self.end:
+                notes.append(f"ends early: {read} of {self.promised} frames are there")
         if self.others:
-            several = (
-                f"holds {1 + len(self.others)} video streams; the first is read (others: {', '.join(self.others)})"
-            )
-            notes.append(f"{self.path.name}: {several}; copy another into a file of its own: ffmpeg -map 0:v:1 -c copy")
+            others = f"the first is read (others: {', '.join(self.others)})"
+            remedy = "copy another into a file of its own: ffmpeg -map 0:v:1 -c copy"
+            notes.append(f"holds {1 + len(self.others)} video streams; {others}; {remedy}")
         if self.pixel_aspect != 1:
             shape = f"are not square ({self.pixel_aspect:.3g} times as wide as high); its frames are used as stored"
-            notes.append(f"{self.path.name}: its pixels {shape}, so fl_x / fl_y is {1 / self.pixel_aspect:.3g}")
+            notes.append(f"its pixels {shape}, so fl_x / fl_y is {1 / self.pixel_aspect:.3g}")
         if self.interlaced:
-            notes.append(f"{self.path.name}: is interlaced; deinterlace it (ffmpeg -vf yadif) for sharper frames")
+            notes.append("is interlaced; deinterlace it (ffmpeg -vf yadif) for sharper frames")
         if self.turned:
-            notes.append(f"{self.path.name}: states a rotation by {self.turned} degrees; its frames are used as stored")
+            notes.append(f"states a rotation by {self.turned} degrees; its frames are used as stored")
         return notes
 
 
@@ -393,22 +381,17 @@ def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[
     columns = [[Path(str(cell)).name for cell in table.rows[:, index]] for index in range(len(table.header))]
     names = next((cells for cells in columns if sum(cell in by_name for cell in cells) > 0.5 * len(cells)), None)
     if names is not None:
-        there = [row for row, cell in enumerate(names) if cell in by_name]
-        absent = [folder / cell for cell in names if cell not in by_name]
+        there = np.array([cell in by_name for cell in names])
+        absent = np.flatnonzero(~there)
         if not _are_few(len(absent), len(names)):
-            row = next(row for row, cell in enumerate(names) if cell not in by_name)
-            raise NeecoError(
-                f"{table_path}: line {lines[row]}: {names[row]!r} is not in {folder.name} ({len(absent)} of "
-                f"{len(names)} like it); correct the names"
-            )
-        notes += _left_out(folder, "are listed and not there", absent)
-        files, times, lines = [by_name[names[row]] for row in there], times[there], lines[there]
+            what = f"{names[absent[0]]!r} is not in {folder.name} ({len(absent)} of {len(names)} like it)"
+            raise NeecoError(f"{table_path}: line {lines[absent[0]]}: {what}; correct the names")
+        notes += _left_out(folder, "are listed and not there", [folder / names[row] for row in absent])
+        files, times, lines = [by_name[name] for name in names if name in by_name], times[there], lines[there]
     if len(times) != len(files):
         raise NeecoError(f"{table_path}: has {len(times)} times for {len(files)} images; add a column of names")
     wrong = ~(np.diff(times, prepend=-np.inf) > 0)  # NaN compares false
     if wrong.any():
-        raise NeecoError(
-            f"{table_path}: line {lines[wrong][0]}: {column}: expected a time after the one before; keep the rows of "
-            "one run, in order"
-        )
+        what = f"line {lines[wrong][0]}: {column}: expected a time after the one before"
+        raise NeecoError(f"{table_path}: {what}; keep the rows of one run, in order")
     return files, times

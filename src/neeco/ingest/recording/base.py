@@ -28,7 +28,6 @@ MM = 1000.0  # per m
 STATED = f"{{transform: 4 rows, mm, sd_mm: {DVRK_SD_MM:g}, sd_deg: {DVRK_SD_DEG:g}}}"
 NEAR_MM = 10.0  # no base is nearer to a camera: a transform in metres
 WHAT = "a camera registration of the dVRK: JSON"
-_AXES = word((*CAMERA_FRAMES,), "is no convention", f"write one of {', '.join(CAMERA_FRAMES)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +55,7 @@ class BaseSection:
     """{transform, axes, sd_mm, sd_deg}; axes: those of the camera that the transform leads to."""
 
     transform: Annotated[np.ndarray | None, Node.rigid] = None
-    axes: Annotated[str, _AXES] = CAMERA
+    axes: Annotated[str, word(*CAMERA_FRAMES)] = CAMERA
     sd_mm: Positive | None = None
     sd_deg: Positive | None = None
 

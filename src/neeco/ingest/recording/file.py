@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -46,7 +46,6 @@ from neeco.ingest.recording.sections import (
     existing_file,
     integer,
     ranges,
-    text,
     word,
 )
 
@@ -77,12 +76,6 @@ def recording_of(document: Any, path: Path) -> Recording:
 Names = tuple[str, ...]
 
 
-def _euler(node: Node) -> str:
-    if not _EULER.fullmatch(text(node)):
-        raise Fault(node.field, f"{printable(node.value)} is none; three axes: XYZ intrinsic, xyz extrinsic")
-    return text(node)
-
-
 def _words(node: Node) -> Names:
     return tuple(str(item) for item in (node.value if isinstance(node.value, list) else [node.value]))
 
@@ -100,7 +93,7 @@ class PoseColumnsSection:
     euler: Annotated[Names, columns(3)] | None = None
     rotation_matrix: Annotated[Names, columns(9)] | None = None
     matrix: Annotated[Names, columns(12, 16)] | None = None
-    euler_convention: Annotated[str, _euler] | None = None
+    euler_convention: Name | None = None
     state: Name | None = None
     good: Annotated[Names, _words] = ("OK",)
 
@@ -112,8 +105,9 @@ class PoseColumnsSection:
             raise Fault("quaternion", "the names do not say the order; use quaternion_wxyz or quaternion_xyzw")
         if self.matrix and self.position:
             raise Fault("position", "the 4x4 matrix holds the position already; remove it (or use rotation_matrix)")
-        if self.euler and self.euler_convention is None:
-            raise Fault("euler_convention", "missing; name the axes in order: ZYX intrinsic, zyx extrinsic, ...")
+        if self.euler and not _EULER.fullmatch(self.euler_convention or ""):
+            problem = f"{printable(self.euler_convention)} is none" if self.euler_convention else "missing"
+            raise Fault("euler_convention", f"{problem}; name three axes in order: ZYX intrinsic, zyx extrinsic")
 
     @property
     def rotation(self) -> tuple[Names | None, str | None]:
@@ -149,7 +143,7 @@ class PoseSection(LogSection):
 
     columns: PoseColumnsSection = field(default_factory=PoseColumnsSection)
     tool: Name | None = None
-    frame: Annotated[str, word(FRAMES, "is no frame of poses", f"write one of {', '.join(FRAMES)}")] | None = None
+    frame: Annotated[str, word(*FRAMES)] | None = None
 
     def log(self, video: Path | None) -> PoseColumns:
         """Return the log; in the file of the images, it shares their clock."""
@@ -333,7 +327,7 @@ def _episodes(node: Node) -> tuple[int, ...]:
 class RecordingSection(FramesSection, BasesSection):
     """The keys of recording.yaml."""
 
-    camera: Annotated[str, word((STILL, MOVING), "says nothing of a scope", f"write {STILL} or {MOVING}")] | None = None
+    camera: Annotated[str, word(STILL, MOVING)] | None = None
     stereo: StereoSection | None = None
     episodes: Annotated[tuple[int, ...], _episodes] = ()
     intrinsics: Annotated[Any, _intrinsics] = None
@@ -373,21 +367,15 @@ class RecordingSection(FramesSection, BasesSection):
             frames=self.frames, splits=self.splits, notes=notes, settings=self.settings, camera=self.camera,
             stereo=stereo, episodes=self.episodes,
         )  # fmt: skip
-        _check_one_clock(found)
+        known = None if video is None else format_of(video)
+        for log in found.logs if known is not None else ():
+            if video is None or known is None or log.path != video or log.clock != VIDEO_CLOCK:
+                continue
+            of_log, of_images = known.clock(video, log.stream), known.clock(video, found.stream)
+            if of_log and of_images and of_log != of_images:  # another part of one file, as of another episode
+                problem = f"{printable(log.stream)} is of {of_log}, the images of {of_images}"
+                raise Fault("stream", f"{problem}; name the same in both")
         return found
-
-
-def _check_one_clock(recording: Recording) -> None:
-    """Raise Fault when a log is of another part of the images' file than they are, as of another episode."""
-    video = recording.video
-    known = None if video is None else format_of(video)
-    for log in recording.logs:
-        if known is None or video is None or log.path != video or log.clock != VIDEO_CLOCK:
-            continue
-        own, images = known.clock(video, log.stream), known.clock(video, recording.stream)
-        if own and images and own != images:
-            problem = f"{printable(log.stream)} is of {own}, the images of {images}; name the same in both"
-            raise Fault("stream", problem)
 
 
 def _sync(
@@ -399,49 +387,33 @@ def _sync(
         return {}, ()
     clocks = tuple(dict.fromkeys(log.clock for log in logs_of(instruments, scope)))
     if not isinstance(node.value, str):
-        if not isinstance(node.value, dict):
-            raise Fault(node.field, "must name a JSON file or give offsets, as in `sync: {em: 0.038}`")
-        return _offsets(node, clocks)
+        return _offsets(node, node.value, clocks)
     file = existing_file(node)
     require_file(file, "clock offsets as JSON")
     document = read_json(file)
-    if not isinstance(document, dict):
-        raise NeecoError(f'{file}: expected clock offsets, as in {{"clocks": {{"em": 0.038}}}}')
+    stated = document if isinstance(document, dict) else {}
+    others = {key: value for key, value in stated.items() if key.endswith(_OFFSET_SUFFIX)}
     with faults_in(file):
-        if isinstance(document.get("clocks"), dict):
-            return _offsets(Node(document["clocks"], str(file), "clocks"), clocks)
-        stated = {key: value for key, value in document.items() if key.endswith(_OFFSET_SUFFIX)}
-        if not stated:
-            raise Fault("clocks", 'missing; give offsets, as in {"clocks": {"em": 0.038}}')
-        return _offsets(Node(stated, str(file)), clocks)
+        return _offsets(Node(document, str(file)), stated if "clocks" in stated else others or None, clocks)
 
 
-def _offsets(node: Node, clocks: tuple[str, ...]) -> tuple[dict[str, float], tuple[str, ...]]:
-    held: Mapping[Any, Any] = node.value
-    offsets: dict[str, float] = {}
-    notes = []
-    for key, value in (held["clocks"] if isinstance(held.get("clocks"), dict) else held).items():
-        place = f"{node.field}.{key}".lstrip(".")
-        clock = _clock_of(place, str(key).removesuffix(_OFFSET_SUFFIX), clocks)
+def _offsets(node: Node, stated: Any, clocks: tuple[str, ...]) -> tuple[dict[str, float], tuple[str, ...]]:
+    if isinstance(stated, dict) and isinstance(stated.get("clocks"), dict):
+        node, stated = node.child("clocks"), stated["clocks"]
+    if not isinstance(stated, dict):
+        expected = 'expected clock offsets in s, as in {"clocks": {"em": 0.038}}'
+        raise Fault(node.field or "clocks", f"{expected}, or a JSON file of them; correct it")
+    offsets, notes = dict[str, float](), []
+    for key, value in stated.items():
+        place, name = join_places(node.field, str(key)), str(key).removesuffix(_OFFSET_SUFFIX)
         seconds = as_float(value)
         if seconds is None or not abs(seconds) < MAX_NUMBER:
             raise Fault(place, f"{printable(value)} is not an offset in seconds; t_log = t_video + offset")
-        if clock is None:
-            notes.append(f"{Path(node.file).name}: {printable(place)} belongs to no log of this recording; ignored")
+        longer = [clock for clock in clocks if clock.startswith(name + "_")]  # "jaw" for jaw_angle
+        if name in clocks or len(longer) == 1:
+            offsets[name if name in clocks else longer[0]] = seconds
+        elif likely := nearest(name, clocks) or " or ".join(longer):
+            raise Fault(place, f"no log has the clock {printable(name)}; did you mean {likely}?")
         else:
-            offsets[clock] = seconds
+            notes.append(f"{Path(node.file).name}: {printable(place)} belongs to no log of this recording; ignored")
     return offsets, tuple(notes)
-
-
-def _clock_of(place: str, name: str, clocks: tuple[str, ...]) -> str | None:
-    """Return the clock that a name in a sync file means: itself, or the only one it begins ("jaw" for jaw_angle)."""
-    if name in clocks:
-        return name
-    longer = [clock for clock in clocks if clock.startswith(name + "_")]
-    if len(longer) == 1:
-        return longer[0]
-    likely = nearest(name, clocks)
-    if likely or len(longer) > 1:
-        meant = likely or " or ".join(longer)
-        raise Fault(place, f"no log has the clock {printable(name)}; did you mean {meant}?")
-    return None

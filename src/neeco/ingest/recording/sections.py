@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -44,12 +44,12 @@ def integer(least: int) -> Parser:
     return lambda node: node.integer(least)
 
 
-def word(names: Sequence[str], fault: str, remedy: str) -> Parser:
+def word(*names: str) -> Parser:
     """Return the parser of one of some names, in small letters."""
 
     def parse(node: Node) -> str:
         if text(node).lower() not in names:
-            raise Fault(node.field, f"{printable(node.value)} {fault}; {remedy}")
+            raise Fault(node.field, f"{printable(node.value)} is none of them; write one of {', '.join(names)}")
         return text(node).lower()
 
     return parse

@@ -1,4 +1,7 @@
-"""`neeco ingest --init`: a drafted recording.yaml, by looking at the files in a folder."""
+"""`neeco ingest --init`: a drafted recording.yaml, by looking at the files in a folder.
+
+A line counts only where something was measured or read that says so; else it is a comment with the reason.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,19 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from neeco.base.errors import NeecoError, visible
 from neeco.base.files import read_json, require_content
 from neeco.base.placeholders import placeholder
 from neeco.ingest.calibration.lens import read_lens
+from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.readers import IMAGES as IMAGE_STREAMS
-from neeco.ingest.readers import POSES, READINGS, Stream, format_of, read_table
+from neeco.ingest.readers import POSES, READINGS, Stream, VideoSource, format_of, read_table
 from neeco.ingest.readers.columns import (
     BASE,
     MATRIX,
@@ -28,18 +36,32 @@ from neeco.ingest.readers.columns import (
     recognise_value,
     split_unit,
 )
+from neeco.ingest.readers.delimited import tool_columns, tool_names
 from neeco.ingest.readers.frame_names import NamedFrame, without_frame
 from neeco.ingest.readers.logs import with_named_frame
-from neeco.ingest.readers.ndi import tool_columns, tool_names
 from neeco.ingest.readers.rosbag import DVRK_WRIST
 from neeco.ingest.readers.video import IMAGES, VIDEOS
-from neeco.ingest.recording.drafted_scope import FoundFrames, StandsStill, draft_scope
+from neeco.ingest.recording.model import STILL, ImageFolder, VideoFile
 
-MAX_FILES = 400  # looked at; a folder with more is not one recording
-MIN_IMAGES = 10  # in a folder of frames
-MAX_CALIBRATION_ROWS = 200
+StandsStill = Callable[[VideoSource], bool]  # does a scope stand still, by its images?
 _EPISODES = re.compile(r"episodes (\d+) to (\d+)")
+_LEFT = re.compile("left", re.IGNORECASE)
+_NO_NAME = re.compile(r"[^A-Za-z0-9_]+")
 _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)", re.IGNORECASE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DraftLimits:
+    """Limits on what is looked at, and the rates that are guessed."""
+
+    files: int = 400  # a folder with more is not one recording
+    min_images: int = 10  # in a folder of frames
+    calibration_rows: int = 200  # of a joint's table
+    image_rate: float = 25.0  # a second
+    tracker_rate: float = 40.0
+
+
+LIMITS, IN_BASE = DraftLimits(), NamedFrame(BASE)
 
 # Lines of a draft that leave something open: what marks the first of them, and what to write there
 _QUESTIONS = (
@@ -62,20 +84,30 @@ def open_questions(draft: str) -> list[tuple[int, str]]:
 
 
 @dataclass(frozen=True)
+class _Frames:
+    """Images of one camera. line: `video: …` or `images: …` of the draft; name: of their file there; file: the video,
+    the folder of images or the file of which `stream` is one."""
+
+    line: str
+    name: str
+    file: Path
+    stream: str | None = None
+
+
+@dataclass(frozen=True)
 class _Log:
-    """A log: its file, relative to the folder; stream: which of it; tool: which of several in an NDI export; meaning:
-    of the frame of a table's poses."""
+    """A log: its file, relative to the folder; says: the holder of remarks on the body (`hints`), and of keys that
+    nothing in the file answers (`asks`), its stream or the meaning of a table's frame; tool: which of several in an NDI
+    export; in_base: are its poses stated in a base's frame?"""
 
     file: str
-    stream: Stream | None = None
+    says: Stream | NamedFrame = IN_BASE
     tool: str | None = None
-    meaning: NamedFrame | None = None
-    in_base: bool = False  # are its poses stated in a base's frame?
+    in_base: bool = False
 
     @property
-    def says(self) -> Stream | NamedFrame:
-        """The holder of remarks on the body (`hints`), and of keys that nothing in the file answers (`asks`)."""
-        return self.stream or self.meaning or NamedFrame(BASE)
+    def stream(self) -> Stream | None:
+        return self.says if isinstance(self.says, Stream) else None
 
     @property
     def stem(self) -> str:
@@ -83,21 +115,21 @@ class _Log:
         if self.stream is None and self.tool is None:
             return without_frame(Path(self.file).stem)
         name = re.sub(r"[^A-Za-z0-9]+", "_", self.stream.name if self.stream else str(self.tool)).strip("_")
-        if self.tool is not None and not name[:1].isalpha():
-            name = f"tool_{name}"
+        name = name if self.tool is None or name[:1].isalpha() else f"tool_{name}"
         return without_frame((self.stream and self.stream.body) or name)
 
     def lines(self) -> list[str]:
-        given = [("file", self.file), ("stream", self.stream.name if self.stream else None), ("tool", self.tool)]
-        return [f"{key}: {_scalar(value)}" for key, value in given if value is not None]
+        keys = [("file", self.file), ("stream", self.stream.name if self.stream else None), ("tool", self.tool)]
+        return [f"{key}: {_scalar(value)}" for key, value in keys if value is not None]
 
 
 @dataclass(kw_only=True)
 class _FolderFiles:
     """The files of a folder by their likely kind, as paths relative to it. joints: log, time, column and joint's name;
-    problems: what cannot be read, and whether it may be images; others: all that is not used."""
+    problems: what cannot be read, and whether it may be images; others: all that is not used; episodes: of a data set
+    that holds several, "0-9"."""
 
-    frames: list[FoundFrames] = field(default_factory=list)
+    frames: list[_Frames] = field(default_factory=list)
     lenses: list[str] = field(default_factory=list)
     syncs: list[str] = field(default_factory=list)
     poses: list[tuple[_Log, RecognisedColumns]] = field(default_factory=list)
@@ -105,13 +137,17 @@ class _FolderFiles:
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
     problems: list[tuple[str, bool]] = field(default_factory=list)
-    episodes: str | None = None  # of a data set that holds several, "0-9"
+    episodes: str | None = None
 
-    def leave_out(self, what: str, why: str = "", images: bool = False) -> None:
-        """List something as not used. why: what is wrong with it, where anything is; images: may they be in it?"""
-        line = visible(f"{what}: {why}" if why else what)
+    def leave_out(self, what: str, why: NeecoError | str = "", path: Path | None = None, images: bool = False) -> None:
+        """List something as not used. why: what is wrong with it, where anything is, in a message that may begin with
+        the file; images: may they be in it?"""
+        name = what.rpartition(": ")[2]
+        reason = str(why).removeprefix(f"{path}: ").removeprefix(f"{name}: ")
+        reason = reason if path is None else reason.replace(str(path), path.name)
+        line = visible(f"{what}: {reason}" if reason else what)
         self.others.append(line)
-        self.problems += [(line, images)] if why else []
+        self.problems += [(line, images)] if reason else []
 
 
 def write_template(
@@ -128,80 +164,49 @@ def write_template(
     require_content(source)
     if source.is_file() and (known is None or not known.streams(source)):
         raise NeecoError(f"{source}: is a file of no format that holds images and logs; give the recording's folder")
-    found = _find_files(source)
-    if not found.frames:
-        if problems := [line.removeprefix(f"{source.name}: ") for line, images in found.problems if images]:
+    files = _find_files(source)
+    if not files.frames:
+        if problems := [line.removeprefix(f"{source.name}: ") for line, images in files.problems if images]:
             more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
             raise NeecoError(f"{source}: holds no images that can be read: {problems[0]}{more}")
         raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
-    for line, _ in found.problems:
+    for line, _ in files.problems:
         report(line)
-    return "\n".join(_draft(found, stands_still)) + "\n"
-
-
-def _draft(found: _FolderFiles, stands_still: StandsStill | None) -> Iterator[str]:
-    """Yield the lines of the draft."""
-    frames = found.frames
-    scopes = [(log, columns) for log, columns in found.poses if _SCOPE.search(log.stem)]
-    on_scope, right, still = draft_scope(frames, [*map(_scalar, found.lenses)], stands_still)
-    yield "# A recording, for `neeco ingest recording.yaml --output CAPTURE`, drafted by looking at the files. Check"
-    yield "# every line. Paths are relative to this file; docs/recording.md explains all keys."
-    yield frames[0].line + ("   # the rate is a guess: correct it" if frames[0].line.startswith("images") else "")
-    yield from (f"# {item.line}   # another one found" for item in frames[1:] if item.line != right)
-    if found.episodes:
-        yield f'# episodes: ["{found.episodes}"]   # of the data set, or [0, 3, 7]: they become one capture'
-    yield from on_scope
-    yield from _instruments(found, in_camera=still or not scopes)
-    if scopes:
-        yield "laparoscope:"
-        yield from (f"  # {hint}" for hint in scopes[0][0].says.hints)
-        yield from (f"  {line}" for line in _pose_lines(*scopes[0]))
-        yield from (f"# laparoscope: {{{', '.join(log.lines())}}}   # another one found" for log, _ in scopes[1:])
-    shared = any(log.stream is not None and log.file == frames[0].name for log, _ in found.poses)
-    offsets = "# sync: {video: 0.0}" if shared else "# sync: {em: 0.0}"
-    yield f"sync: {_scalar(found.syncs[0])}" if found.syncs else f"{offsets}   # s, t_log = t_video + offset, by clock"
-    if found.others:
-        yield "# There, too, and not used:"
-        yield from (f"#   {line}" for line in found.others)
+    return "\n".join(_draft(files, stands_still)) + "\n"
 
 
 def _find_files(source: Path) -> _FolderFiles:
-    found = _FolderFiles()
-    if _add_streams(found, source, source.name):
-        return found
-    folder, found_in = source, ("*", "*/*")
-    for inner in sorted(entry for pattern in found_in for entry in folder.glob(pattern) if entry.is_dir()):
-        _add_streams(found, inner, inner.relative_to(folder).as_posix())
-    held = {item.file for item in found.frames} | {folder / log.file for log, _ in found.poses}
-    files = sorted(
-        file
-        for pattern in found_in
-        for file in folder.glob(pattern)
-        if (file.is_file() or placeholder(file)) and not held & {*file.parents}
-        if not any(part.startswith(".") for part in file.relative_to(folder).parts)
-    )
-    for file in [file for file in files if file.suffix.lower() not in IMAGES][:MAX_FILES]:
-        name, suffix = file.relative_to(folder).as_posix(), file.suffix.lower()
+    files = _FolderFiles()
+    if _add_streams(files, source, source.name):
+        return files
+    entries = [entry for pattern in ("*", "*/*") for entry in source.glob(pattern)]
+    entries = [entry for entry in entries if not any(part[:1] == "." for part in entry.relative_to(source).parts)]
+    for inner in sorted(entry for entry in entries if entry.is_dir()):
+        _add_streams(files, inner, inner.relative_to(source).as_posix())
+    used = {item.file for item in files.frames} | {source / log.file for log, _ in files.poses}
+    entries = sorted(file for file in entries if (file.is_file() or placeholder(file)) and not used & {*file.parents})
+    for file in [file for file in entries if file.suffix.lower() not in IMAGES][: LIMITS.files]:
+        name, suffix = file.relative_to(source).as_posix(), file.suffix.lower()
         if problem := placeholder(file):
-            found.leave_out(name, problem, images=True)
+            files.leave_out(name, problem, images=True)
         elif suffix in VIDEOS:
-            found.frames.append(FoundFrames(f"video: {_scalar(name)}", name, file))
+            files.frames.append(_Frames(f"video: {_scalar(name)}", name, file))
         elif format_of(file) is not None:
-            if not _add_streams(found, file, name):
-                _classify_table(found, _Log(name), file)
+            if not _add_streams(files, file, name):
+                _classify_table(files, name, file)
         elif suffix == ".json" and _is_sync(file):
-            found.syncs.append(name)
+            files.syncs.append(name)
         elif suffix in (".yaml", ".yml", ".xml", ".json"):
             with suppress(NeecoError):
-                found.lenses += [name] if read_lens(file) is not None else []
-    for parent, count in Counter(file.parent for file in files if file.suffix.lower() in IMAGES).items():
-        name = parent.relative_to(folder).as_posix()
-        line = f"images: {{folder: {_scalar(name)}, fps: 25}}"
-        found.frames += [FoundFrames(line, name, parent)] if count >= MIN_IMAGES else []
-    return found
+                files.lenses += [name] if read_lens(file) is not None else []
+    for parent, count in Counter(file.parent for file in entries if file.suffix.lower() in IMAGES).items():
+        name = parent.relative_to(source).as_posix()
+        line = f"images: {{folder: {_scalar(name)}, fps: {LIMITS.image_rate:g}}}"
+        files.frames += [_Frames(line, name, parent)] if count >= LIMITS.min_images else []
+    return files
 
 
-def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
+def _add_streams(files: _FolderFiles, path: Path, name: str) -> bool:
     """Add the streams of what holds several, and all of them as a list to choose from."""
     known = format_of(path)
     if known is None:
@@ -210,102 +215,191 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         known.require_package(path)
         streams = known.streams(path)
     except NeecoError as error:
-        found.leave_out(name, _without_place(str(error), path, name), images=True)
+        files.leave_out(name, error, path, images=True)
         return path.is_dir()
     for stream in streams:
-        log = _Log(name, stream)
+        log, title = _Log(name, stream), f"{name}: {stream.name}"
         used = stream.offered and stream.count > 0 and stream.problem is None
         if used and stream.kind == IMAGE_STREAMS:
-            line = f"video: {{{', '.join(log.lines())}}}"
-            found.frames.append(FoundFrames(line, name, path, stream.name))
+            files.frames.append(_Frames(f"video: {{{', '.join(log.lines())}}}", name, path, stream.name))
         elif used and stream.kind in (POSES, READINGS):
             try:
-                _classify_stream(found, log, stream, path)
+                _classify_stream(files, log, stream, path)
             except NeecoError as error:
-                found.leave_out(f"{name}: {stream.name}", _without_place(str(error), path, stream.name))
+                files.leave_out(title, error, path)
         elif stream.problem is not None:
-            why, images = _without_place(stream.problem, path, stream.name), stream.kind == IMAGE_STREAMS
-            found.leave_out(f"{name}: {stream.name}", why, images)
+            files.leave_out(title, stream.problem, path, stream.kind == IMAGE_STREAMS)
         else:
             rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
-            found.leave_out(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}")
+            files.leave_out(f"{title}: {stream.type}, {stream.count}{rate}")
             if (several := _EPISODES.fullmatch(stream.name)) and known.of_episode(stream.name, 0) is not None:
-                found.episodes = f"{several[1]}-{several[2]}"
+                files.episodes = f"{several[1]}-{several[2]}"
     return bool(streams)
 
 
-def _classify_stream(found: _FolderFiles, log: _Log, stream: Stream, path: Path) -> None:
+def _classify_stream(files: _FolderFiles, log: _Log, stream: Stream, path: Path) -> None:
     table = read_table(path, stream.name)
     when = recognise_time(table.header)
     joints: Sequence[tuple[str | None, str]] = stream.joints or ()
     if stream.kind == POSES:
         header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
         in_base = table.frame in (None, BASE) and not stream.asks
-        found.poses.append((replace(log, in_base=in_base), recognise_pose(header)))
+        files.poses.append((replace(log, in_base=in_base), recognise_pose(header)))
     elif stream.joints is None:  # every angle is one
         joints = [(None, column) for column in table.header if split_unit(column, "angle")[1]]
-    found.joints += [(log, when, column, joint) for joint, column in joints]
+    files.joints += [(log, when, column, joint) for joint, column in joints]
 
 
-def _without_place(message: str, path: Path, name: str) -> str:
-    """A message without the file and the stream that it begins with."""
-    return message.removeprefix(f"{path}: ").removeprefix(f"{name}: ").replace(str(path), path.name)
-
-
-def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
-    name = log.file
+def _classify_table(files: _FolderFiles, name: str, file: Path) -> None:
     try:
         table = read_table(file)
         meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
     except NeecoError as error:
-        found.leave_out(name, _without_place(str(error), file, name))
+        files.leave_out(name, error, file)
         return
     tools = tool_names(table)
     for tool in tools:
         try:
             own = tool_columns(table, PoseColumns(file, tool=tool))
         except NeecoError as error:
-            found.leave_out(f"{name}: {tool}", _without_place(str(error), file, name))
+            files.leave_out(f"{name}: {tool}", error, file)
             continue
-        found.poses.append((_Log(name, tool=tool), recognise_pose(own.header)))
+        files.poses.append((_Log(name, tool=tool), recognise_pose(own.header)))
     if tools:
         return
-    pose = recognise_pose(table.header)
-    value, when = recognise_value(table.header)
+    log, pose, (value, when) = _Log(name), recognise_pose(table.header), recognise_value(table.header)
     columns = [column for column in table.header if column]
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
-        found.poses.append((replace(log, meaning=meaning), pose))
+        files.poses.append((replace(log, says=meaning or log.says), pose))
         joints = joint_columns(columns, pose_bodies(columns))
-        found.joints += [(log, when, column, _joint_of(column)) for column in joints]
+        files.joints += [(log, when, column, _joint_of(column)) for column in joints]
     elif value and when.time:
-        found.joints.append((log, when, value, None))
+        files.joints.append((log, when, value, None))
     elif when.time and len(angles) > 1:
-        found.joints += [(log, when, column, _joint_of(column)) for column in angles]
-    elif len(columns) == 2 and angles and not when.time and len(table.rows) <= MAX_CALIBRATION_ROWS:
-        found.calibrations.append((name, table.header))
+        files.joints += [(log, when, column, _joint_of(column)) for column in angles]
+    elif len(columns) == 2 and angles and not when.time and len(table.rows) <= LIMITS.calibration_rows:
+        files.calibrations.append((name, table.header))
     elif not (when.time and len(columns) <= 2):
-        found.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
+        files.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
 
 
 def _is_sync(file: Path) -> bool:
     with suppress(NeecoError):
-        held = document if isinstance(document := read_json(file), dict) else {}
-        offsets = held.get("clocks") or {key: held[key] for key in held if key.endswith("_minus_video_s")}
+        stated = document if isinstance(document := read_json(file), dict) else {}
+        offsets = stated.get("clocks") or {key: stated[key] for key in stated if key.endswith("_minus_video_s")}
         return isinstance(offsets, dict) and bool(offsets) and {*map(type, offsets.values())} <= {int, float}
     return False
 
 
-def _instruments(found: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
+def _draft(files: _FolderFiles, stands_still: StandsStill | None) -> Iterator[str]:
+    """Yield the lines of the draft."""
+    frames = files.frames
+    scopes = [(log, columns) for log, columns in files.poses if _SCOPE.search(log.stem)]
+    on_scope, right, still = _scope_lines(frames, [*map(_scalar, files.lenses)], stands_still)
+    yield "# A recording, for `neeco ingest recording.yaml --output CAPTURE`, drafted by looking at the files. Check"
+    yield "# every line. Paths are relative to this file; docs/recording.md explains all keys."
+    yield frames[0].line + ("   # the rate is a guess: correct it" if frames[0].line.startswith("images") else "")
+    yield from (f"# {item.line}   # another one found" for item in frames[1:] if item.line != right)
+    if files.episodes:
+        yield f'# episodes: ["{files.episodes}"]   # of the data set, or [0, 3, 7]: they become one capture'
+    yield from on_scope
+    yield from _instrument_lines(files, in_camera=still or not scopes)
+    if scopes:
+        yield "laparoscope:"
+        yield from (f"  # {hint}" for hint in scopes[0][0].says.hints)
+        yield from (f"  {line}" for line in _pose_lines(*scopes[0]))
+        yield from (f"# laparoscope: {{{', '.join(log.lines())}}}   # another one found" for log, _ in scopes[1:])
+    shared = any(log.stream is not None and log.file == frames[0].name for log, _ in files.poses)
+    offsets = f"# sync: {{{'video' if shared else 'em'}: 0.0}}   # s, t_log = t_video + offset, by clock"
+    yield f"sync: {_scalar(files.syncs[0])}" if files.syncs else offsets
+    if files.others:
+        yield "# There, too, and not used:"
+        yield from (f"#   {line}" for line in files.others)
+
+
+def _scope_lines(
+    frames: Sequence[_Frames], calibrations: Sequence[str], stands_still: StandsStill | None
+) -> tuple[list[str], str | None, bool]:
+    """Return the lines on the scope whose images are the first of `frames`, the line that names the second camera's
+    images, and whether the scope is stated to stand still. calibrations: files of lenses in the folder of the frames'
+    files, as YAML; stands_still: judges images, None: they are not looked at."""
+    first = frames[0]
+    right, stereo, problem = _second_camera(first, frames[1:], calibrations)
+    still, camera = False, "# camera: still   # or moving"
+    if stands_still is not None and (first.stream is not None or stereo):
+        with suppress(NeecoError):
+            video = VideoFile(first.file, stream=first.stream)
+            source = ImageFolder(first.file, LIMITS.image_rate) if first.line.startswith("images") else video
+            still = stands_still(source.open())
+            camera += "; in frames spread over the recording, the background does not keep its place"
+    if still:
+        camera = f"camera: {STILL}   # in frames spread over the recording, the background keeps its place"
+    lines = [camera]
+    if stereo:
+        lines.append(stereo if still else f"# {stereo}; for a scope that stands still")
+    elif right:
+        why = problem or "its second camera, begun together: measures the depth of the tissue"
+        lines.append(f"# stereo: {{{right}, calibration: stereo.yaml}}   # {why}")
+    lens, known = None, None if first.stream is None else format_of(first.file)
+    with suppress(NeecoError):
+        lens = known and known.lens(first.file, first.stream)
+    if lens:
+        lines.append(f"# intrinsics: left out, {first.name} states the lens")
+    elif not calibrations and not (stereo and still):
+        lines.append("# intrinsics: [290, 290, 160, 128]   # fl_x, fl_y, cx, cy px; no calibration was found")
+    lines += [f"{'# ' if index else ''}intrinsics: {name}" for index, name in enumerate(calibrations)]
+    return lines, right, still
+
+
+def _second_camera(
+    left: _Frames, others: Sequence[_Frames], calibrations: Sequence[str]
+) -> tuple[str | None, str, str]:
+    """Return the line of the right camera's images, the line `stereo: …` where a calibration states both cameras, else
+    the reason why it does not."""
+    namesake = _LEFT.sub(
+        lambda word: "RIGHT" if word[0].isupper() else "Right" if word[0][0].isupper() else "right",
+        left.stream or left.name,
+    )
+    tries: list[tuple[str, str, Callable[[], Any]]] = []  # line, source of the calibration, reader
+    known = None if left.stream is None else format_of(left.file)
+    if known is None or left.stream is None:
+        line = next((item.line for item in others if item.name == namesake), None)
+        folder = left.file.parents[left.name.count("/")]
+        tries = [(line, name, partial(read_stereo, folder / name)) for name in calibrations if line]
+    else:
+        streams = [item for item in known.streams(left.file) if item.kind == IMAGE_STREAMS and not item.problem]
+        names = [item.name for item in streams if item.count and item.name != left.stream]
+        lines = {name: left.line.replace(left.stream, name) for name in names}
+        line = lines.get(namesake)
+        for name in sorted(names, key=lambda name: name != namesake):
+            tries.append((lines[name], "", partial(known.stereo, left.file, left.stream, name)))
+    problem = ""
+    for images, calibration, read in tries:
+        try:
+            lenses = read()
+        except NeecoError as error:
+            if not calibration and images == line:
+                problem = " ".join(str(error).removeprefix(f"{left.file}: ").split())
+            continue
+        if lenses is not None:
+            keys = f"{images}, calibration: {calibration}" if calibration else images
+            apart = float(np.linalg.norm(lenses[2][:3, 3]))
+            states = f"{calibration or left.name} states both lenses, {apart:.2f} mm apart"
+            return images, f"stereo: {{{keys}}}   # {states}", ""
+    return line, "", problem
+
+
+def _instrument_lines(files: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
     """Yield the lines of all instruments. in_camera: do the poses of a base have to be related to a still camera?"""
-    poses = [(log, columns) for log, columns in found.poses if not _SCOPE.search(log.stem)]
-    if not poses and not found.joints:
+    poses = [(log, columns) for log, columns in files.poses if not _SCOPE.search(log.stem)]
+    if not poses and not files.joints:
         return
     names = _unique([log.stem for log, _ in poses]) or ["instrument"]
     # a joint's log belongs to the instrument of its body or that its name begins with, else to the first
     owners = {
         log: min(names, key=lambda name: (log.stem != name, not log.stem.startswith(name.split("_")[0])))
-        for log, *_ in found.joints
+        for log, *_ in files.joints
     }
     yield "instruments:"
     for index, name in enumerate(names):
@@ -317,13 +411,13 @@ def _instruments(found: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
                 yield "    # camera_from_base: unknown   # or its registration, or a transform: docs/still-scopes.md"
             yield "    poses:"
             yield from (f"      {line}" for line in _pose_lines(log, columns))
-        logs = [log for log in found.joints if owners[log[0]] == name]
+        logs = [log for log in files.joints if owners[log[0]] == name]
         if all(joint in DVRK_WRIST for *_, joint in logs):
             logs.sort(key=lambda log: DVRK_WRIST.index(str(log[3])))
         yield from ["    joints:"] if logs else []
         for joint, own in zip(_unique([_joint_name(*log) for log in logs]), logs, strict=True):
             yield f"      {_scalar(joint)}:"
-            yield from (f"        {line}" for line in _joint_lines(found, *own))
+            yield from (f"        {line}" for line in _joint_lines(files, *own))
 
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
@@ -340,48 +434,46 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     return lines + _unit_lines(columns, {"length": of_length})
 
 
-def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value: str, named: str | None) -> list[str]:
-    lines = log.lines()
+def _joint_lines(files: _FolderFiles, log: _Log, when: RecognisedColumns, value: str, named: str | None) -> list[str]:
+    lines, stem = log.lines(), log.stem.lower()
     if log.stream is None and named:  # a table of several joints is a robot's, as its poses are
         lines.append("clock: em   # that of the poses: correct it where another computer logged it")
-    elif log.stream is None and not found.syncs:
+    elif log.stream is None and not files.syncs:
         lines.append("# clock: em   # left out, it is its own, whose offset nothing states")
-    lines.append(f"columns: {{value: {_scalar(value)}}}")
-    stem = log.stem.lower()
-    tables = [name for name, header in found.calibrations if value in header]
-    tables += [name for name, _ in found.calibrations if Path(name).stem.lower().startswith(stem)]
-    lines += [f"calibration: {_scalar(tables[0])}"] if tables else []
+    tables = [name for name, header in files.calibrations if value in header]
+    tables += [name for name, _ in files.calibrations if Path(name).stem.lower().startswith(stem)]
+    lines += [f"columns: {{value: {_scalar(value)}}}", *(f"calibration: {_scalar(name)}" for name in tables[:1])]
     return lines + _unit_lines(when, {} if tables else {"angle": (value,)})
 
 
 def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | None]) -> list[str]:
     """A line asking for the units that neither the columns' names nor their format say."""
-    lines = []
-    if columns.counts_frames or columns.time is None:
+    lines, time = [], columns.time or ()
+    if columns.counts_frames or not time:
         why = "time counts frames" if columns.counts_frames else "nothing says when its rows were taken"
-        lines.append(f"rate_hz: 40   # {why}, and this rate is a guess: correct it")
-    elif columns.time and len(columns.time) == 1 and not (columns.time_unit or split_unit(columns.time[0], "time")[1]):
-        wanted = {"time": columns.time} | wanted
-    implied = {"length": columns.length_unit}
+        lines.append(f"rate_hz: {LIMITS.tracker_rate:g}   # {why}, and this rate is a guess: correct it")
+    elif len(time) == 1 and not columns.time_unit:
+        wanted = {"time": time} | wanted
+    units = {"time": "s", "length": "mm", "angle": "rad"}
     unsaid = [
-        kind for kind, names in wanted.items() if names and not implied.get(kind) and not split_unit(names[0], kind)[1]
+        f"{kind}: {units[kind]}"
+        for kind, names in wanted.items()
+        if names and not split_unit(names[0], kind)[1] and not (kind == "length" and columns.length_unit)
     ]
     if unsaid:
-        choices = {"time": "s", "length": "mm", "angle": "rad"}
-        values = ", ".join(f"{kind}: {choices[kind]}" for kind in unsaid)
-        lines.append(f"# units: {{{values}}}   # nothing says them: correct, and remove the #")
+        lines.append(f"# units: {{{', '.join(unsaid)}}}   # nothing says them: correct, and remove the #")
     return lines
 
 
 def _joint_name(log: _Log, when: RecognisedColumns, value: str, named: str | None) -> str:
     if named or log.stream is not None:
         return named or _joint_of(value)
-    stem = re.sub(r"[^A-Za-z0-9_]+", "_", log.stem)
+    stem = _NO_NAME.sub("_", log.stem)
     return stem if stem.endswith("angle") else f"{stem}_angle"
 
 
 def _joint_of(column: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_]+", "_", split_unit(column, "angle")[0]).strip("_")
+    return _NO_NAME.sub("_", split_unit(column, "angle")[0]).strip("_")
 
 
 def _unique(names: list[str]) -> list[str]:
