@@ -38,7 +38,7 @@ def test_the_estimated_iou_of_labels_is_near_the_true_one(label: slice, dark: bo
     views = [view(label, seed, dark=dark) for seed in range(3)]
     foreground = Foreground.learned(views)
     assert foreground is not None
-    quality = quality_of(sum((label_counts(shown, foreground) for shown in views), np.zeros(3)))
+    quality = quality_of(sum((label_counts(shown, foreground) for shown in views), np.zeros(4)))
     assert quality is not None
     missed = label.start >= SHAFT.start and label.stop <= SHAFT.stop
     assert quality.iou == pytest.approx(
@@ -51,7 +51,7 @@ def test_labels_that_leave_out_a_dark_shaft_are_doubtful_and_right_ones_are_not(
         views = [view(label, seed, dark=True) for seed in range(3)]
         foreground = Foreground.learned(views)
         assert foreground is not None
-        quality = quality_of(sum((label_counts(shown, foreground) for shown in views), np.zeros(3)))
+        quality = quality_of(sum((label_counts(shown, foreground) for shown in views), np.zeros(4)))
         assert quality is not None
         assert (quality.doubt is not None) == doubtful
 
@@ -59,3 +59,12 @@ def test_labels_that_leave_out_a_dark_shaft_are_doubtful_and_right_ones_are_not(
 def test_nothing_is_said_of_images_without_an_instrument() -> None:
     views = [view(slice(0, 0), seed) for seed in range(3)]
     assert Foreground.learned(views) is None
+
+
+def test_labels_of_pixels_that_tell_nothing_are_less_certain() -> None:
+    """Most of these are shadows and fringes: of a label that is as large, fewer pixels show an instrument."""
+    certain, partly = quality_of(np.array([1000, 0, 0, 0])), quality_of(np.array([1000, 0, 0, 500]))
+    assert certain is not None
+    assert partly is not None
+    assert (certain.iou, certain.recall, partly.recall) == (1, 1, 1)
+    assert 1000 / 1500 < partly.iou < 0.9

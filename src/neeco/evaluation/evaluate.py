@@ -116,7 +116,7 @@ class _Tally:
     parts: PartTally
     rows: list[dict[str, Any]] = field(default_factory=list)  # of every frame: its name, fit and scores
     scores: list[dict[str, float | None]] = field(default_factory=list)
-    counts: np.ndarray = field(default_factory=lambda: np.zeros(3))  # of `label_counts`, over all frames
+    counts: np.ndarray = field(default_factory=lambda: np.zeros(4))  # of `label_counts`, over all frames
 
 
 @dataclass(frozen=True)

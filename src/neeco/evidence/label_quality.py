@@ -22,6 +22,7 @@ class QualitySettings:
     reach: float = 0.2  # of the images' width: how far from a rendered instrument one may show that is not labelled
     labelled: float = 0.5  # rendered share of a pixel from which it is labelled
     certain: float = 0.25  # certainty from which a pixel counts
+    unknown: float = 0.4  # share of labelled pixels of which nothing is certain that show an instrument
     least_iou: float = 0.8  # estimated, below which labels are doubtful
     least_shown: int = 600  # px of an instrument in one image; of a smaller one, edges are too large a part
 
@@ -32,7 +33,7 @@ QUALITY = QualitySettings()
 @dataclass(frozen=True)
 class LabelQuality:
     """Estimated quality of labels over some images, all in [0, 1]: the share of what images show of the instrument
-    that is labelled, the share of the label that does not show tissue, and the IoU that follows."""
+    that is labelled, the share of the label that shows it, and the IoU that follows."""
 
     recall: float
     precision: float
@@ -71,16 +72,19 @@ def learned_foreground(scene: GaussianScene, frames: Sequence[Frame]) -> Foregro
 
 
 def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
-    """Count pixels of a view [3]: certain instrument that is labelled, that is not, and certain tissue that is."""
-    certainty, label = foreground.certainty(view, QUALITY.reach), view.label > QUALITY.labelled
+    """Count pixels of a view [4]: certain instrument that is labelled, that is not, certain tissue that is labelled,
+    and pixels that are labelled of which nothing is certain."""
+    certainty, label = foreground.certainty(view, QUALITY.reach), view.usable & (view.label > QUALITY.labelled)
     instrument, tissue = certainty > QUALITY.certain, certainty < -QUALITY.certain
-    return np.array([(instrument & label).sum(), (instrument & ~label).sum(), (tissue & label).sum()])
+    masks = instrument & label, instrument & ~label, tissue & label, label & ~instrument & ~tissue
+    return np.array([mask.sum() for mask in masks])
 
 
 def quality_of(counts: np.ndarray, least: int = SETTINGS.least_pixels) -> LabelQuality | None:
-    """Return the quality of labels with such counts [3], summed over their images; None where these show fewer than
+    """Return the quality of labels with such counts [4], summed over their images; None where these show fewer than
     `least` pixels of an instrument for certain."""
-    both, missed, wrong = counts.tolist()
+    both, missed, wrong, unknown = counts.tolist()
     if both + missed < least:
         return None
-    return LabelQuality(both / (both + missed), both / max(1, both + wrong))
+    right = both + QUALITY.unknown * unknown
+    return LabelQuality(both / (both + missed), right / max(1, both + wrong + unknown))

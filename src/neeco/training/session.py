@@ -372,7 +372,7 @@ class GaussianSession(GaussianTraining):
         foreground = Foreground.learned(views)
         if foreground is None:
             return
-        quality = quality_of(sum((label_counts(view, foreground) for view in views), np.zeros(3)))
+        quality = quality_of(sum((label_counts(view, foreground) for view in views), np.zeros(4)))
         if quality is not None:
             self.scene.diagnostics[LABEL_QUALITY] = quality.as_json()
 
