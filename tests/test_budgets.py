@@ -19,13 +19,13 @@ ROOMS = {
     "report": (1700, 1500),
     "studies": (3300, 2600),
     "ingest": (18_100, 10_500),
-    "tracking": (1350, 1200),
+    "tracking": (1440, 1200),
     "synthesis": (4400, 3200),
     "evaluation": (1550, 1200),
     "labels": (950, 800),
     "methods": (6200, 3500),
     "training": (2050, 1700),
-    "states": (3300, 2600),
+    "states": (3400, 2600),
     "evidence": (300, 1200),
     "scene": (2000, 1800),
     "capture": (5100, 3900),
@@ -33,7 +33,7 @@ ROOMS = {
     "geometry": (950, 1000),
     "base": (1600, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (345, 240), (3800, 3000), (1750, 300)
+FILES, FUNCTIONS, NUMBERS = (330, 240), (3750, 3000), (980, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

@@ -13,7 +13,7 @@ from scene_worlds import TISSUE, grasper_state, make_scene, pose_of
 
 from neeco.base.errors import NeecoError
 from neeco.geometry.camera import Camera
-from neeco.methods.breathing import N_HARMONICS, Breathing
+from neeco.methods.breathing import BREATHING, Breathing
 from neeco.scene import GaussianScene
 from neeco.scene.io import load_scene, save_scene
 
@@ -25,7 +25,7 @@ PERIOD, LATE = 4.0, 1.7e9  # s; clocks may count from 1970
 
 def breathing(points: torch.Tensor) -> Breathing:
     """One whose control points move differently."""
-    made = Breathing.of(points, PERIOD, torch.zeros(2 * N_HARMONICS, 3), LATE)
+    made = Breathing.of(points, PERIOD, torch.zeros(2 * BREATHING.n_harmonics, 3), LATE)
     with torch.no_grad():
         made.swings += torch.randn(made.swings.shape, generator=torch.Generator().manual_seed(1))
     return made

@@ -37,7 +37,7 @@ from neeco.states.crop_rendering import FrameView
 from neeco.states.fitter import Fitter, StateFit
 from neeco.states.parameters import StateParameters
 from neeco.states.refinement import Refinement, Verdict
-from neeco.states.search import JOINT, LARGE, LARGEST, FittedState, StateSearch
+from neeco.states.search import SEARCH, FittedState, StateSearch
 from neeco.training.config import method_defaults
 from neeco.training.session import GaussianSession, new_session
 
@@ -91,7 +91,7 @@ def measured(search: StateSearch, scale: float) -> list[FittedState]:
     information = torch.diag(layout.vector_from_degrees(0.3, 0.3, 1.0, 0.1) ** -2)
     for index, wrong in enumerate(with_errors(TRUE, scale)):
         noise = torch.from_numpy(rng.standard_normal(layout.size)) * torch.diagonal(information).rsqrt()
-        precision = search.precision(index, LARGEST)
+        precision = search.precision(index, SEARCH.largest)
         most_likely = layout.increments_between(wrong, TRUE[index]) + noise
         correction = torch.linalg.solve(information + precision, information @ most_likely)
         view = search.view(0, None)
@@ -105,7 +105,7 @@ def measured(search: StateSearch, scale: float) -> list[FittedState]:
 def test_errors_of_a_robot_are_told_from_those_of_a_tracker(tmp_path: Path) -> None:
     search = search_of(session_of(tmp_path, TRUE))
     scales = [search.scale_of(measured(search, scale)) for scale in (0.1, 1.0)]
-    assert scales[0] < LARGE < scales[1] < 1.5
+    assert scales[0] < SEARCH.large < scales[1] < 1.5
 
 
 def test_without_stated_links_only_tilt_tells_how_large_errors_are(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_a_joint_is_fitted_to_its_image(tmp_path: Path) -> None:
     assert found is not None
     error = found.fit.state.instruments["grasper"].joints["jaw_angle"] - given.joints["jaw_angle"]
     assert abs(error) < 1.5 * found.deviations[6]
-    assert found.deviations[6] < math.radians(3.5) < math.radians(JOINT)
+    assert found.deviations[6] < math.radians(3.5) < math.radians(SEARCH.joint)
 
 
 def test_a_fitted_state_is_no_surer_for_more_pixels_with_the_same_residuals(tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ def test_a_wrong_state_contradicts_the_others_and_is_found_from_one_of_theirs(tm
     states[3] = replace(TRUE[10], time=TRUE[3].time)
     session = session_of(tmp_path, states)
     search = search_of(session)
-    refit_outliers(search, LARGE, Misfits.of(search))
+    refit_outliers(search, SEARCH.large, Misfits.of(search))
     assert contradicting(session.refinement) == {3: Verdict.REFITTED}
     found = session.refinement.state(3, states[3])
     assert session.refinement.layout.increments_between(TRUE[3], found)[3:6].norm() < 0.7
@@ -163,7 +163,7 @@ def test_a_wrong_state_is_found_by_the_first_of_two_cameras_and_corrected_for_bo
     session, count = session_of(tmp_path, states, cameras=2), len(TRUE)
     assert session.refinement.frames_of_instant == [[k, count + k] for k in range(count)]
     search = search_of(session)
-    refit_outliers(search, LARGE, Misfits.of(search))
+    refit_outliers(search, SEARCH.large, Misfits.of(search))
     assert contradicting(session.refinement) == {3: Verdict.REFITTED}
     for index in (3, count + 3):
         found = session.refinement.state(index, states[3])
@@ -175,7 +175,7 @@ def test_an_instant_that_no_state_explains_is_left_out_with_all_its_images(tmp_p
     frame = session.full_views.frames[5]
     world.write_image(frame.image_path, torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(0)))
     search = search_of(session)
-    refit_outliers(search, LARGE, Misfits.of(search))
+    refit_outliers(search, SEARCH.large, Misfits.of(search))
     assert contradicting(session.refinement) == {5: Verdict.EXCLUDED}
     assert [k for k in range(2 * count) if not session.refinement.counts(k)] == [5, count + 5]
 
@@ -185,7 +185,7 @@ def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
     frame = session.full_views.frames[5]
     world.write_image(frame.image_path, torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(0)))
     search = search_of(session)
-    refit_outliers(search, LARGE, Misfits.of(search))
+    refit_outliers(search, SEARCH.large, Misfits.of(search))
     assert contradicting(session.refinement) == {5: Verdict.EXCLUDED}
 
 
@@ -403,7 +403,7 @@ def test_states_are_judged_again_where_errors_are_large(size: float, tmp_path: P
 def test_corrections_are_as_uncertain_as_errors_are_large(scale: float, cameras: int, tmp_path: Path) -> None:
     session = session_of(tmp_path, with_errors(TRUE, scale), cameras=cameras)
     search, before = search_of(session), session.refinement.deviations(0)
-    assert search.size_errors(()) == bool(scale) == (float(session.refinement.error_scale) > LARGE)
+    assert search.size_errors(()) == bool(scale) == (float(session.refinement.error_scale) > SEARCH.large)
     after = session.refinement.deviations(0)
     torch.testing.assert_close(after, search.deviations(0, 1.0) if scale else before, rtol=1e-5, atol=0)
 

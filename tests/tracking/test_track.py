@@ -25,7 +25,7 @@ from neeco.report.track_page import write_track_page
 from neeco.states.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer, color_matched, view_of
 from neeco.states.fitter import loose_prior
 from neeco.states.parameters import DEG
-from neeco.tracking.follow import SEARCH_ROLLS_EVERY, Follower, Step
+from neeco.tracking.follow import FOLLOW, Follower, Step
 from neeco.tracking.motion import MotionModel
 from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.track import StepFiles, Tracked, state_of, track_footage, write_tracked
@@ -95,7 +95,7 @@ def test_a_stretch_of_little_trust_is_gone_through_backwards_looking_for_other_r
         )
 
     steps = StepFiles(tmp_path, Follower(), lambda done, total: None).all_steps(grasper_state())
-    assert asked == [SEARCH_ROLLS_EVERY] * 3
+    assert asked == [FOLLOW.search_rolls_every] * 3
     assert [one.trust.value for one in steps] == [1.0, 1.0, 0.9, 0.9, 0.9, 1.0]
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neeco.capture.model import Frame, State
-from neeco.methods.breathing import N_HARMONICS, Breathing, find_breathing, find_period
+from neeco.methods.breathing import BREATHING, Breathing, find_breathing, find_period
 from neeco.methods.static import Static
 from neeco.methods.tissue_fit import fit_tissue
 from neeco.raster import Camera, rasterize
@@ -37,7 +37,7 @@ def test_the_period_is_found_at_irregular_times_in_any_order(start: float) -> No
     assert found is not None
     assert found.period == pytest.approx(PERIOD, rel=0.01)
     assert found.explained > 0.6
-    assert found.swing.shape == (2 * N_HARMONICS, 3)
+    assert found.swing.shape == (2 * BREATHING.n_harmonics, 3)
 
 
 @pytest.mark.parametrize("kind", ["noise", "drift", "short", "faint"])
@@ -102,7 +102,7 @@ def test_still_tissue_does_not_breathe() -> None:
 def test_an_interrupted_run_goes_on_breathing(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def begin(self: Static, training: object) -> None:
         tissue = 10 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
-        self.start_breathing(Breathing.of(tissue, 0.2, torch.full((2 * N_HARMONICS, 3), 0.5), 0.1))
+        self.start_breathing(Breathing.of(tissue, 0.2, torch.full((2 * BREATHING.n_harmonics, 3), 0.5), 0.1))
 
     def interrupt(row: ProgressRow) -> None:
         if row.iteration == 15 and not row.note:

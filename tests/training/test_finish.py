@@ -15,7 +15,7 @@ from neeco.methods.kinematic import wrist
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.kinematic.finish import conclude, extend_shaft, finalise_links, shaft_coverage
 from neeco.methods.kinematic.hinges import Hinges
-from neeco.methods.kinematic.wrist import color_boundary, measure_radius, place_wrists, refine_wrists
+from neeco.methods.kinematic.wrist import WristSettings, color_boundary, measure_radius, place_wrists, refine_wrists
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
@@ -165,7 +165,7 @@ def test_the_colours_border_is_found_to_a_fraction_of_the_radius(session: Gaussi
 def test_a_wrist_found_again_moves_unless_spinning_then_costs_more(
     session: GaussianSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(wrist, "SPIN_ANGLE", math.pi / 4)  # the rings have eight Gaussians each
+    monkeypatch.setattr(wrist, "WRIST", WristSettings(spin_angle=math.pi / 4))  # the rings have eight Gaussians each
     hinges = hinges_of(session)
     hinges.wrist_start.fill_(3.0)
     refine_wrists(session, session.scene.deformation)

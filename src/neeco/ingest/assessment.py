@@ -14,7 +14,7 @@ from neeco.capture.documents import Problem
 from neeco.capture.model import HOW_TO_REGISTER, UNKNOWN_DEG, Capture
 from neeco.geometry.lines import frame_about
 from neeco.ingest.registration.base import BaseRegistration
-from neeco.ingest.registration.hand_eye import PLACED_DEG, PLACED_MM, Registration
+from neeco.ingest.registration.hand_eye import HAND_EYE, Registration
 from neeco.ingest.result import IngestResult
 
 # Limits above which there is a warning: conventions, not measurements.
@@ -208,7 +208,7 @@ def _placed(registration: Registration, capture: Capture, found_in_images: Colle
         return []
     sds = registration.placement_sd(np.stack(places))
     found = []
-    for sd, unit, limit in zip(sds, (" mm", "°"), (PLACED_MM, PLACED_DEG), strict=True):
+    for sd, unit, limit in zip(sds, (" mm", "°"), (HAND_EYE.placed_mm, HAND_EYE.placed_deg), strict=True):
         known = f"the place of instruments in the images is known to ±{sd:.1f}{unit}"
         warning = f"{known[0].upper()}{known[1:]} only (hand-eye calibration): record more turns of the scope."
         found.append(_Evidence(f"{known} (usual: {limit:g} or less)", 0 if sd <= limit else 1, warning))
@@ -228,7 +228,7 @@ def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Eviden
         says = f"the outline of {name} and what moves overlap by {overlap:.2f}"
         warning = f"{says[0].upper()}{says[1:]} only: is its clock right?"
         found.append(_Evidence(f"{says} (usual: {MIN_OVERLAP:g} or more)", level, warning))
-    limit_mm, limit_deg = (PLACED_MM, PLACED_DEG) if base.tracked else (BASE_MM, BASE_DEG)
+    limit_mm, limit_deg = (HAND_EYE.placed_mm, HAND_EYE.placed_deg) if base.tracked else (BASE_MM, BASE_DEG)
     what = f"the {'place' if base.tracked else 'base'} of {name}"
     known = [(what, "mm", limit_mm, base.sd_mm), (what, "deg", limit_deg, base.sd_deg)]
     if base.shaft is not None and linked:

@@ -21,8 +21,27 @@ from neeco.scene.deformation import floored_decay
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 
-N_HARMONICS = 2  # breath is no pure sine: the pause after breathing out is longer
-N_CONTROL_POINTS = 24
+
+@dataclass(frozen=True, kw_only=True)
+class BreathingSettings:
+    """Settings of the search for breathing."""
+
+    n_harmonics: int = 2  # breath is no pure sine: the pause after breathing out is longer
+    n_control_points: int = 24
+    max_frames: int = 240  # in which displacements are measured
+    n_pixels: int = 96 * 77  # of the images in which they are measured: the motion is a pixel or two there
+    robust_scale: float = 0.04  # of white: larger residuals have little weight (instruments, highlights)
+    n_reweightings: int = 4
+    periods_s: tuple[float, float] = (1.5, 10.0)  # of breath
+    min_breaths: float = 2.0  # in the recording, so that the second confirms the first
+    oversampling: int = 8  # periods tried per independent frequency
+    n_folds: int = 4  # intervals of time, each of which is predicted from the others
+    min_explained: float = 0.5  # share of the displacement's variance in stretches that were left out
+    min_amplitude: float = 0.2  # mm, rms over time: less does not blur
+
+
+BREATHING = BreathingSettings()
+
 RATES = {"period": 5e-4, "swings": 2e-2}  # s and mm, Adam's at the start
 
 
@@ -40,22 +59,22 @@ class Breathing(nn.Module):
     reach: Tensor  # [] mm, standard deviation of the basis functions
     origin: Tensor  # [] s, float64: when t is 0
 
-    def __init__(self, count: int = N_CONTROL_POINTS) -> None:
+    def __init__(self, count: int = BREATHING.n_control_points) -> None:
         super().__init__()
         self.register_buffer("points", torch.zeros(count, 3))
         self.register_buffer("reach", torch.ones(()))
         self.register_buffer("origin", torch.zeros((), dtype=torch.float64))
         self.period = nn.Parameter(torch.ones(()))  # T, s
-        self.swings = nn.Parameter(torch.zeros(2 * N_HARMONICS, count, 3))  # a_1, b_1, a_2, … in mm
+        self.swings = nn.Parameter(torch.zeros(2 * BREATHING.n_harmonics, count, 3))  # a_1, b_1, a_2, … in mm
 
     @classmethod
     def of(cls, tissue: Tensor, period: float, swing: Tensor, origin: float) -> Breathing:
-        """Return a breathing that moves all of the tissue, points [P, 3] mm, by `swing` [2 N_HARMONICS, 3] mm (a_1,
+        """Return a breathing that moves all of the tissue, points [P, 3] mm, by `swing` [2 `n_harmonics`, 3] mm (a_1,
         b_1, …)."""
         from scipy.cluster.vq import kmeans2  # slow to import
 
         places, _ = kmeans2(
-            tissue.detach().cpu().double().numpy(), min(N_CONTROL_POINTS, len(tissue)), minit="++", seed=0
+            tissue.detach().cpu().double().numpy(), min(BREATHING.n_control_points, len(tissue)), minit="++", seed=0
         )
         made = cls(len(places))
         apart = np.linalg.norm(places[:, None] - places, axis=-1) + np.diag(np.full(len(places), np.inf))
@@ -90,8 +109,8 @@ class Breathing(nn.Module):
 
 
 def _waves(breaths: Tensor) -> Tensor:
-    """Return cosine and sine [2 N_HARMONICS] of every harmonic after so many breaths []."""
-    angles = 2 * math.pi * breaths * torch.arange(1, N_HARMONICS + 1, device=breaths.device)
+    """Return cosine and sine [2 `n_harmonics`] of every harmonic after so many breaths []."""
+    angles = 2 * math.pi * breaths * torch.arange(1, BREATHING.n_harmonics + 1, device=breaths.device)
     return torch.stack([angles.cos(), angles.sin()], 1).flatten()
 
 
@@ -131,23 +150,12 @@ class BreathingTissue(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *others)
 
 
-MAX_FRAMES = 240  # in which displacements are measured
-N_PIXELS = 96 * 77  # of the images in which they are measured: the motion is a pixel or two there
-ROBUST_SCALE = 0.04  # of white: larger residuals have little weight (instruments, highlights)
-N_REWEIGHTINGS = 4
-PERIODS_S = (1.5, 10.0)  # of breath
-MIN_BREATHS = 2.0  # in the recording, so that the second confirms the first
-OVERSAMPLING = 8  # periods tried per independent frequency
-N_FOLDS = 4  # intervals of time, each of which is predicted from the others
-MIN_EXPLAINED = 0.5  # share of the displacement's variance in stretches that were left out
-MIN_AMPLITUDE = 0.2  # mm, rms over time: less does not blur
-
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Found:
-    """A period, s, the Fourier series [2 N_HARMONICS, 3] mm of the displacement from its time `origin` on (see
+    """A period, s, the Fourier series [2 `n_harmonics`, 3] mm of the displacement from its time `origin` on (see
     `Breathing`), and the share of the displacement's variance that it predicts in times that it was not fitted to."""
 
     period: float
@@ -160,20 +168,20 @@ def find_period(times: Array, shifts: Array) -> Found | None:
     """Return the period of displacements `shifts` [F, 3] mm at `times` [F] s, in any order and at any intervals; None
     where none predicts clearly."""
     duration = float(np.ptp(times)) if len(times) else 0.0
-    longest = min(PERIODS_S[1], duration / MIN_BREATHS)
-    if len(times) < 8 * N_FOLDS or longest <= PERIODS_S[0]:
+    longest = min(BREATHING.periods_s[1], duration / BREATHING.min_breaths)
+    if len(times) < 8 * BREATHING.n_folds or longest <= BREATHING.periods_s[0]:
         return None
     origin = float(times.min() + times.max()) / 2
     times, shifts = times - origin, shifts - shifts.mean(0)
-    frequencies = np.arange(1 / longest, 1 / PERIODS_S[0], 1 / (OVERSAMPLING * duration))
+    frequencies = np.arange(1 / longest, 1 / BREATHING.periods_s[0], 1 / (BREATHING.oversampling * duration))
     best = max(frequencies, key=lambda frequency: _explained(times, shifts, frequency, 1))
-    near = best + np.linspace(-1, 1, 2 * OVERSAMPLING + 1) / (OVERSAMPLING * duration)
-    best = max(near, key=lambda frequency: _explained(times, shifts, frequency, N_HARMONICS))
-    explained = _explained(times, shifts, best, N_HARMONICS)
-    design = _design(times, best, N_HARMONICS)
+    near = best + np.linspace(-1, 1, 2 * BREATHING.oversampling + 1) / (BREATHING.oversampling * duration)
+    best = max(near, key=lambda frequency: _explained(times, shifts, frequency, BREATHING.n_harmonics))
+    explained = _explained(times, shifts, best, BREATHING.n_harmonics)
+    design = _design(times, best, BREATHING.n_harmonics)
     swing: Array = np.linalg.lstsq(design, shifts, rcond=None)[0][1:].astype(np.float64)
     amplitude = float(np.sqrt((design[:, 1:] @ swing).var(0).sum()))
-    if explained < MIN_EXPLAINED or amplitude < MIN_AMPLITUDE:
+    if explained < BREATHING.min_explained or amplitude < BREATHING.min_amplitude:
         return None
     return Found(float(1 / best), swing, origin, explained)
 
@@ -189,9 +197,9 @@ def _design(times: Array, frequency: float, harmonics: int) -> Array:
 def _explained(times: Array, shifts: Array, frequency: float, harmonics: int) -> float:
     """Return the share of the variance of each interval that a fit to the others predicts."""
     design = _design(times, frequency, harmonics)
-    fold = np.minimum(N_FOLDS * (times - times.min()) / np.ptp(times), N_FOLDS - 1).astype(int)
+    fold = np.minimum(BREATHING.n_folds * (times - times.min()) / np.ptp(times), BREATHING.n_folds - 1).astype(int)
     error = 0.0
-    for left_out in range(N_FOLDS):
+    for left_out in range(BREATHING.n_folds):
         held = fold == left_out
         fitted = np.linalg.lstsq(design[~held], shifts[~held], rcond=1e-6)[0]
         error += float(((shifts[held] - design[held] @ fitted) ** 2).sum())
@@ -202,9 +210,9 @@ def _explained(times: Array, shifts: Array, frequency: float, harmonics: int) ->
 def find_breathing(tissue: GaussianScene, views: TrainingViews) -> tuple[Breathing, Found] | None:
     """Estimate the breathing from one displacement of all tissue per frame; None without a period. `tissue`: a scene of
     static tissue alone, learned from these views."""
-    picked = range(0, len(views), max(1, -(-len(views) // MAX_FRAMES)))
+    picked = range(0, len(views), max(1, -(-len(views) // BREATHING.max_frames)))
     times = np.array([views.frames[index].state.time for index in picked], np.float64)
-    if np.ptp(times) < MIN_BREATHS * PERIODS_S[0]:
+    if np.ptp(times) < BREATHING.min_breaths * BREATHING.periods_s[0]:
         return None
     shifts = torch.stack([tissue_shift(tissue, views, index) for index in picked])
     found = find_period(times, shifts.double().cpu().numpy())
@@ -218,7 +226,7 @@ def tissue_shift(tissue: GaussianScene, views: TrainingViews, index: int) -> Ten
     """Return the displacement [3] mm, world frame, of all tissue that best explains frame `index` to first order,
     together with a gain per colour; pixels that neither explains have little weight."""
     frame, target, mask = views.frames[index], views.target(index), views.mask(index)
-    camera = frame.camera.within(N_PIXELS)
+    camera = frame.camera.within(BREATHING.n_pixels)
     width, height = camera.width, camera.height
     rendering = rasterize(tissue.at(frame.state), camera)
     target, color = area_averaged(target, width, height), rendering.color
@@ -236,9 +244,9 @@ def tissue_shift(tissue: GaussianScene, views: TrainingViews, index: int) -> Ten
     fitted = design.new_zeros(6)
     if not len(design):
         return fitted[:3]
-    for _ in range(N_REWEIGHTINGS):
+    for _ in range(BREATHING.n_reweightings):
         left = (residual - design @ fitted).square().mean(-1, keepdim=True)
-        weight = (1 + left / ROBUST_SCALE**2) ** -2  # Geman and McClure
+        weight = (1 + left / BREATHING.robust_scale**2) ** -2  # Geman and McClure
         weighted = (design * weight[..., None]).reshape(-1, 6)
         flat = design.reshape(-1, 6)
         normal = weighted.T @ flat

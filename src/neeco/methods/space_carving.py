@@ -27,12 +27,21 @@ from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.session import GaussianSession
 
-SOLID_LEVELS = (0.85, 0.75, 0.65)  # mean evidence of a solid point: the strictest level that enough points reach
-MIN_SOLID_POINTS = 8  # with fewer, nothing is carved
-MIN_COARSE_POINTS = 24  # solid points on the coarse grid; with fewer, the finer one is tried
-SEED_SPREAD = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
-DARKEST_SHADOW = 0.66  # of the tissue's sRGB values: 40 % of its light
-MIN_LEVEL = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
+
+@dataclass(frozen=True, kw_only=True)
+class CarvingLimits:
+    """Thresholds of carving."""
+
+    # mean evidence of a solid point: the strictest level that enough points reach
+    solid_levels: tuple[float, float, float] = (0.85, 0.75, 0.65)
+    min_solid_points: int = 8  # with fewer, nothing is carved
+    min_coarse_points: int = 24  # solid points on the coarse grid; with fewer, the finer one is tried
+    seed_spread: float = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
+    darkest_shadow: float = 0.66  # of the tissue's sRGB values: 40 % of its light
+    min_level: float = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
+
+
+CARVING = CarvingLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +136,7 @@ def gather_evidence(
         explanations = [(hits, tissue)]
         if unshaded:
             dimmed = (image * tissue).sum(-1, keepdim=True) / tissue.square().sum(-1, keepdim=True).clamp_min(1e-6)
-            explanations.append((without_shadows, tissue * dimmed.clamp(DARKEST_SHADOW, 1.0)))
+            explanations.append((without_shadows, tissue * dimmed.clamp(CARVING.darkest_shadow, 1.0)))
         for found, expected in explanations:
             residual = (expected - image).abs().mean(-1)
             if mask is not None:
@@ -204,7 +213,7 @@ class PosedViews:
     def scores(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return `score_points` with 0 where the evidence is nearly as strong under exchanged poses."""
         score, visible = score_points(self.evidence, self.own, points)
-        likely = torch.nonzero(score > 0.5 * MIN_LEVEL)[:, 0]  # the others are far below all thresholds
+        likely = torch.nonzero(score > 0.5 * CARVING.min_level)[:, 0]  # the others are far below all thresholds
         static = score[likely] <= self.motion_ratio * self.exchanged_scores(points[likely])
         score[likely[static]] = 0
         return score, visible
@@ -271,7 +280,7 @@ def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, sha
 def shape_around_frame(shape: CarvedShape, distance: float, count: int, generator: torch.Generator) -> CarvedShape:
     """Return the initial shape where carving is not reliable: `count` seeds around the tracked frame, which is on the
     body."""
-    spread = SEED_SPREAD * distance
+    spread = CARVING.seed_spread * distance
     seeds = (torch.randn(count, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
     frame = torch.eye(4, device=seeds.device)
     return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
@@ -284,9 +293,9 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
     views = posed_views(evidence, name, settings)
     for side in (settings.grid, settings.fine_grid):
         points, scores, level = _solid_points(views, reach, side)
-        if int((scores > level).sum()) >= MIN_COARSE_POINTS:
+        if int((scores > level).sum()) >= CARVING.min_coarse_points:
             break
-    if int((scores > level).sum()) < MIN_SOLID_POINTS:
+    if int((scores > level).sum()) < CARVING.min_solid_points:
         return None
     rows = torch.tensor(evenly_spaced(len(evidence.frames), SHAFT.n_frames), device=evidence.device)
     coarse, fine = (
@@ -343,12 +352,16 @@ def _shape(base: Tensor, line: Tensor, radius: float, points: Tensor, level: flo
 
 def _solid_points(views: PosedViews, reach: float, side: int) -> tuple[Tensor, Tensor, float]:
     """Return the points [Q, 3] with most evidence of a grid of `side`^3 within `reach` mm of the
-    frame's origin, their mean evidence [Q], and the strictest of SOLID_LEVELS that MIN_SOLID_POINTS of them reach."""
+    frame's origin, their mean evidence [Q], and the strictest of `solid_levels` that
+    `min_solid_points` of them reach."""
     ticks = torch.linspace(-reach, reach, side, device=views.evidence.device)
     grid = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     score, visible = views.scores(grid)
     score[visible <= 0.25] = 0
-    level = next((level for level in SOLID_LEVELS if int((score > level).sum()) >= MIN_SOLID_POINTS), SOLID_LEVELS[-1])
+    level = next(
+        (level for level in CARVING.solid_levels if int((score > level).sum()) >= CARVING.min_solid_points),
+        CARVING.solid_levels[-1],
+    )
     likely = score.topk(min(SHAFT.n_points, len(score)))
     chosen = likely.indices[likely.values > SHAFT.least_evidence]
     return grid[chosen], score[chosen], level
@@ -392,7 +405,7 @@ def _slice_centers(views: PosedViews, spacing: float, half: float, level: float)
         plane = torch.stack([x.flatten(), y.flatten(), z.expand(x.numel())], -1)
         score, visible = views.scores(plane)
         score = torch.where(visible > 0.15, score, 0.0)
-        if score.max() < MIN_LEVEL:
+        if score.max() < CARVING.min_level:
             continue
         weight = (score - level).clamp_min(0)
         weight = weight if weight.sum() > 0 else (score - 0.95 * score.max()).clamp_min(0)
@@ -412,7 +425,7 @@ def _sample_seeds(
     along = near - 0.1 * length + random[:, 2] * 1.2 * length
     points = torch.stack([(2 * random[:, 0] - 1) * width, (2 * random[:, 1] - 1) * width, along], -1)
     score, visible = views.scores(points)
-    chosen = points[(score > MIN_LEVEL) & (visible > 0.05)]
+    chosen = points[(score > CARVING.min_level) & (visible > 0.05)]
     if len(chosen) < count:  # thin instruments: fill up with jittered copies
         source = chosen if len(chosen) else points
         extra = torch.randint(len(source), (count - len(chosen),), generator=generator, device=device)

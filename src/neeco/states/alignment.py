@@ -21,7 +21,7 @@ from neeco.geometry.camera import Camera
 from neeco.raster import depth_maps, rasterize
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
-from neeco.states.crop_rendering import MAX_PIXELS
+from neeco.states.crop_rendering import CROPS
 from neeco.states.minimise import ImageResidual, minimise
 from neeco.states.parameters import InstrumentParameters, StateParameters, moved_camera, precision_of
 
@@ -40,7 +40,7 @@ class AlignConfig:
     sigma_camera_mm: float = 1.5
     sigma_camera_deg: float = 0.3
     levels: tuple[float, ...] = (0.25, 0.5, 1.0)  # sizes of the images compared, coarse to fine
-    max_pixels: int = MAX_PIXELS  # of the largest of them, to which larger images are reduced
+    max_pixels: int = CROPS.max_pixels  # of the largest of them, to which larger images are reduced
     steps: tuple[int, ...] = (3, 2, 2)  # Levenberg-Marquardt iterations at each
     huber: float = 0.05  # colour residual beyond which the cost is linear: highlights and unobserved tissue
     correlation_px: float = 100.0  # pixels that count as one observation, since residuals of neighbours correlate

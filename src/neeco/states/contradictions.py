@@ -20,24 +20,35 @@ from neeco.capture.model import InstrumentState, State, evenly_spaced
 from neeco.states.fitter import StateFit
 from neeco.states.outline_model import half_turned, mirrored
 from neeco.states.refinement import Refinement, Verdict
-from neeco.states.search import LEVELS, STEPS, StateSearch
+from neeco.states.search import SEARCH, StateSearch
 
-OUTLYING = 3.0  # robust standard deviations of a log misfit above which a state is an outlier
-REJECTED = 6.0  # above which a frame that no state explains is left out
-BETTER = 0.7  # of a state's misfit: that of another one which refutes it
-UNCLEAR = 1.05  # ratio of another fit's gain to that of the fit about the recorded state, up to which the latter holds
-MIN_DISTANCE = 3.0  # standard deviations of the prior, root mean square, of a state that is another one
-EXPLAINED = 1.0  # misfit up to which a state explains its image
-MIN_SPREAD = 0.25  # standard deviation of log misfits, at least
-N_OTHERS = 60  # frames whose states are tried
-N_TRIED = 3  # of them that are fitted
-MIN_FRAMES = 8  # with fewer, no state contradicts the others
-START_SCALE = 3.0  # of the prior about another start, times usual errors
-SUSPECT = 1.0  # robust standard deviations of a log misfit above which a state may be wrong
-ALIKE = 1.15  # times a state's misfit, below which the mirrored state may be right instead
-N_OWN, N_NEAR = 12, 64  # starts sampled from the prior about a recorded state, and about another
-MAX_SHARE, MAX_SUSPECTS = 1 / 3, 24  # of all frames
-MAX_NAMED = 8  # frames in a line
+
+@dataclass(frozen=True, kw_only=True)
+class ContradictionSettings:
+    """Settings of the search for wrong states."""
+
+    outlying: float = 3.0  # robust standard deviations of a log misfit above which a state is an outlier
+    rejected: float = 6.0  # above which a frame that no state explains is left out
+    better: float = 0.7  # of a state's misfit: that of another one which refutes it
+    # ratio of another fit's gain to that of the fit about the recorded state, up to which the latter holds
+    unclear: float = 1.05
+    min_distance: float = 3.0  # standard deviations of the prior, root mean square, of a state that is another one
+    explained: float = 1.0  # misfit up to which a state explains its image
+    min_spread: float = 0.25  # standard deviation of log misfits, at least
+    n_others: int = 60  # frames whose states are tried
+    n_tried: int = 3  # of them that are fitted
+    min_frames: int = 8  # with fewer, no state contradicts the others
+    start_scale: float = 3.0  # of the prior about another start, times usual errors
+    suspect: float = 1.0  # robust standard deviations of a log misfit above which a state may be wrong
+    alike: float = 1.15  # times a state's misfit, below which the mirrored state may be right instead
+    n_own: int = 12  # starts sampled from the prior about a recorded state, and about another
+    n_near: int = 64
+    max_share: float = 1 / 3  # of all frames
+    max_suspects: int = 24
+    max_named: int = 8  # frames in a line
+
+
+JUDGE = ContradictionSettings()
 
 
 @dataclass(frozen=True)
@@ -57,9 +68,9 @@ class Misfits:
         firsts = [frames[0] for frames in search.refinement.frames_of_instant]
         misfits = {index: search.misfit(index, search.state(index)) for index in firsts}
         shown = torch.tensor([misfit for misfit in misfits.values() if math.isfinite(misfit)])
-        if len(shown) < MIN_FRAMES:
+        if len(shown) < JUDGE.min_frames:
             return cls(misfits, math.inf, math.inf, math.inf)
-        limits = (max(_limit(shown, many), EXPLAINED) for many in (OUTLYING, REJECTED, SUSPECT))
+        limits = (max(_limit(shown, many), JUDGE.explained) for many in (JUDGE.outlying, JUDGE.rejected, JUDGE.suspect))
         found = cls(misfits, *limits)
         if len(found.outliers) > len(shown) // 2:
             return replace(found, limit=math.inf, rejection_limit=math.inf)
@@ -74,7 +85,7 @@ class Misfits:
 def _limit(misfits: Tensor, many: float) -> float:
     """Return the misfit that lies `many` robust standard deviations of the log misfits [F] above their median."""
     logs = misfits.clamp(1e-3, 1e3).log()
-    spread = max(1.4826 * float((logs - logs.median()).abs().median()), MIN_SPREAD)
+    spread = max(1.4826 * float((logs - logs.median()).abs().median()), JUDGE.min_spread)
     return math.exp(float(logs.median()) + many * spread)
 
 
@@ -89,12 +100,14 @@ class Refitted:
     def of(cls, search: StateSearch, index: int, fits: Sequence[StateFit]) -> Refitted:
         """Return the best of `fits`, and, with stated links, of fits about the best one turned by half a turn about its
         shaft, which has a similar outline."""
-        precision, best = search.precision(index, START_SCALE), _best(fits)
+        precision, best = search.precision(index, JUDGE.start_scale), _best(fits)
         if search.linked:
             fits = [*fits, *_fits_near(search, index, half_turned_state(search, best.state))]
             best = _best(fits)
         apart = search.refinement.layout.increments_between
-        possible = torch.stack([apart(best.state, fit.state) for fit in fits if BETTER * fit.misfit <= best.misfit])
+        possible = torch.stack(
+            [apart(best.state, fit.state) for fit in fits if JUDGE.better * fit.misfit <= best.misfit]
+        )
         return cls(best, (best.deviations(precision).square() + possible.square().mean(0)).sqrt())
 
 
@@ -147,7 +160,7 @@ def leave_out_unexplained(search: StateSearch, misfits: Mapping[int, float]) -> 
     """
     refinement = search.refinement
     right = [misfit for index, misfit in misfits.items() if refinement.verdict(index) is Verdict.ACCEPTED]
-    limit = _limit(torch.tensor(right), OUTLYING) if len(right) >= MIN_FRAMES else math.inf
+    limit = _limit(torch.tensor(right), JUDGE.outlying) if len(right) >= JUDGE.min_frames else math.inf
     for index, misfit in misfits.items():
         if refinement.verdict(index) is Verdict.REFITTED and misfit > limit:
             refinement.judge(index, Verdict.EXCLUDED)
@@ -172,14 +185,14 @@ def _judge(
     best = _best(others) if others else None
     verdict = Verdict.ACCEPTED
     # an instrument that is hardly in the image has a low misfit, too
-    if best is not None and best.misfit < BETTER * misfit and best.gain > gain:
-        if _distance(search, index, given, best.state, scale) > MIN_DISTANCE:
+    if best is not None and best.misfit < JUDGE.better * misfit and best.gain > gain:
+        if _distance(search, index, given, best.state, scale) > JUDGE.min_distance:
             verdict = Verdict.REFITTED if best.misfit < misfits.limit else Verdict.EXCLUDED
             refitted = Refitted.of(search, index, others)
             refinement.set_state(index, given, refitted.fit.state, refitted.deviations)
     elif misfits.rejection_limit < misfit < math.inf:
         verdict = Verdict.EXCLUDED
-    explained = not misfits.limit < misfit < math.inf and (best is None or best.gain <= UNCLEAR * gain)
+    explained = not misfits.limit < misfit < math.inf and (best is None or best.gain <= JUDGE.unclear * gain)
     if verdict is not Verdict.ACCEPTED:
         refinement.judge(index, verdict)
     elif explained and refinement.verdict(index) is not Verdict.ACCEPTED:
@@ -192,7 +205,7 @@ def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:
     """Return the best fit of a frame with the prior about its recorded state, from several starts: a single fit may end
     in a local minimum. None where all leave the image."""
     given, precision = search.scene.recorded.states[index], search.precision(index, scale)
-    starts = [given, search.state(index), *_sampled(search, index, given, precision, N_OWN)]
+    starts = [given, search.state(index), *_sampled(search, index, given, precision, JUDGE.n_own)]
     return max(_fits(search, index, starts, precision, given), key=lambda fit: fit.gain, default=None)
 
 
@@ -215,16 +228,16 @@ def _suspects(search: StateSearch, misfits: Misfits) -> list[int]:
             continue
         state, alike = search.state(index), 0.0
         other = mirrored_state(search, index, state)
-        if _distance(search, index, state, other, 1.0) > MIN_DISTANCE:
-            alike = ALIKE * misfit / max(search.misfit(index, other), 1e-9)
+        if _distance(search, index, state, other, 1.0) > JUDGE.min_distance:
+            alike = JUDGE.alike * misfit / max(search.misfit(index, other), 1e-9)
         scores[index] = max(misfit / misfits.suspect_limit, alike)
-    most = min(int(MAX_SHARE * len(misfits.of_frame)), MAX_SUSPECTS)
+    most = min(int(JUDGE.max_share * len(misfits.of_frame)), JUDGE.max_suspects)
     return [index for index in sorted(scores, key=lambda index: -scores[index])[:most] if scores[index] > 1]
 
 
 def _states_of(search: StateSearch, frames: Sequence[int]) -> list[State]:
-    """Return the states of at most N_OTHERS frames."""
-    return [search.state(frames[place]) for place in evenly_spaced(len(frames), N_OTHERS)]
+    """Return the states of at most `n_others` frames."""
+    return [search.state(frames[place]) for place in evenly_spaced(len(frames), JUDGE.n_others)]
 
 
 def _distance(search: StateSearch, index: int, given: State, state: State, scale: float) -> float:
@@ -268,10 +281,11 @@ def describe_contradictions(refinement: Refinement, names: Sequence[str]) -> str
     if not contradicting:
         return ""
     excluded = sum(not refinement.counts(index) for index in firsts)
-    more = f" and {len(contradicting) - MAX_NAMED} more" if len(contradicting) > MAX_NAMED else ""
+    named = ", ".join(contradicting[: JUDGE.max_named])
+    more = f" and {len(contradicting) - JUDGE.max_named} more" if len(contradicting) > JUDGE.max_named else ""
     return (
-        f"{len(contradicting)} of {len(firsts)} states contradict the others: {', '.join(contradicting[:MAX_NAMED])}"
-        f"{more}; {len(contradicting) - excluded} were fitted to their images from other states, {excluded} left out"
+        f"{len(contradicting)} of {len(firsts)} states contradict the others: {named}{more}; "
+        f"{len(contradicting) - excluded} were fitted to their images from other states, {excluded} left out"
     )
 
 
@@ -289,15 +303,17 @@ def _other_starts(search: StateSearch, index: int, others: Sequence[State]) -> l
 def _fits_from(search: StateSearch, index: int, starts: Sequence[State]) -> list[StateFit]:
     """Return fits of a frame from the most promising starts, and from states about the best of these; none where all
     leave the image."""
-    fits = _fits(search, index, starts, search.precision(index, START_SCALE))
+    fits = _fits(search, index, starts, search.precision(index, JUDGE.start_scale))
     return [*fits, *_fits_near(search, index, _best(fits).state)] if fits else []
 
 
 def _fits_near(search: StateSearch, index: int, state: State) -> list[StateFit]:
     """Return fits of a frame from states about `state`, and about its mirrored one."""
-    precision = search.precision(index, START_SCALE)
+    precision = search.precision(index, JUDGE.start_scale)
     about = [state, *([mirrored_state(search, index, state)] if search.linked else [])]
-    near = [start for center in about for start in _sampled(search, index, center, precision, N_NEAR // len(about))]
+    near = [
+        start for center in about for start in _sampled(search, index, center, precision, JUDGE.n_near // len(about))
+    ]
     return _fits(search, index, near, precision)
 
 
@@ -308,11 +324,11 @@ def _best(fits: Sequence[StateFit]) -> StateFit:
 def _fits(
     search: StateSearch, index: int, starts: Sequence[State], precision: Tensor, about: State | None = None
 ) -> list[StateFit]:
-    """Return fits of a frame from the N_TRIED most promising starts, with a prior of such precision [P, P] about each
+    """Return fits of a frame from the `n_tried` most promising starts, with a prior of such precision [P, P] about each
     (or `about` one state)."""
     view = search.view(index, None)
     fits = (
-        search.fitter.fit(view, about or start, precision, start, levels=LEVELS, steps=STEPS)
-        for start in search.fitter.ranked(view, starts, LEVELS[0])[:N_TRIED]
+        search.fitter.fit(view, about or start, precision, start, levels=SEARCH.levels, steps=SEARCH.steps)
+        for start in search.fitter.ranked(view, starts, SEARCH.levels[0])[: JUDGE.n_tried]
     )
     return [fit for fit in fits if fit is not None]

@@ -20,17 +20,25 @@ from neeco.raster.shadow import GAMMA, shadowed
 from neeco.raster.types import Gaussians
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 
-BLOCK_PX = 8  # images are trimmed and crops rounded to multiples of it, so that they can be halved three times exactly
-MAX_PIXELS = 160_000  # of images worked on, to which larger ones are reduced
-MIN_OPACITY = 0.2  # of Gaussians that say where the instrument is
-MARGIN_QUANTILE = 0.002  # share of them at each side that a crop need not hold
 
-N_POSED = 8  # states whose posed Gaussians are kept
+@dataclass(frozen=True, kw_only=True)
+class CropSettings:
+    """Settings of views and their colours."""
 
-N_TRIMMINGS = 5  # of pixels that a linear map of colours does not explain: instruments and foreground
-SAME_COLOR = 0.02  # mean difference of colours in [0, 1] below which they are left as they are
-MAX_UNEXPLAINED = 0.5  # of the colours' standard deviation
-GAIN_RANGE = (0.2, 3.0)
+    # images are trimmed and crops rounded to multiples of it, so that they can be halved three times exactly
+    block_px: int = 8
+    max_pixels: int = 160_000  # of images worked on, to which larger ones are reduced
+    min_opacity: float = 0.2  # of Gaussians that say where the instrument is
+    margin_quantile: float = 0.002  # share of them at each side that a crop need not hold
+    n_posed: int = 8  # states whose posed Gaussians are kept
+    n_trimmings: int = 5  # of pixels that a linear map of colours does not explain: instruments and foreground
+    same_color: float = 0.02  # mean difference of colours in [0, 1] below which they are left as they are
+    max_unexplained: float = 0.5  # of the colours' standard deviation
+    gain_range: tuple[float, float] = (0.2, 3.0)
+
+
+CROPS = CropSettings()
+
 
 Box = tuple[int, int, int, int]  # px: left, top, right, bottom
 
@@ -57,12 +65,14 @@ class FrameView:
 
 
 def working_size(camera: Camera, recorded: Recorded) -> Camera:
-    """Return the camera of the size worked on: no larger than MAX_PIXELS nor than the training images, trimmed to
-    multiples of BLOCK_PX."""
+    """Return the camera of the size worked on: no larger than `max_pixels` nor than the training images, trimmed to
+    multiples of `block_px`."""
     learned = recorded.scale * max(other.fx for other in recorded.cameras)
-    factor = min(1.0, math.sqrt(MAX_PIXELS / (camera.width * camera.height)), learned / camera.fx)
+    factor = min(1.0, math.sqrt(CROPS.max_pixels / (camera.width * camera.height)), learned / camera.fx)
     scaled = camera if factor == 1 else camera.scaled(factor)
-    width, height = (max(BLOCK_PX, size // BLOCK_PX * BLOCK_PX) for size in (scaled.width, scaled.height))
+    width, height = (
+        max(CROPS.block_px, size // CROPS.block_px * CROPS.block_px) for size in (scaled.width, scaled.height)
+    )
     return replace(scaled, width=width, height=height)
 
 
@@ -94,10 +104,10 @@ def color_matched(image: Tensor, tissue: Tensor, weight: Tensor) -> Tensor:
     These are a linear map of each channel's light, fitted robustly to the tissue. The image itself is returned where
     its colours agree, or no map explains them.
     """
-    small = (downsampled(each, 1 / BLOCK_PX).flatten(0, 1) for each in (image, tissue, weight[..., None]))
+    small = (downsampled(each, 1 / CROPS.block_px).flatten(0, 1) for each in (image, tissue, weight[..., None]))
     observed, rendered, counted = (each.clamp(0, 1) ** GAMMA for each in small)
     used = counted[:, 0] > 0.99
-    for _ in range(N_TRIMMINGS):
+    for _ in range(CROPS.n_trimmings):
         if int(used.sum()) < 8:
             return image
         (some, others), spread = (each[used] for each in (observed, rendered)), rendered[used].var(0)
@@ -106,8 +116,12 @@ def color_matched(image: Tensor, tissue: Tensor, weight: Tensor) -> Tensor:
         off = (observed - gain * rendered - offset).abs().amax(1)
         used = (off <= 2 * off[counted[:, 0] > 0.99].median()) & (counted[:, 0] > 0.99)
     changed = ((gain - 1) * rendered[used] + offset).abs().mean()
-    explained = off[used].mean() < MAX_UNEXPLAINED * observed[used].std(0).mean()
-    if changed < SAME_COLOR or not explained or bool(((gain < GAIN_RANGE[0]) | (gain > GAIN_RANGE[1])).any()):
+    explained = off[used].mean() < CROPS.max_unexplained * observed[used].std(0).mean()
+    if (
+        changed < CROPS.same_color
+        or not explained
+        or bool(((gain < CROPS.gain_range[0]) | (gain > CROPS.gain_range[1])).any())
+    ):
         return image
     return ((image**GAMMA - offset) / gain).clamp_min(0) ** (1 / GAMMA)
 
@@ -145,7 +159,7 @@ class InstrumentRenderer:
         self._black = scene.canonical.means.new_zeros(3)
         self._poser = self.alone.deformation.poser(self.alone.canonical)
         self._first: Gaussians | None = None
-        self._latest: deque[tuple[State, State, Gaussians]] = deque(maxlen=N_POSED)
+        self._latest: deque[tuple[State, State, Gaussians]] = deque(maxlen=CROPS.n_posed)
 
     def pose(self, state: State) -> Gaussians:
         """Return the instruments' Gaussians in `state`. Do not modify: the latest are kept, by the state's identity."""
@@ -202,16 +216,16 @@ class InstrumentRenderer:
         pixels, depth = (each.cpu().numpy() for each in project_world(posed.means, camera))
         x, y = pixels.T
         inside = (depth > camera.near) & (x > 0) & (x < camera.width) & (y > 0) & (y < camera.height)
-        inside &= posed.opacities.cpu().numpy() > MIN_OPACITY
+        inside &= posed.opacities.cpu().numpy() > CROPS.min_opacity
         if not inside.any():
             return None
-        ends = (MARGIN_QUANTILE, 1 - MARGIN_QUANTILE)
+        ends = (CROPS.margin_quantile, 1 - CROPS.margin_quantile)
         (left, right), (top, bottom) = (np.quantile(values[inside], ends).tolist() for values in (x, y))
         return (
-            max(0, int((left - margin) // BLOCK_PX) * BLOCK_PX),
-            max(0, int((top - margin) // BLOCK_PX) * BLOCK_PX),
-            min(camera.width, -int(-(right + margin) // BLOCK_PX) * BLOCK_PX),
-            min(camera.height, -int(-(bottom + margin) // BLOCK_PX) * BLOCK_PX),
+            max(0, int((left - margin) // CROPS.block_px) * CROPS.block_px),
+            max(0, int((top - margin) // CROPS.block_px) * CROPS.block_px),
+            min(camera.width, -int(-(right + margin) // CROPS.block_px) * CROPS.block_px),
+            min(camera.height, -int(-(bottom + margin) // CROPS.block_px) * CROPS.block_px),
         )
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from neeco.capture.model import Frame, State
 from neeco.raster.types import Gaussians
 from neeco.states.crop_rendering import (
-    N_POSED,
+    CROPS,
     FrameView,
     InstrumentRenderer,
     TissueRenderer,
@@ -29,17 +29,29 @@ from neeco.states.crop_rendering import (
 from neeco.states.minimise import ImageResidual, minimise
 from neeco.states.parameters import StateParameters, precision_of
 
-HUBER = 0.05  # colour residual beyond which the cost of a pixel is linear
-CORRELATION_PX = 25.0  # pixels of the full size that count as one observation, since residuals of neighbours correlate
-STEPS = (0.2, 0.1, 0.5, 0.1)  # deg, mm, deg and mm of joints: finite differences at full size
-SMALL_STEP = (0.05, 0.05, 0.1, 0.05)  # the same: a smaller step is the last
-STEPS_AT_ONCE = 2  # steps between new differences and shadows; more would attract the fit to where it was
-NEIGHBOURHOOD = 0.015  # of the image's diagonal: pixels this close to an instrument belong to its misfit
-FOREGROUND_WIDTH = 0.02  # of the diagonal: areas as wide that neither instrument nor tissue explains are foreground
-FOREGROUND_ERROR = 3 * HUBER * (0.1 - HUBER / 2)  # Huber error of a pixel whose colours are off by 0.1
-FOREGROUND_RIM_PX = 5  # side of the square by which such areas are widened
-MAX_HIDDEN = 0.3  # share of an instrument behind the foreground; if more, it is rather somewhere else
-MARGIN_PX = 28  # about the instruments, that a fit looks at
+
+@dataclass(frozen=True, kw_only=True)
+class FitterSettings:
+    """Settings of fits by rendering."""
+
+    huber: float = 0.05  # colour residual beyond which the cost of a pixel is linear
+    # pixels of the full size that count as one observation, since residuals of neighbours correlate
+    correlation_px: float = 25.0
+    # deg, mm, deg and mm of joints: finite differences at full size
+    steps: tuple[float, float, float, float] = (0.2, 0.1, 0.5, 0.1)
+    small_step: tuple[float, float, float, float] = (0.05, 0.05, 0.1, 0.05)  # the same: a smaller step is the last
+    steps_at_once: int = 2  # steps between new differences and shadows; more would attract the fit to where it was
+    neighbourhood: float = 0.015  # of the image's diagonal: pixels this close to an instrument belong to its misfit
+    # of the diagonal: areas as wide that neither instrument nor tissue explains are foreground
+    foreground_width: float = 0.02
+    foreground_error: float = 3 * huber * (0.1 - huber / 2)  # Huber error of a pixel whose colours are off by 0.1
+    foreground_rim_px: int = 5  # side of the square by which such areas are widened
+    max_hidden: float = 0.3  # share of an instrument behind the foreground; if more, it is rather somewhere else
+    margin_px: int = 28  # about the instruments, that a fit looks at
+
+
+FIT = FitterSettings()
+
 
 P = TypeVar("P", bound=StateParameters, covariant=True)
 
@@ -51,7 +63,7 @@ class StateFit:
     state: State
     cost: float  # of pixels and prior, -log probability
     gain: float  # by how much pixels cost less than with the tissue alone; comparable between crops
-    # Huber error on and close by the instrument, without foreground, per pixel of instrument; 1: of residuals of HUBER
+    # Huber error on and close by the instrument, without foreground, per pixel of instrument; 1: of residuals of huber
     misfit: float
     observations: float  # independent ones that the information takes the instrument's pixels for
     information: Tensor  # [P, P] of the pixels on the parameters
@@ -89,7 +101,7 @@ class _CropProblem:
         parameters, state = self.fitter.parameters, self.moved.at(at)
         # the pose of a single instrument moves all Gaussians as one
         n_rigid = 6 if len(parameters.instruments) == 1 else 0
-        for index, step in enumerate((parameters.vector_from_degrees(*STEPS) / self.size).tolist()):
+        for index, step in enumerate((parameters.vector_from_degrees(*FIT.steps) / self.size).tolist()):
             increments, change = at.clone(), step * parameters.step_sign(state, index, step)
             increments[index] += change
             other = parameters.moved(self.moved.expected, increments)
@@ -104,7 +116,7 @@ class MovedStates:
 
     def __init__(self, parameters: StateParameters, expected: State) -> None:
         self.parameters, self.expected = parameters, expected
-        self._known: deque[tuple[Tensor, State]] = deque(maxlen=N_POSED)
+        self._known: deque[tuple[Tensor, State]] = deque(maxlen=CROPS.n_posed)
 
     def at(self, increments: Tensor) -> State:
         """Return the state moved by increments [P] float64, which must not be modified afterwards."""
@@ -123,7 +135,7 @@ class Fitter(Generic[P]):
     instruments: InstrumentRenderer
     parameters: P
     tissue: TissueRenderer
-    correlation_px: float = CORRELATION_PX  # more where the scene's own errors correlate, too
+    correlation_px: float = FIT.correlation_px  # more where the scene's own errors correlate, too
 
     def view(self, frame: Frame, state: State | None) -> FrameView:
         """Return a frame at the size worked on, over tissue with the shadow of instruments in `state` (None: none)."""
@@ -148,18 +160,18 @@ class Fitter(Generic[P]):
         increments = torch.zeros(parameters.size, dtype=torch.float64)
         if start is not None:
             increments = parameters.increments_between(expected, start)
-        small, moved = parameters.vector_from_degrees(*SMALL_STEP), MovedStates(parameters, expected)
+        small, moved = parameters.vector_from_degrees(*FIT.small_step), MovedStates(parameters, expected)
         cost, information = math.inf, torch.zeros_like(precision)
         for level, count in zip(levels, steps, strict=True):
             crop = self.crop_around(view, moved.at(increments))
             if crop is None:
                 return None
             residual = residual_of(crop, level, self.correlation_px)
-            for first in range(0, count, STEPS_AT_ONCE):
+            for first in range(0, count, FIT.steps_at_once):
                 crop = self.with_shadow(crop, moved.at(increments))
                 problem = _CropProblem(self, crop, level, residual, moved, precision)
-                max_steps = min(count - first, STEPS_AT_ONCE)
-                found = minimise(problem, [increments], max_steps, small=small, linearised_for=STEPS_AT_ONCE)
+                max_steps = min(count - first, FIT.steps_at_once)
+                found = minimise(problem, [increments], max_steps, small=small, linearised_for=FIT.steps_at_once)
                 increments, cost = found.parameters, found.cost
                 information = information if found.information is None else found.information
                 if found.settled:
@@ -189,7 +201,7 @@ class Fitter(Generic[P]):
         ]
         return [state for _, _, state in sorted(scored, key=lambda item: item[:2])]
 
-    def crop_around(self, view: FrameView, state: State, margin: float = MARGIN_PX) -> FrameView | None:
+    def crop_around(self, view: FrameView, state: State, margin: float = FIT.margin_px) -> FrameView | None:
         """Return the crop of a view about the instruments in `state`; None where they are outside."""
         box = self.instruments.box(state, view.camera, margin)
         return None if box is None else view.crop(box)
@@ -201,7 +213,7 @@ class Fitter(Generic[P]):
             return view
         if view.shadow_of is not None:
             changed = self.parameters.increments_between(view.shadow_of, state).abs()
-            if bool((changed < 2 * self.parameters.vector_from_degrees(*STEPS)).all()):
+            if bool((changed < 2 * self.parameters.vector_from_degrees(*FIT.steps)).all()):
                 return view
         return replace(view, tissue=self.tissue.render(view.camera, state), shadow_of=state)
 
@@ -214,21 +226,21 @@ class Fitter(Generic[P]):
             residual.errors(image).sum(2) for image in (composite(color, alpha, view.tissue), view.tissue)
         )
         gain = residual.scale * float((without - with_it).sum(dtype=torch.float64))
-        unexplained = (with_it > FOREGROUND_ERROR) & (without > FOREGROUND_ERROR)
-        hidden = wide_areas(unexplained, round(FOREGROUND_WIDTH * view.diagonal))
+        unexplained = (with_it > FIT.foreground_error) & (without > FIT.foreground_error)
+        hidden = wide_areas(unexplained, round(FIT.foreground_width * view.diagonal))
         opaque = alpha * view.weight
-        if float(opaque[hidden].sum()) > MAX_HIDDEN * float(opaque.sum()):
+        if float(opaque[hidden].sum()) > FIT.max_hidden * float(opaque.sum()):
             hidden = torch.zeros_like(hidden)
-        near = widened(alpha > 0.5, round(NEIGHBOURHOOD * view.diagonal)) & ~hidden
+        near = widened(alpha > 0.5, round(FIT.neighbourhood * view.diagonal)) & ~hidden
         pixels = max(float(opaque[~hidden].sum()), 1.0)
-        return gain, float(with_it[near].sum()) / (0.5 * HUBER**2 * 3 * pixels), pixels
+        return gain, float(with_it[near].sum()) / (0.5 * FIT.huber**2 * 3 * pixels), pixels
 
 
 def wide_areas(mask: Tensor, pixels: int) -> Tensor:
     """Return where a mask bool [h, w] holds a square of so many pixels, and the rims of these areas."""
     square = np.ones((pixels, pixels), np.uint8)
     opened = cv2.morphologyEx(mask.numpy().astype(np.uint8), cv2.MORPH_OPEN, square)
-    return torch.from_numpy(cv2.dilate(opened, np.ones((FOREGROUND_RIM_PX, FOREGROUND_RIM_PX), np.uint8)) > 0)
+    return torch.from_numpy(cv2.dilate(opened, np.ones((FIT.foreground_rim_px, FIT.foreground_rim_px), np.uint8)) > 0)
 
 
 def widened(mask: Tensor, pixels: int) -> Tensor:
@@ -237,13 +249,13 @@ def widened(mask: Tensor, pixels: int) -> Tensor:
     return torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), square) > 0)
 
 
-def residual_of(view: FrameView, size: float, correlation_px: float = CORRELATION_PX) -> ImageResidual:
+def residual_of(view: FrameView, size: float, correlation_px: float = FIT.correlation_px) -> ImageResidual:
     """Return the residual of a view reduced to `size` times its size, of the same weight at any size.
 
     correlation_px: pixels of the full size that count as one observation."""
-    scale = size**-2 / (HUBER**2 * correlation_px * 3)
+    scale = size**-2 / (FIT.huber**2 * correlation_px * 3)
     weight = torch.where(downsampled(view.weight[..., None], size)[..., 0] > 0.99, 1.0, 0.0)
-    return ImageResidual(downsampled(view.image, size), weight, HUBER, scale)
+    return ImageResidual(downsampled(view.image, size), weight, FIT.huber, scale)
 
 
 def loose_prior(parameters: StateParameters, degrees: float, millimetres: float, joint_degrees: float) -> Tensor:

@@ -19,26 +19,39 @@ from neeco.capture.kinematics import KinematicTree
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.lines import frame_about
 from neeco.geometry.trocar import line_through_trocar
-from neeco.states.outline_model import MAX_BEND_MM, ArticulatedModel, Outlines, joint_values
+from neeco.states.outline_model import MODEL, ArticulatedModel, Outlines, joint_values
 
 POSE = 6  # parameters of a state's pose: two tilts, roll (rad), two shifts across the view, depth (mm); joints follow
-BINS, SMOOTH_BINS = 24, 0.8  # of colours, per channel
-COMMON = 0.05  # share of pixels whose colour says nothing
-BLOCK_PX, GRID_PX = 8, 4  # blocks of cells that are chosen together; grid on which colours are attributed
-CORRELATED_PX = 12.0  # pixels that count as one: errors of outlines and of the model are correlated along them
-MAX_RATIO, MIN_BLOCKS = 3.0, 40.0  # of likelihoods that count in a misfit; and blocks' worth of them, at least
-EARS_MM = 15.0  # before the first joint, that count neither as shaft nor as beyond it
-BASE_SD_RAD, BASE_SD_MM = 0.035, 3.0
-TUBE_TILT_SD, END_SD_MM, LEAST_END_MM = 0.1, 6.0, -10.0  # of the shaft's axis and end, where no trocar gives the axis
-STEPS = (0.002, 0.05)  # rad, mm, of differences
-PARAMETER_STEP = 0.02  # standard deviations
-MAX_STEP_SDS = 3.0  # of one step
-FIRST_SOFTNESS = 10.0  # px of outlines from which colours are learned at first
-STAGES: tuple[tuple[int, float, int], ...] = (
-    (8, 6.0, 8),
-    (4, 3.0, 8),
-    (4, 2.0, 8),
-)  # px of cells and of the outlines' softness; steps
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutlineFitSettings:
+    """Settings of the fit of outlines to colours."""
+
+    bins: int = 24  # of colours, per channel
+    smooth_bins: float = 0.8
+    common: float = 0.05  # share of pixels whose colour says nothing
+    block_px: int = 8  # blocks of cells that are chosen together; grid on which colours are attributed
+    grid_px: int = 4
+    # pixels that count as one: errors of outlines and of the model are correlated along them
+    correlated_px: float = 12.0
+    max_ratio: float = 3.0  # of likelihoods that count in a misfit; and blocks' worth of them, at least
+    min_blocks: float = 40.0
+    ears_mm: float = 15.0  # before the first joint, that count neither as shaft nor as beyond it
+    base_sd_rad: float = 0.035
+    base_sd_mm: float = 3.0
+    tube_tilt_sd: float = 0.1  # of the shaft's axis and end, where no trocar gives the axis
+    end_sd_mm: float = 6.0
+    least_end_mm: float = -10.0
+    steps: tuple[float, float] = (0.002, 0.05)  # rad, mm, of differences
+    parameter_step: float = 0.02  # standard deviations
+    max_step_sds: float = 3.0  # of one step
+    first_softness: float = 10.0  # px of outlines from which colours are learned at first
+    # px of cells and of the outlines' softness; steps
+    stages: tuple[tuple[int, float, int], ...] = ((8, 6.0, 8), (4, 3.0, 8), (4, 2.0, 8))
+
+
+OUTLINES = OutlineFitSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,11 +97,11 @@ class StatesProblem:
             self.model = ArticulatedModel(views.tree, views.poses)
             self.center = views.poses[:, :3, 3].mean(0)
             self.basis = frame_about(self.model.axis)
-            if line_through_trocar(views.poses, MAX_BEND_MM) is None:
-                self.model.widen_shaft(TUBE_TILT_SD, END_SD_MM, LEAST_END_MM)
+            if line_through_trocar(views.poses, MODEL.max_bend_mm) is None:
+                self.model.widen_shaft(OUTLINES.tube_tilt_sd, OUTLINES.end_sd_mm, OUTLINES.least_end_mm)
         else:
             self.model, self.center, self.basis = like.model, like.center, like.basis
-        base = [BASE_SD_RAD] * 3 + [BASE_SD_MM] * 3
+        base = [OUTLINES.base_sd_rad] * 3 + [OUTLINES.base_sd_mm] * 3
         self.shared_sds = np.append(self.model.sds, base)
         self.shared_means = np.append(self.model.means, np.zeros(6))
         first = [int(np.flatnonzero(views.state_of_view == s)[0]) for s in range(len(views.poses))]
@@ -131,51 +144,55 @@ class StatesProblem:
         has them."""
         images = self.views.images
         count, height, width, _ = images.shape
-        grid = _grid(-(-height // GRID_PX) * GRID_PX, -(-width // GRID_PX) * GRID_PX, GRID_PX)
+        grid = _grid(
+            -(-height // OUTLINES.grid_px) * OUTLINES.grid_px,
+            -(-width // OUTLINES.grid_px) * OUTLINES.grid_px,
+            OUTLINES.grid_px,
+        )
         apart = fit.shared.copy()
-        apart[self.model.ears] = EARS_MM
+        apart[self.model.ears] = OUTLINES.ears_mm
         distances = self.outlines(replace(fit, shared=apart)).distances(np.broadcast_to(grid, (count, *grid.shape)))[0]
         sizes = [np.zeros_like(distances[:, 0]), distances[:, 0], distances[:, 2:].max(1), distances[:, 1]]
         scaled = np.stack(sizes, -1) / softness
         member = np.exp(scaled - scaled.max(-1, keepdims=True))
-        member = (member / member.sum(-1, keepdims=True)).reshape(count, -(-height // GRID_PX), -1, len(sizes))
-        bins = (images.astype(np.uint16) * BINS // 256).astype(np.int32)
-        index = (bins[..., 0] * BINS + bins[..., 1]) * BINS + bins[..., 2]
-        rows, columns = np.arange(height) // GRID_PX, np.arange(width) // GRID_PX
+        member = (member / member.sum(-1, keepdims=True)).reshape(count, -(-height // OUTLINES.grid_px), -1, len(sizes))
+        bins = (images.astype(np.uint16) * OUTLINES.bins // 256).astype(np.int32)
+        index = (bins[..., 0] * OUTLINES.bins + bins[..., 1]) * OUTLINES.bins + bins[..., 2]
+        rows, columns = np.arange(height) // OUTLINES.grid_px, np.arange(width) // OUTLINES.grid_px
         found = []
         for label in range(3):
             own = np.where(self.views.usable, member[..., label][:, rows[:, None], columns[None]], 0.0)
-            counted = np.bincount(index.ravel(), own.ravel(), BINS**3).reshape((BINS,) * 3)
-            density = gaussian_filter(counted, SMOOTH_BINS) + 1e-9
+            counted = np.bincount(index.ravel(), own.ravel(), OUTLINES.bins**3).reshape((OUTLINES.bins,) * 3)
+            density = gaussian_filter(counted, OUTLINES.smooth_bins) + 1e-9
             found.append(density / density.sum())
         tissue, instrument = found[0], (found[1] + found[2]) / 2
-        common = COMMON * (tissue + instrument) / 2
-        ratio = np.log(((1 - COMMON) * instrument + common) / ((1 - COMMON) * tissue + common))
+        common = OUTLINES.common * (tissue + instrument) / 2
+        ratio = np.log(((1 - OUTLINES.common) * instrument + common) / ((1 - OUTLINES.common) * tissue + common))
         return np.asarray(ratio.astype(np.float32).ravel()[index])
 
     def cells(self, fit: StatesFit, ratios: np.ndarray, cell: int, softness: float) -> Cells:
         """Cells of `cell` px in the blocks near a fit's outlines; ratios [V, H, W] as `learn_colors` returns them."""
         count, height, width = ratios.shape
-        rows, columns, inner = height // BLOCK_PX, width // BLOCK_PX, BLOCK_PX // cell
-        grid = _grid(rows * BLOCK_PX, columns * BLOCK_PX, BLOCK_PX)
+        rows, columns, inner = height // OUTLINES.block_px, width // OUTLINES.block_px, OUTLINES.block_px // cell
+        grid = _grid(rows * OUTLINES.block_px, columns * OUTLINES.block_px, OUTLINES.block_px)
         distances = self.outlines(fit).distances(np.broadcast_to(grid, (count, *grid.shape)))[0].max(1)
-        near = np.abs(distances) < BLOCK_PX + 3 * softness  # [V, B]
+        near = np.abs(distances) < OUTLINES.block_px + 3 * softness  # [V, B]
 
         def pooled(images: np.ndarray) -> np.ndarray:
-            cut = images[:, : rows * BLOCK_PX, : columns * BLOCK_PX]
+            cut = images[:, : rows * OUTLINES.block_px, : columns * OUTLINES.block_px]
             parts = cut.reshape((count, rows, inner, cell, columns, inner, cell)).mean((3, 6), dtype=np.float32)
             return np.asarray(parts.transpose(0, 1, 3, 2, 4).reshape(count, len(grid), inner**2))
 
         order = np.argsort(~near, axis=1, kind="stable")[:, : max(int(near.sum(1).max()), 1)]  # near blocks first
         used = np.take_along_axis(near, order, 1)[..., None]
-        points = grid[order][:, :, None] + _grid(BLOCK_PX, BLOCK_PX, cell) - BLOCK_PX / 2
+        points = grid[order][:, :, None] + _grid(OUTLINES.block_px, OUTLINES.block_px, cell) - OUTLINES.block_px / 2
         picked, weights = (
             np.take_along_axis(pooled(part), order[..., None], 1) for part in (ratios, self.views.usable)
         )
         return Cells(
             points.reshape(count, -1, 2).astype(np.float32),
             picked.reshape(count, -1),
-            (weights * used * np.float32(cell**2 / CORRELATED_PX)).reshape(count, -1),
+            (weights * used * np.float32(cell**2 / OUTLINES.correlated_px)).reshape(count, -1),
             softness,
         )
 
@@ -187,15 +204,17 @@ class StatesProblem:
     def misfits(self, fit: StatesFit, ratios: np.ndarray) -> np.ndarray:
         """Misfit [V] of each view: likelihood ratios on the wrong side of the outline, by those on its right side."""
         count, height, width = ratios.shape
-        rows, columns = height // BLOCK_PX, width // BLOCK_PX
-        grid = _grid(rows * BLOCK_PX, columns * BLOCK_PX, BLOCK_PX)
+        rows, columns = height // OUTLINES.block_px, width // OUTLINES.block_px
+        grid = _grid(rows * OUTLINES.block_px, columns * OUTLINES.block_px, OUTLINES.block_px)
         distances = self.outlines(fit).distances(np.broadcast_to(grid, (count, *grid.shape)))[0].max(1)
-        inside = expit(distances / (BLOCK_PX / 4))
-        cut = np.clip(ratios, -MAX_RATIO, MAX_RATIO) * self.views.usable
-        cut = cut[:, : rows * BLOCK_PX, : columns * BLOCK_PX].reshape(count, rows, BLOCK_PX, columns, BLOCK_PX)
+        inside = expit(distances / (OUTLINES.block_px / 4))
+        cut = np.clip(ratios, -OUTLINES.max_ratio, OUTLINES.max_ratio) * self.views.usable
+        cut = cut[:, : rows * OUTLINES.block_px, : columns * OUTLINES.block_px].reshape(
+            count, rows, OUTLINES.block_px, columns, OUTLINES.block_px
+        )
         for_it, against = (np.clip(sign * cut, 0, None).mean((2, 4)).reshape(count, -1) for sign in (1, -1))
         wrong = ((1 - inside) * for_it + inside * against).sum(1)
-        return np.asarray(wrong / ((inside * for_it).sum(1) + MAX_RATIO * MIN_BLOCKS))
+        return np.asarray(wrong / ((inside * for_it).sum(1) + OUTLINES.max_ratio * OUTLINES.min_blocks))
 
     def turned_to_shaft(self, fit: StatesFit) -> StatesFit:
         """The same fit with tilts and roll counted about the shaft's axis as fitted, from now on."""
@@ -260,14 +279,14 @@ class StatesProblem:
 
         own = []
         for index in range(fit.own.shape[1]):
-            step = STEPS[1] if 3 <= index < POSE else STEPS[0]
+            step = OUTLINES.steps[1] if 3 <= index < POSE else OUTLINES.steps[0]
             moved = fit.own.copy()
             moved[:, index] += step
             own.append(by(StatesFit(fit.shared, moved), step))
         common = []
         for index in range(len(fit.shared)) if shared else ():
             moved = fit.shared.copy()
-            moved[index] += (step := PARAMETER_STEP * self.shared_sds[index])
+            moved[index] += (step := OUTLINES.parameter_step * self.shared_sds[index])
             common.append(by(StatesFit(moved, fit.own), step))
         empty = np.zeros((*here.shape, 0))
         return np.stack(own, -1), np.stack(common, -1) if shared else empty
@@ -326,11 +345,11 @@ def adjust(problem: StatesProblem, fit: StatesFit, cells: Cells, max_steps: int,
 
     def move(fit: StatesFit, step: np.ndarray) -> StatesFit:
         count = len(fit.shared) if shared else 0
-        limit = MAX_STEP_SDS * shared_sds[:count]
+        limit = OUTLINES.max_step_sds * shared_sds[:count]
         own = step[count:].reshape(fit.own.shape)
         new = fit.shared.copy()
         new[:count] += np.clip(step[:count], -limit, limit)
-        return StatesFit(new, fit.own + np.clip(own, -MAX_STEP_SDS * sds, MAX_STEP_SDS * sds))
+        return StatesFit(new, fit.own + np.clip(own, -OUTLINES.max_step_sds * sds, OUTLINES.max_step_sds * sds))
 
     return levenberg_marquardt(fit, linearise, move, max_steps=max_steps, damping=1e-2, tolerance=1e-4)
 

@@ -18,28 +18,48 @@ from neeco.geometry.lines import frame_about, unit
 from neeco.geometry.projection import project
 from neeco.geometry.trocar import line_through_trocar
 
-TUBE_MM = 150.0  # of the root link that is modelled
-NEAREST_MM = 8.0  # depth at which cones are cut off
-PIVOT_SD_MM, AXIS_SD_RAD, OFFSET_SD_RAD = 1.2, 0.06, 0.05  # of what is stated; values of joints include shapes' errors
-HEADING_SD_RAD = 0.15  # of an outermost link's direction from the tube's at rest: a curved jaw looks like an offset
-SLIDE_SD_MM = 1.0  # of the offset of a prismatic joint
-PLAY_SD_RAD, PLAY_SD_MM = 0.012, 0.3  # by which readings lag behind, or lead, with the sign of motion
-MOTION_STEPS = 2  # moments before and after, between which the sign of motion is taken
-TILT_SD_RAD, ASIDE_SD_MM = 0.03, 0.7  # of the tube's axis about its first guess, and from the first pivot
-LOG_RADIUS_SD, RATIO_SD = 0.4, 0.3  # of radii, and of the ratio of one link's to its parent's
-FLAT_SD = 0.2  # of the relative change of a radius with the viewing direction
-EARS_MM, EARS_SD_MM = 6.0, 3.0  # from the tube's end to the first pivot
-LENGTH_MM, LENGTH_SD_MM, UNEQUAL_SD_MM = 13.0, 5.0, 1.5  # of outermost links, and of the difference between them
-TUBE_RADIUS_MM, TAPER = 3.8, 0.5  # first guesses; of outermost links
-MIN_RADIUS_MM, MIN_LENGTH_MM = 0.2, 2.0
-MAX_BEND_MM = 1.5  # of a logged pose's line from the trocar, rms
-MIN_PIVOT_MM = 5.0  # from the root's origin, for a direction
+
+@dataclass(frozen=True, kw_only=True)
+class OutlineModelSettings:
+    """Priors of an instrument's shape and of what is stated of its links."""
+
+    tube_mm: float = 150.0  # of the root link that is modelled
+    nearest_mm: float = 8.0  # depth at which cones are cut off
+    pivot_sd_mm: float = 1.2  # of what is stated; values of joints include shapes' errors
+    axis_sd_rad: float = 0.06
+    offset_sd_rad: float = 0.05
+    # of an outermost link's direction from the tube's at rest: a curved jaw looks like an offset
+    heading_sd_rad: float = 0.15
+    slide_sd_mm: float = 1.0  # of the offset of a prismatic joint
+    play_sd_rad: float = 0.012  # by which readings lag behind, or lead, with the sign of motion
+    play_sd_mm: float = 0.3
+    motion_steps: int = 2  # moments before and after, between which the sign of motion is taken
+    tilt_sd_rad: float = 0.03  # of the tube's axis about its first guess, and from the first pivot
+    aside_sd_mm: float = 0.7
+    log_radius_sd: float = 0.4  # of radii, and of the ratio of one link's to its parent's
+    ratio_sd: float = 0.3
+    flat_sd: float = 0.2  # of the relative change of a radius with the viewing direction
+    ears_mm: float = 6.0  # from the tube's end to the first pivot
+    ears_sd_mm: float = 3.0
+    length_mm: float = 13.0  # of outermost links, and of the difference between them
+    length_sd_mm: float = 5.0
+    unequal_sd_mm: float = 1.5
+    tube_radius_mm: float = 3.8  # first guesses; of outermost links
+    taper: float = 0.5
+    min_radius_mm: float = 0.2
+    min_length_mm: float = 2.0
+    max_bend_mm: float = 1.5  # of a logged pose's line from the trocar, rms
+    min_pivot_mm: float = 5.0  # from the root's origin, for a direction
+    max_along: float = 0.9  # cosine between a joint's axis and the shaft, above which it turns the shaft about itself
+    min_motion: float = 0.02  # standard deviation of a joint's value, rad, from which it bends
+    min_slide_mm: float = 0.5
+
+
+MODEL = OutlineModelSettings()
+
 STATIONS = np.array([0.04, 0.15, 0.3, 0.5, 0.7, 0.85, 0.96])  # along a cone, of outline points
-TUBE_STATIONS = 1 - np.array([1, 3, 6, 9, 13, 18, 24, 31, 40, 50, 62, 75, 90]) / TUBE_MM
+TUBE_STATIONS = 1 - np.array([1, 3, 6, 9, 13, 18, 24, 31, 40, 50, 62, 75, 90]) / MODEL.tube_mm
 CAP_ANGLES = np.radians([-80, -50, -25, 0, 25, 50, 80])  # about a cone's outer end
-MAX_ALONG = 0.9  # cosine between a joint's axis and the shaft, above which it turns the shaft about itself
-MIN_MOTION = 0.02  # standard deviation of a joint's value, rad, from which it bends
-MIN_SLIDE_MM = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +113,12 @@ class ArticulatedModel:
         first = next(i for i in range(len(names)) if tree.links[i].type != FIXED)
         self.first = first
         self.axis = _tube_axis(tree, self.rest[first][:3, 3], poses)
-        self.tilt = self._add("shaft", [0] * 4, [TILT_SD_RAD] * 2 + [ASIDE_SD_MM] * 2)
+        self.tilt = self._add("shaft", [0] * 4, [MODEL.tilt_sd_rad] * 2 + [MODEL.aside_sd_mm] * 2)
         self.least_ears = 0.5  # mm
-        self.ears = self._add("ears", [EARS_MM], [EARS_SD_MM])
-        self.tube = self._add("tube radius", [np.log(TUBE_RADIUS_MM), -0.15], [LOG_RADIUS_SD, RATIO_SD])
+        self.ears = self._add("ears", [MODEL.ears_mm], [MODEL.ears_sd_mm])
+        self.tube = self._add(
+            "tube radius", [np.log(MODEL.tube_radius_mm), -0.15], [MODEL.log_radius_sd, MODEL.ratio_sd]
+        )
         self._cones()
         self._outline()
 
@@ -129,20 +151,22 @@ class ArticulatedModel:
                 continue
             key = (parent, *link.origin[:3, 3].round(6), *link.axis.round(6))
             if key not in places:
-                sds = [PIVOT_SD_MM] * 3 + [AXIS_SD_RAD] * 2
+                sds = [MODEL.pivot_sd_mm] * 3 + [MODEL.axis_sd_rad] * 2
                 places[key] = self._add(f"pivot of {link.name}", [0] * 5, sds)
             self.pivots.append(places[key])
-            sd = SLIDE_SD_MM if link.type == PRISMATIC else OFFSET_SD_RAD
+            sd = MODEL.slide_sd_mm if link.type == PRISMATIC else MODEL.offset_sd_rad
             if link.type != PRISMATIC and index not in self.parents:
-                sd = float(np.hypot(sd, HEADING_SD_RAD))
+                sd = float(np.hypot(sd, MODEL.heading_sd_rad))
             self.offsets.append(self._add(f"offset of {link.name}", [0], [sd]))
             self.plays.append(
-                self._add(f"play of {link.name}", [0], [PLAY_SD_MM if link.type == PRISMATIC else PLAY_SD_RAD])
+                self._add(
+                    f"play of {link.name}", [0], [MODEL.play_sd_mm if link.type == PRISMATIC else MODEL.play_sd_rad]
+                )
             )
 
     def _cones(self) -> None:
         self.cones: list[Cone] = []
-        lengths = self._add("length", [LENGTH_MM], [LENGTH_SD_MM])
+        lengths = self._add("length", [MODEL.length_mm], [MODEL.length_sd_mm])
         self.mean_length = lengths
         for index, link in enumerate(self.tree.links):
             if index == 0 or not link.body or all(self.pivots[i] is None for i in self._chain(index)):
@@ -151,13 +175,18 @@ class ArticulatedModel:
             pivots = {tuple(self.tree.links[i].origin[:3, 3].round(3)): i for i in below}
             for child in pivots.values():
                 if np.linalg.norm(self.tree.links[child].origin[:3, 3]) > 1.0:
-                    radii = self._add(f"radii of {link.name}", [-0.2, 0, 0, 0], [RATIO_SD] * 2 + [FLAT_SD] * 2)
+                    radii = self._add(
+                        f"radii of {link.name}", [-0.2, 0, 0, 0], [MODEL.ratio_sd] * 2 + [MODEL.flat_sd] * 2
+                    )
                     self.cones.append(Cone(index, child, radii, None))
             if not below:
-                means, sds = [-0.45, np.log(TAPER), 0, 0], [RATIO_SD, 2 * RATIO_SD, FLAT_SD, FLAT_SD]
+                means, sds = (
+                    [-0.45, np.log(MODEL.taper), 0, 0],
+                    [MODEL.ratio_sd, 2 * MODEL.ratio_sd, MODEL.flat_sd, MODEL.flat_sd],
+                )
                 radii = self._add(f"radii of {link.name}", means, sds)
-                length = self._add(f"length of {link.name}", [0], [UNEQUAL_SD_MM])
-                heading = self._add(f"heading of {link.name}", [0], [HEADING_SD_RAD])
+                length = self._add(f"length of {link.name}", [0], [MODEL.unequal_sd_mm])
+                heading = self._add(f"heading of {link.name}", [0], [MODEL.heading_sd_rad])
                 self.cones.append(Cone(index, None, radii, length, heading))
 
     def _chain(self, index: int) -> list[int]:
@@ -207,7 +236,7 @@ class ArticulatedModel:
         tube = np.exp(parameters[self.tube])
         ears = tube * np.exp(parameters[self.tube + 1])
         across = np.broadcast_to(basis[:, 0], pivot.shape)
-        ends = [np.stack([pivot - TUBE_MM * axis, end], 1), np.stack([end, pivot], 1)]
+        ends = [np.stack([pivot - MODEL.tube_mm * axis, end], 1), np.stack([end, pivot], 1)]
         radii, flat, sideways = [(tube, tube), (ears, ears)], [np.zeros(2)] * 2, [across, across]
         for cone in self.cones:
             turn, shift = turns[cone.link], shifts[cone.link]
@@ -218,14 +247,14 @@ class ArticulatedModel:
                 link = self.tree.links[cone.link]
                 out_of_plane = link.origin[:3, :3].T @ link.axis
                 ahead = unit(rest @ self.axis + parameters[cone.heading] * out_of_plane)
-                length = max(parameters[self.mean_length] + parameters[cone.length], MIN_LENGTH_MM)
+                length = max(parameters[self.mean_length] + parameters[cone.length], MODEL.min_length_mm)
                 far = shift + length * (turn @ ahead)
             else:
                 far = shifts[cone.child]
             ends.append(np.stack([shift, far], 1))
             own = parameters[cone.radii : cone.radii + 4]
-            near = max(tube * np.exp(own[0]), MIN_RADIUS_MM)
-            radii.append((near, max(near * np.exp(own[1]), MIN_RADIUS_MM)))
+            near = max(tube * np.exp(own[0]), MODEL.min_radius_mm)
+            radii.append((near, max(near * np.exp(own[1]), MODEL.min_radius_mm)))
             flat.append(np.clip(own[2:], -0.6, 0.6))
             sideways.append(turn @ (rest @ basis[:, 0]))
         return np.stack(ends, 1), np.array(radii), np.array(flat), np.stack(sideways, 1)
@@ -243,9 +272,9 @@ class ArticulatedModel:
         a = (turn @ ends[:, :, 0, :, None])[..., 0] + camera_from_root[:, None, :3, 3]
         b = (turn @ ends[:, :, 1, :, None])[..., 0] + camera_from_root[:, None, :3, 3]
         sideways = (turn @ sideways[..., None])[..., 0]
-        valid = b[..., 2] > NEAREST_MM
+        valid = b[..., 2] > MODEL.nearest_mm
         gap = np.where(np.abs(b[..., 2] - a[..., 2]) > 1e-6, b[..., 2] - a[..., 2], 1e-6)
-        cut = np.where(valid & (a[..., 2] < NEAREST_MM), (NEAREST_MM - a[..., 2]) / gap, 0.0)
+        cut = np.where(valid & (a[..., 2] < MODEL.nearest_mm), (MODEL.nearest_mm - a[..., 2]) / gap, 0.0)
         a = a + np.clip(cut, 0, 0.999)[..., None] * (b - a)
         axis = unit(b - a)
         normal = unit(np.cross(a, b) + 1e-9)  # of the plane through the camera and the cone's axis
@@ -262,7 +291,7 @@ class ArticulatedModel:
             sine = np.clip(size / np.maximum(-(facing * place).sum(-1, keepdims=True), 1e-3), 0, 0.9)
             near, out = place + size * sine * facing, size * np.sqrt(1 - sine**2) * normal
             left, right = (
-                np.stack(project(p, *intrinsics, nearest=NEAREST_MM / 2), -1) for p in (near - out, near + out)
+                np.stack(project(p, *intrinsics, nearest=MODEL.nearest_mm / 2), -1) for p in (near - out, near + out)
             )
             middles.append((left + right) / 2)
             chords.append((right - left) / 2)
@@ -318,7 +347,7 @@ def with_motion(values: np.ndarray) -> np.ndarray:
     and the signs of their motion then, rounded where they turn."""
     last = len(values) - 1
     near = np.arange(len(values))
-    speed = values[np.minimum(near + MOTION_STEPS, last)] - values[np.maximum(near - MOTION_STEPS, 0)]
+    speed = values[np.minimum(near + MODEL.motion_steps, last)] - values[np.maximum(near - MODEL.motion_steps, 0)]
     usual = np.abs(speed).mean((0, 1))
     return np.concatenate([values, np.tanh(speed / np.maximum(usual, 1e-6))], -1)
 
@@ -326,7 +355,9 @@ def with_motion(values: np.ndarray) -> np.ndarray:
 def bends(tree: KinematicTree, values: np.ndarray) -> bool:
     """Whether joints move the links in a recording, values [F, L]."""
     kinds = [link.type for link in tree.links]
-    least = np.array([np.inf if kind == FIXED else MIN_SLIDE_MM if kind == PRISMATIC else MIN_MOTION for kind in kinds])
+    least = np.array(
+        [np.inf if kind == FIXED else MODEL.min_slide_mm if kind == PRISMATIC else MODEL.min_motion for kind in kinds]
+    )
     return bool((np.std(values, axis=0) > least).any())
 
 
@@ -370,7 +401,9 @@ def _first_joint_across(
     rest. Without one: the root's origin and any direction across."""
     points, axes = (part[::-1] for part in tree.axes_at_rest)
     joints = zip(tree.joints[::-1], points, axes, strict=True)
-    across = [(link, point, own - (own @ axis) * axis) for link, point, own in joints if abs(own @ axis) < MAX_ALONG]
+    across = [
+        (link, point, own - (own @ axis) * axis) for link, point, own in joints if abs(own @ axis) < MODEL.max_along
+    ]
     if not across:
         return np.zeros(3), np.linalg.svd(axis[None])[2][1], []
     return across[0][1], unit(across[0][2]), [(link, unit(own)) for link, _, own in across]
@@ -389,9 +422,9 @@ def _bent_back(readings: Mapping[str, float], links: Sequence[Link]) -> dict[str
 def _tube_axis(tree: KinematicTree, pivot: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """First guess [3] of the tube's direction in the root's frame: through the trocar, as the log has it; else from the
     root's origin to the first pivot; else the root's z."""
-    line = line_through_trocar(poses, MAX_BEND_MM)
+    line = line_through_trocar(poses, MODEL.max_bend_mm)
     if line is not None:
         return line.axis
-    if np.linalg.norm(pivot) > MIN_PIVOT_MM:
+    if np.linalg.norm(pivot) > MODEL.min_pivot_mm:
         return np.asarray(unit(pivot))
     return np.array([0.0, 0.0, 1.0])

@@ -16,42 +16,43 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Instrument, InstrumentState, evenly_spaced
 from neeco.scene.training_views import TrainingViews
-from neeco.states.outline_fit import (
-    FIRST_SOFTNESS,
-    POSE,
-    STAGES,
-    Cells,
-    LinkViews,
-    StatesFit,
-    StatesProblem,
-    adjust,
-    posterior,
-)
+from neeco.states.outline_fit import OUTLINES, POSE, Cells, LinkViews, StatesFit, StatesProblem, adjust, posterior
 from neeco.states.outline_model import mirrored
 from neeco.states.parameters import DEG
 from neeco.states.refinement import Refinement, Verdict
 
-# standard deviations of errors that are tried: tilts, roll (rad), across, depth (mm), revolute (rad), prismatic (mm)
-TRIED = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
-# of a state that is wrong altogether, about each of its starts
-WRONG = (12 * DEG, 30 * DEG, 4.0, 8.0, 20 * DEG, 8.0)
-# standard deviations of a refitted one, at most, for it to count
-SETTLED = (6 * DEG, 15 * DEG, 1.5, 4.0, 15 * DEG, 4.0)
-# sizes that errors of the model alone may feign: no cone is a wrist
-FEIGNED = (0.35 * DEG, 2.3 * DEG, 0.3, 0.6, 3 * DEG, 1.0)
-MIN_SHARE = 0.5  # of the errors tried, the least that is assumed of any parameter where those of another are large
-MIN_FACTOR = 2.0  # times these, from which a size counts
-EM_STEPS = 200
-MAX_ESTIMATED = 30  # states from which sizes are estimated
-BAD_MADS, BAD_MISFIT = 6.0, 0.08  # median absolute deviations, and more than the median, from which a state is bad
-BAD_WEIGHT = 0.02
-LARGE_SDS = 1.8  # root mean square of a correction in standard deviations
-MAX_USUAL_MISFIT = 0.25  # median, above which colours do not show the instrument
-MAX_MISFIT = 0.4  # from which a state is wrong even where nothing explains it better
-BETTER = 0.75  # share of the misfit, below which another start is right
-N_OTHERS = 4  # states of other moments that are tried
-WIDTH_PX = 320  # of the images compared
-MIN_STATES = 8  # with fewer, nothing is said about them
+
+@dataclass(frozen=True, kw_only=True)
+class OutlineStatesSettings:
+    """Settings of the search by outlines."""
+
+    # standard deviations of errors that are tried: tilts, roll (rad), across, depth (mm), revolute (rad), prismatic
+    # (mm)
+    tried: tuple[float, ...] = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
+    # of a state that is wrong altogether, about each of its starts
+    wrong: tuple[float, ...] = (12 * DEG, 30 * DEG, 4.0, 8.0, 20 * DEG, 8.0)
+    # standard deviations of a refitted one, at most, for it to count
+    settled: tuple[float, ...] = (6 * DEG, 15 * DEG, 1.5, 4.0, 15 * DEG, 4.0)
+    # sizes that errors of the model alone may feign: no cone is a wrist
+    feigned: tuple[float, ...] = (0.35 * DEG, 2.3 * DEG, 0.3, 0.6, 3 * DEG, 1.0)
+    # of the errors tried, the least that is assumed of any parameter where those of another are large
+    min_share: float = 0.5
+    min_factor: float = 2.0  # times these, from which a size counts
+    em_steps: int = 200
+    max_estimated: int = 30  # states from which sizes are estimated
+    bad_mads: float = 6.0  # median absolute deviations, and more than the median, from which a state is bad
+    bad_misfit: float = 0.08
+    bad_weight: float = 0.02
+    large_sds: float = 1.8  # root mean square of a correction in standard deviations
+    max_usual_misfit: float = 0.25  # median, above which colours do not show the instrument
+    max_misfit: float = 0.4  # from which a state is wrong even where nothing explains it better
+    better: float = 0.75  # share of the misfit, below which another start is right
+    n_others: int = 4  # states of other moments that are tried
+    width_px: int = 320  # of the images compared
+    min_states: int = 8  # with fewer, nothing is said about them
+
+
+STATES = OutlineStatesSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,7 +69,7 @@ class FoundStates:
 
 
 def sds_of(sizes: tuple[float, ...], slides: np.ndarray) -> np.ndarray:
-    """Standard deviations [6 + R] of sizes as TRIED has them."""
+    """Standard deviations [6 + R] of sizes as `tried` has them."""
     tilt, roll, across, depth, turn, slide = sizes
     return np.append([tilt, tilt, roll, across, across, depth], np.where(slides, slide, turn))
 
@@ -78,18 +79,18 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
 
     expected [6 + R]: standard deviations of the recorded states; slides [R]: which readings are of prismatic joints.
     """
-    tried = np.maximum(expected, sds_of(TRIED, slides))
-    few = take(views, np.array(evenly_spaced(len(views.poses), MAX_ESTIMATED)))
+    tried = np.maximum(expected, sds_of(STATES.tried, slides))
+    few = take(views, np.array(evenly_spaced(len(views.poses), STATES.max_estimated)))
     first = _fit(few, tried)
-    if np.median(first.misfits) > MAX_USUAL_MISFIT:
+    if np.median(first.misfits) > STATES.max_usual_misfit:
         return None
     found = error_sizes(first, expected)
-    large = bool((found > MIN_FACTOR * sds_of(FEIGNED, slides)).any())
+    large = bool((found > STATES.min_factor * sds_of(STATES.feigned, slides)).any())
     if not large and not _bad(first).any():
         return None
     sds = expected
     if large:  # parameters that make up for each other must not hold each other
-        sds = np.maximum(np.maximum(found, MIN_SHARE * sds_of(TRIED, slides)), expected)
+        sds = np.maximum(np.maximum(found, STATES.min_share * sds_of(STATES.tried, slides)), expected)
     states = _with_inconsistent(_fit(views, sds, first), sds, slides, large=large)
     return states if large or states.inconsistent.any() else None
 
@@ -105,10 +106,10 @@ def register_states(views: TrainingViews, refinement: Refinement, instruments: S
     count = len(refinement.frames_of_instant)
     if len(instruments) != 1 or not all(frame.camera.is_pinhole for frame in frames):
         return False
-    if tree is None or instruments[0].unrecorded or len(sizes) > 1 or count < MIN_STATES:
+    if tree is None or instruments[0].unrecorded or len(sizes) > 1 or count < STATES.min_states:
         return False
     (instrument,) = instruments
-    scale = min(1.0, WIDTH_PX / frames[0].camera.width)
+    scale = min(1.0, STATES.width_px / frames[0].camera.width)
     small = views if scale == 1.0 else views.scaled(scale)
     cameras = [frame.camera for frame in small.frames]
     firsts = [frames[shown[0]].state.instruments[instrument.name] for shown in refinement.frames_of_instant]
@@ -157,18 +158,18 @@ class _Fitted:
 def _fit(views: LinkViews, sds: np.ndarray, known: _Fitted | None = None) -> _Fitted:
     """Fit all states from those recorded; known: a fit of some of them, whose shape and base are where it begins."""
     problem = StatesProblem(views, np.tile(sds, (len(views.poses), 1)))
-    fit, softness, stages = problem.start(), FIRST_SOFTNESS, STAGES
+    fit, softness, stages = problem.start(), OUTLINES.first_softness, OUTLINES.stages
     if known is not None:
         fit = problem.turned_to_shaft(replace(fit, shared=known.fit.shared))
-        stages = STAGES[1:]
+        stages = OUTLINES.stages[1:]
         if len(views.poses) == len(known.problem.views.poses):
-            fit, softness, stages = replace(fit, own=known.fit.own), STAGES[-1][1], STAGES[-1:]
+            fit, softness, stages = replace(fit, own=known.fit.own), OUTLINES.stages[-1][1], OUTLINES.stages[-1:]
     for cell, next_softness, steps in stages:
         ratios = problem.learn_colors(fit, softness)
         cells = problem.cells(fit, ratios, cell, next_softness)
-        if softness < FIRST_SOFTNESS:  # wrong states do not count in the shape and the base
+        if softness < OUTLINES.first_softness:  # wrong states do not count in the shape and the base
             bad = _bad(_Fitted(problem, fit, ratios, cells, problem.misfits(fit, ratios)))
-            weights = np.where(bad, BAD_WEIGHT, 1.0)[views.state_of_view, None]
+            weights = np.where(bad, STATES.bad_weight, 1.0)[views.state_of_view, None]
             cells = replace(cells, weights=cells.weights * weights)
         fit = problem.turned_to_shaft(adjust(problem, fit, cells, steps))
         softness = next_softness
@@ -188,7 +189,7 @@ def error_sizes(found: _Fitted, sds: np.ndarray) -> np.ndarray:
     groups = [np.array(own) for own in ((0, 1), (2,), (3, 4), (5,), *((k,) for k in range(POSE, len(sds))))]
 
     sds = sds.copy()
-    for _ in range(EM_STEPS):
+    for _ in range(STATES.em_steps):
         covariance = np.linalg.inv(information + np.diag(sds**-2))
         mean = np.einsum("sij,sj->si", covariance, linear)
         second = (mean**2 + np.einsum("sii->si", covariance)).mean(0)
@@ -203,13 +204,15 @@ def _bad(found: _Fitted) -> np.ndarray:
     worst = np.zeros(len(problem.views.poses))
     np.maximum.at(worst, problem.views.state_of_view, found.misfits)
     off = worst - np.median(worst)
-    return np.asarray((off > max(BAD_MADS * 1.48 * float(np.median(np.abs(off))), BAD_MISFIT)) | _far(found))
+    return np.asarray(
+        (off > max(STATES.bad_mads * 1.48 * float(np.median(np.abs(off))), STATES.bad_misfit)) | _far(found)
+    )
 
 
 def _far(found: _Fitted) -> np.ndarray:
     """bool [S]: states that a fit moves far, in standard deviations of their priors."""
     size = np.sqrt(((found.fit.own / found.problem.sds) ** 2).mean(1))
-    return np.asarray(size > LARGE_SDS * max(1.0, 1.5 * float(np.median(size))))
+    return np.asarray(size > STATES.large_sds * max(1.0, 1.5 * float(np.median(size))))
 
 
 def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray, *, large: bool) -> FoundStates:
@@ -226,12 +229,14 @@ def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray, *, l
     good = np.flatnonzero(~inconsistent)
     worst = np.array([found.misfits[problem.views.state_of_view == s].max() for s in range(len(poses))])
     usual = worst[good]
-    limit = np.median(usual) + max(BAD_MADS * 1.48 * float(np.median(np.abs(usual - np.median(usual)))), BAD_MISFIT)
+    limit = np.median(usual) + max(
+        STATES.bad_mads * 1.48 * float(np.median(np.abs(usual - np.median(usual)))), STATES.bad_misfit
+    )
     for state in np.flatnonzero(inconsistent).tolist():
         trial = _from_starts(found, state, good, slides)
         best = trial.misfits.argmin()
-        if trial.misfits[best] > BETTER * worst[state]:  # nothing explains it much better
-            inconsistent[state] = worst[state] > MAX_MISFIT or far[state]
+        if trial.misfits[best] > STATES.better * worst[state]:  # nothing explains it much better
+            inconsistent[state] = worst[state] > STATES.max_misfit or far[state]
             continue
         own, values = trial.problem.corrected(trial.fit)
         poses[state], readings[state] = own[best], values[best]
@@ -240,7 +245,7 @@ def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray, *, l
             trial.problem.basis,
             trial.problem.root_from_camera[best],
         )
-        known = np.sqrt(np.diagonal(covariances[state])) < sds_of(SETTLED, slides)
+        known = np.sqrt(np.diagonal(covariances[state])) < sds_of(STATES.settled, slides)
         refitted[state] = trial.misfits[best] <= limit and bool(known.all())
     return FoundStates(
         large=large,
@@ -267,15 +272,15 @@ def _from_starts(found: _Fitted, state: int, good: np.ndarray, slides: np.ndarra
     )
     starts.append((there, np.array([bent[name] for name in names])))
     own_poses, own_readings = problem.corrected(found.fit)
-    others = _subproblem(found, view, own_poses[good], own_readings[good], sds_of(WRONG, slides))
+    others = _subproblem(found, view, own_poses[good], own_readings[good], sds_of(STATES.wrong, slides))
     ratios = np.broadcast_to(found.ratios[view], (len(good), *found.ratios.shape[1:]))
-    near = np.argsort(others.misfits(StatesFit(found.fit.shared, np.zeros_like(others.sds)), ratios))[:N_OTHERS]
+    near = np.argsort(others.misfits(StatesFit(found.fit.shared, np.zeros_like(others.sds)), ratios))[: STATES.n_others]
     starts += [(own_poses[good[k]], own_readings[good[k]]) for k in near]
     poses, values = (np.stack(part) for part in zip(*starts, strict=True))
-    trial = _subproblem(found, view, poses, values, sds_of(WRONG, slides))
+    trial = _subproblem(found, view, poses, values, sds_of(STATES.wrong, slides))
     ratios = np.broadcast_to(found.ratios[view], (len(starts), *found.ratios.shape[1:]))
     fit = StatesFit(found.fit.shared, np.zeros_like(trial.sds))
-    for cell, softness, steps in STAGES[:2]:
+    for cell, softness, steps in OUTLINES.stages[:2]:
         cells = trial.cells(fit, ratios, cell, softness)
         fit = adjust(trial, fit, cells, steps, shared=False)
     return _Fitted(trial, fit, ratios, cells, trial.misfits(fit, ratios))

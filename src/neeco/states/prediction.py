@@ -17,13 +17,23 @@ from neeco.capture.model import Frame, evenly_spaced
 from neeco.scene.state_corrections import MAX_ANCHORS, StateCorrections, kernel
 from neeco.states.refinement import Refinement
 
-N_BLOCKS = 6  # stretches of the recording, left out one after the other
-MIN_INSTANTS = 12
-MIN_EXPLAINED = 0.1  # share of the corrections' variance: independent errors reach 0.06 by chance
-LENGTHS = (0.5, 1.0, 2.0, 4.0)  # of the kernel, in units of features
-NOISES = (0.1, 0.3, 1.0, 3.0)  # variance of a single instant's correction over the kernel's
-JITTER = 1e-6
-MAX_DEVIATIONS = 8.0  # median absolute deviations of the corrections of states that were not wrong altogether
+
+@dataclass(frozen=True, kw_only=True)
+class PredictionSettings:
+    """Settings of the prediction."""
+
+    n_blocks: int = 6  # stretches of the recording, left out one after the other
+    min_instants: int = 12
+    min_explained: float = 0.1  # share of the corrections' variance: independent errors reach 0.06 by chance
+    lengths: tuple[float, float, float, float] = (0.5, 1.0, 2.0, 4.0)  # of the kernel, in units of features
+    # variance of a single instant's correction over the kernel's
+    noises: tuple[float, float, float, float] = (0.1, 0.3, 1.0, 3.0)
+    jitter: float = 1e-6
+    # median absolute deviations of the corrections of states that were not wrong altogether
+    max_deviations: float = 8.0
+
+
+PREDICTION = PredictionSettings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +58,7 @@ def predict_corrections(
         shown.setdefault(refinement.instants[frame], frame)
     order = sorted(shown, key=lambda instant: frames[shown[instant]].state.time)
     found: dict[str, Prediction] = {}
-    if len(order) < MIN_INSTANTS:
+    if len(order) < PREDICTION.min_instants:
         return found
     for index, name in enumerate(corrections.names):
         states = [frames[shown[instant]].state.instruments[name] for instant in order]
@@ -64,7 +74,7 @@ def predict_corrections(
         for part, places in parts.items():
             total = float(usual[places].sum())
             explained = 1 - float(residuals[places].sum()) / total if total else 0.0
-            found[part] = Prediction(explained=explained, applied=explained >= MIN_EXPLAINED)
+            found[part] = Prediction(explained=explained, applied=explained >= PREDICTION.min_explained)
             applied[places] = float(found[part].applied)
         learned, anchors = features[usual_rows], features[usual_rows]
         anchors = anchors[evenly_spaced(len(anchors), MAX_ANCHORS)]
@@ -82,18 +92,18 @@ def predict_corrections(
 def _consistent(rows: Tensor) -> Tensor:
     """Return which corrections [n] bool of `rows` [n, K] are none of a state that was wrong altogether."""
     off = (rows - rows.median(0).values).abs()
-    return (off <= MAX_DEVIATIONS * off.median(0).values.clamp_min(1e-9)).all(1)
+    return (off <= PREDICTION.max_deviations * off.median(0).values.clamp_min(1e-9)).all(1)
 
 
 def _best(features: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, float, float]:
     """Return what leaving out stretches of `rows` [n, K] gives: sums [K] of squares of their residuals from the
     prediction and from the mean, and the kernel's length and noise of the best prediction."""
-    block = torch.arange(len(rows)) * N_BLOCKS // len(rows)
-    left = [(block == number, block != number) for number in range(N_BLOCKS)]
+    block = torch.arange(len(rows)) * PREDICTION.n_blocks // len(rows)
+    left = [(block == number, block != number) for number in range(PREDICTION.n_blocks)]
     usual = torch.stack([(rows[out] - rows[rest].mean(0)).square().sum(0) for out, rest in left]).sum(0)
     tried = []
-    for length in LENGTHS:
-        for noise in NOISES:
+    for length in PREDICTION.lengths:
+        for noise in PREDICTION.noises:
             error = torch.zeros_like(usual)
             for out, rest in left:
                 mean = rows[rest].mean(0)
@@ -108,4 +118,6 @@ def _best(features: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, float, float]
 def _weights(features: Tensor, rows: Tensor, anchors: Tensor, length: float, noise: float) -> Tensor:
     """Return the weights [A, K] of kernels at `anchors` [A, F] that explain `rows` [n, K] (subset of regressors)."""
     own, across = kernel(anchors, anchors, length), kernel(anchors, features, length)
-    return torch.linalg.solve(across @ across.T + noise * own + JITTER * torch.eye(len(own)).to(own), across @ rows)
+    return torch.linalg.solve(
+        across @ across.T + noise * own + PREDICTION.jitter * torch.eye(len(own)).to(own), across @ rows
+    )

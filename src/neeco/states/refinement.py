@@ -35,13 +35,22 @@ STATE = (
 )  # tensors of a checkpoint, without the moments
 ON_CPU = ("frame_steps", "fitted", "verdicts", "error_scale")  # read in every step
 MM_PER_RAD = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
-MAX_SPEEDUP = 10.0  # of the learning rates where a pose is less certain than usual
-MIN_DEVIATION = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
-MEAN_DECAY = 0.4  # of the learning rates over a run: its mean
-MIN_SHARE = 0.05  # of a prior's standard deviations, that remain of a state's
-UNCORRECTED = 1.2  # times what was corrected: errors, as some remain that corrections do not explain
-MAX_NEIGHBOUR_S = 1.0  # s between instants whose unrecorded joints are similar
-MAX_VELOCITY_S = 0.5  # s between frames that velocities are taken from
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementLimits:
+    """Limits of corrections and of what is taken from neighbours in time."""
+
+    max_speedup: float = 10.0  # of the learning rates where a pose is less certain than usual
+    min_deviation: float = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
+    mean_decay: float = 0.4  # of the learning rates over a run: its mean
+    min_share: float = 0.05  # of a prior's standard deviations, that remain of a state's
+    uncorrected: float = 1.2  # times what was corrected: errors, as some remain that corrections do not explain
+    max_neighbour_s: float = 1.0  # s between instants whose unrecorded joints are similar
+    max_velocity_s: float = 0.5  # s between frames that velocities are taken from
+
+
+LIMITS = RefinementLimits()
 
 
 class Verdict(IntEnum):
@@ -145,7 +154,7 @@ class Refinement:
                 if stated is not None and reading in stated.joints_deg:
                     deviation = stated.joints_deg[reading]
                     own = deviation if slide else math.radians(deviation)
-                    self.joint_sd[instant, column] = max(own, MIN_DEVIATION)
+                    self.joint_sd[instant, column] = max(own, LIMITS.min_deviation)
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
             # multiplied where states are less certain than usual
@@ -223,7 +232,7 @@ class Refinement:
     @torch.no_grad()
     def set_deviations(self, index: int, deviations: Tensor) -> None:
         """Set the standard deviations [S] of `layout` (rad, mm) of the prior on the corrections of frame `index`."""
-        pose, joints = self._parts(deviations.clamp(min=MIN_DEVIATION))
+        pose, joints = self._parts(deviations.clamp(min=LIMITS.min_deviation))
         instant = self.instants[index]
         self.pose_sd[instant] = pose
         if self.readings:
@@ -256,16 +265,16 @@ class Refinement:
             return self.pose_sd.new_ones(3)
         config = self.config
         least = max(config.prior_rotation / config.rotation_rate, config.prior_translation / config.translation_rate)
-        taken = (MEAN_DECAY * steps >= least) & ~fitted
+        taken = (LIMITS.mean_decay * steps >= least) & ~fitted
         used, readings = taken.to(self.poses.device), self.learned[~self.unrecorded[self.learned]]
         poses, joints = self.poses[used] / self.pose_sd[used], self.joints[used] / self.joint_sd[used]
         parts = (poses[..., :3], poses[..., 3:], joints[:, readings])
         corrected = (self.config.frame_poses, self.config.frame_poses, self.config.frame_joints)
         shares = [
-            UNCORRECTED * part.square().mean().sqrt() if learned and part.numel() else part.new_ones(())
+            LIMITS.uncorrected * part.square().mean().sqrt() if learned and part.numel() else part.new_ones(())
             for part, learned in zip(parts, corrected, strict=True)
         ]
-        return torch.stack(shares).clamp(min=MIN_SHARE)
+        return torch.stack(shares).clamp(min=LIMITS.min_share)
 
     @torch.no_grad()
     def scale_deviations(self, shares: Tensor) -> None:
@@ -329,9 +338,9 @@ class Refinement:
             update = adam_update(leaf.grad, first, second, steps, (0.9, 0.99), 1e-12)
             rate = self.rates[name]
             if name == "poses":
-                rate = rate * (self.pose_sd[row] / self.camera_sigma).clamp(1, MAX_SPEEDUP)
+                rate = rate * (self.pose_sd[row] / self.camera_sigma).clamp(1, LIMITS.max_speedup)
             elif name == "joints":
-                rate = rate * (self.joint_sd[row] / self.usual_joint_sd).clamp(1, MAX_SPEEDUP)
+                rate = rate * (self.joint_sd[row] / self.usual_joint_sd).clamp(1, LIMITS.max_speedup)
             getattr(self, name)[row] -= decay * rate * update
         self._leaves = {}
 
@@ -430,7 +439,7 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
     """Return (instant of each frame, neighbours of each instant).
 
     Frames of one time and one set of poses show one instant. Its neighbours follow or precede it in the recording
-    within MAX_NEIGHBOUR_S; without any it is its own.
+    within `max_neighbour_s`; without any it is its own.
     """
     numbers: dict[tuple[object, ...], int] = {}
     shown: list[int] = []
@@ -440,7 +449,7 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
         number = numbers.setdefault((frame.state.time, *poses), len(numbers))
         times += [frame.state.time] if number == len(times) else []
         shown.append(number)
-    near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and abs(times[k] - t) < MAX_NEIGHBOUR_S] or [i]
+    near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and abs(times[k] - t) < LIMITS.max_neighbour_s] or [i]
             for i, t in enumerate(times)]  # fmt: skip
     return shown, near
 
@@ -458,7 +467,7 @@ def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual_sd
             turn = state.pose[:3, :3].detach().cpu().double().T @ camera[:3, :3]  # instrument_from_camera
             shifts = (turn.square() @ torch.tensor(stated.translation_mm, dtype=torch.float64).square()).sqrt()
             turns = torch.tensor(stated.rotation_deg, dtype=torch.float64).deg2rad()
-            priors[row, k] = torch.cat([turns, shifts]).clamp(min=MIN_DEVIATION).float()
+            priors[row, k] = torch.cat([turns, shifts]).clamp(min=LIMITS.min_deviation).float()
     return priors
 
 
@@ -478,7 +487,7 @@ def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tens
     for place, index in enumerate(order):
         before, after = frames[order[max(place - 1, 0)]], frames[order[min(place + 1, count - 1)]]
         elapsed = after.state.time - before.state.time
-        if not 0 < elapsed < MAX_VELOCITY_S:
+        if not 0 < elapsed < LIMITS.max_velocity_s:
             continue
         for k, name in enumerate(instruments):
             earlier, later = before.state.instruments[name].pose.double(), after.state.instruments[name].pose.double()

@@ -17,22 +17,36 @@ from neeco.scene import GaussianScene
 from neeco.states.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer
 from neeco.states.fitter import Fitter, StateFit
 from neeco.states.parameters import DEG, InstrumentParameters, StateParameters
-from neeco.states.refinement import MIN_DEVIATION, MM_PER_RAD, Refinement
+from neeco.states.refinement import LIMITS, MM_PER_RAD, Refinement
 
-# standard deviations of states by a robot's log and a rough base: of the shaft's tilt and roll (degrees), of the origin
-# across the view and in depth (mm), of joints (degrees)
-TILT, ROLL, ACROSS, DEPTH, JOINT = 2.0, 6.0, 0.4, 1.5, 4.0
-LARGEST = 1.5  # times them, of errors that are looked for
-USUAL = 0.15  # times them: a tracker's errors
-COMPARED = (0, 1, 3, 4)  # classes of errors that tell: a tracker's across the view are as large as a robot's
-N_ITERATIONS = 40  # of expectation maximisation
-KEPT_SHARE = 0.85  # of squared corrections that count, without the largest
-CORRELATION_PX = 100.0  # pixels that count as one observation, as the scene is still learned
-BEYOND_LIMITS = 0.5  # of the range of a joint's limits, by which readings may be off
-LEVELS, STEPS = (0.25, 0.5, 1.0), (4, 4, 4)
-N_SAMPLED = 16  # frames by which errors are sized
-LARGE = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
-SCALE = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
+
+@dataclass(frozen=True, kw_only=True)
+class SearchSettings:
+    """Settings of fits of training frames, and sizes of errors."""
+
+    # standard deviations of states by a robot's log and a rough base: of the shaft's tilt and roll (degrees), of the
+    # origin across the view and in depth (mm), of joints (degrees)
+    tilt: float = 2.0
+    roll: float = 6.0
+    across: float = 0.4
+    depth: float = 1.5
+    joint: float = 4.0
+    largest: float = 1.5  # times them, of errors that are looked for
+    usual: float = 0.15  # times them: a tracker's errors
+    # classes of errors that tell: a tracker's across the view are as large as a robot's
+    compared: tuple[int, int, int, int] = (0, 1, 3, 4)
+    n_iterations: int = 40  # of expectation maximisation
+    kept_share: float = 0.85  # of squared corrections that count, without the largest
+    correlation_px: float = 100.0  # pixels that count as one observation, as the scene is still learned
+    beyond_limits: float = 0.5  # of the range of a joint's limits, by which readings may be off
+    levels: tuple[float, float, float] = (0.25, 0.5, 1.0)
+    steps: tuple[int, int, int] = (4, 4, 4)
+    n_sampled: int = 16  # frames by which errors are sized
+    large: float = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
+    scale: float = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
+
+
+SEARCH = SearchSettings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +84,7 @@ class StateSearch:
                 _bounded(own, item) for own, item in zip(refinement.layout.instruments, scene.instruments, strict=True)
             )
         )
-        fitter = Fitter(InstrumentRenderer(scene), bounded, TissueRenderer(scene), CORRELATION_PX)
+        fitter = Fitter(InstrumentRenderer(scene), bounded, TissueRenderer(scene), SEARCH.correlation_px)
         return cls(scene, refinement, frames, fitter, shafts)
 
     @property
@@ -94,7 +108,9 @@ class StateSearch:
         where the fit leads out of the image."""
         given, precision = self.scene.recorded.states[index], self.precision(index, scale)
         start = start or self.state(index)
-        fit = self.fitter.fit(self.view(index, start), about or given, precision, start, levels=LEVELS, steps=STEPS)
+        fit = self.fitter.fit(
+            self.view(index, start), about or given, precision, start, levels=SEARCH.levels, steps=SEARCH.steps
+        )
         if fit is None:
             return None
         correction = self.refinement.layout.increments_between(about or given, fit.state)
@@ -122,21 +138,21 @@ class StateSearch:
         layout = self.refinement.layout
         for item, own, shaft in zip(self.scene.instruments, layout.instruments, self.shafts, strict=True):
             stated = self.frames[index].state.instruments[item.name].uncertainty
-            turns = scale * DEG * torch.tensor([TILT, TILT, ROLL], dtype=torch.float64)
-            shifts: Sequence[float] = (scale * ACROSS, scale * ACROSS, scale * DEPTH)
+            turns = scale * DEG * torch.tensor([SEARCH.tilt, SEARCH.tilt, SEARCH.roll], dtype=torch.float64)
+            shifts: Sequence[float] = (scale * SEARCH.across, scale * SEARCH.across, scale * SEARCH.depth)
             if stated is not None:
                 own_turns = torch.tensor(stated.rotation_deg, dtype=torch.float64).clamp(max=60).deg2rad()
                 turns, shifts = (_about(shaft).square() @ own_turns.square()).sqrt(), stated.translation_mm
             found += [*turns.tolist(), *shifts]
             for reading, slides in zip(own.joints, own.slides, strict=True):
                 limits = item.joints[reading] if reading in item.unrecorded else None
-                usual = scale * JOINT * DEG * (MM_PER_RAD if slides else 1.0)
+                usual = scale * SEARCH.joint * DEG * (MM_PER_RAD if slides else 1.0)
                 if limits is not None and limits[0] != limits[1]:
                     usual = (limits[1] - limits[0]) / 4
                 elif stated is not None and reading in stated.joints_deg:
                     usual = stated.joints_deg[reading] * (1.0 if slides else DEG)
                 found.append(usual)
-        return torch.tensor(found, dtype=torch.float64).clamp(min=MIN_DEVIATION)
+        return torch.tensor(found, dtype=torch.float64).clamp(min=LIMITS.min_deviation)
 
     def _axes(self, index: int) -> Tensor:
         """Return the rows [P, P] that take corrections to the axes of errors: tilt, tilt, roll, across, across, depth,
@@ -156,12 +172,12 @@ class StateSearch:
         """Return whether states have larger errors than a tracker's, which the recording states, or images show of all
         states but `outliers`, and set that: their corrections have a prior of such errors from then on."""
         stated, refinement = self.stated_scale(), self.refinement
-        scale = stated if stated > LARGE else self._size_of_errors(outliers)
-        if scale <= LARGE:
+        scale = stated if stated > SEARCH.large else self._size_of_errors(outliers)
+        if scale <= SEARCH.large:
             return False
         refinement.error_scale.fill_(scale)
         for index, *_ in refinement.frames_of_instant:
-            refinement.set_deviations(index, self.deviations(index, SCALE))
+            refinement.set_deviations(index, self.deviations(index, SEARCH.scale))
         return True
 
     def _size_of_errors(self, outliers: Sequence[int]) -> float:
@@ -169,10 +185,10 @@ class StateSearch:
         which may be wrong altogether."""
         fits = []
         usual = [index for index in range(len(self.frames)) if index not in outliers]
-        for index in (usual[place] for place in evenly_spaced(len(usual), N_SAMPLED)):
+        for index in (usual[place] for place in evenly_spaced(len(usual), SEARCH.n_sampled)):
             # states that were fitted before training are judged by what is left of their errors
             about = self.state(index) if self.refinement.fitted[index] else None
-            fit = self.fitted(index, LARGEST, about)
+            fit = self.fitted(index, SEARCH.largest, about)
             fits += [] if fit is None else [fit]
         return self.scale_of(fits) if len(fits) > 2 else 0.0
 
@@ -186,8 +202,8 @@ class StateSearch:
             back = torch.linalg.inv(self._axes(found.index)) * self._usual()
             weighed = (found.fit.information + found.precision) @ found.correction
             observed.append((back.T @ found.fit.information @ back, back.T @ weighed))
-        variances = torch.full((6,), USUAL**2, dtype=torch.float64)
-        for _ in range(N_ITERATIONS):
+        variances = torch.full((6,), SEARCH.usual**2, dtype=torch.float64)
+        for _ in range(SEARCH.n_iterations):
             prior = torch.diag(1 / variances[kind])
             covariances = [torch.linalg.inv(information + prior) for information, _ in observed]
             means = torch.stack([c @ most for c, (_, most) in zip(covariances, observed, strict=True)])
@@ -195,9 +211,9 @@ class StateSearch:
             for number in range(5):
                 each = squares[:, kind == number].flatten().sort().values
                 if len(each):
-                    variances[number] = each[: math.ceil(KEPT_SHARE * len(each))].mean()
+                    variances[number] = each[: math.ceil(SEARCH.kept_share * len(each))].mean()
         # without stated links, roll, depth and joints follow the errors of a hinge that is still rough
-        counted = COMPARED if self.linked else (0,)
+        counted = SEARCH.compared if self.linked else (0,)
         return float(variances[[number for number in counted if number in kinds]].sqrt().median())
 
     def stated_scale(self) -> float:
@@ -210,7 +226,9 @@ class StateSearch:
             return 0.0
         shares = torch.stack([self._deviations(index, 1.0) / self._usual() for index in stated]).median(0).values
         kinds = torch.tensor(self._kinds())
-        return float(torch.stack([shares[kinds == k].median() for k in COMPARED if bool((kinds == k).any())]).median())
+        return float(
+            torch.stack([shares[kinds == k].median() for k in SEARCH.compared if bool((kinds == k).any())]).median()
+        )
 
     def _kinds(self) -> list[int]:
         """Return the class of each correction: tilt 0, roll 1, across 2, depth 3, joints 4, unrecorded ones 5."""
@@ -223,8 +241,15 @@ class StateSearch:
         """Return usual errors [P] of a robot's states (rad, mm)."""
         found: list[float] = []
         for own in self.refinement.layout.instruments:
-            found += [TILT * DEG, TILT * DEG, ROLL * DEG, ACROSS, ACROSS, DEPTH]
-            found += [JOINT * DEG * (MM_PER_RAD if slides else 1.0) for slides in own.slides]
+            found += [
+                SEARCH.tilt * DEG,
+                SEARCH.tilt * DEG,
+                SEARCH.roll * DEG,
+                SEARCH.across,
+                SEARCH.across,
+                SEARCH.depth,
+            ]
+            found += [SEARCH.joint * DEG * (MM_PER_RAD if slides else 1.0) for slides in own.slides]
         return torch.tensor(found, dtype=torch.float64)
 
 
@@ -233,7 +258,7 @@ def _bounded(parameters: InstrumentParameters, instrument: Instrument) -> Instru
     ends = []
     for joint in parameters.joints:
         low, high = instrument.joints[joint] or (-math.inf, math.inf)
-        beyond = BEYOND_LIMITS * (high - low) if math.isfinite(high - low) else 0.0
+        beyond = SEARCH.beyond_limits * (high - low) if math.isfinite(high - low) else 0.0
         ends.append([low - beyond, high + beyond])
     bounds = torch.tensor(ends, dtype=torch.float64).reshape(-1, 2)
     return replace(parameters, low=bounds[:, 0], high=bounds[:, 1])

@@ -14,19 +14,30 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import Frame, State
 from neeco.states.crop_rendering import FrameView
 from neeco.states.fitter import StateFit, loose_prior
-from neeco.tracking.motion import MAX_GAP_S, MotionModel, MotionState
+from neeco.tracking.motion import MOTION, MotionModel, MotionState
 from neeco.tracking.parameters import TrackingFitter
 from neeco.tracking.search import Search
-from neeco.tracking.trust import NO_TRUST, WRONG_DEG, Judge, Reference, TrackTrust
+from neeco.tracking.trust import NO_TRUST, TRUST, Judge, Reference, TrackTrust
 
-UNUSUAL = 1.3  # times the usual misfit, above which another state is searched for
-BETTER = 0.85  # of such a fit's misfit, that the other must be below
-N_RECENT = 10  # frames whose median misfit is usual
-MIN_OVERLAP = 0.5  # of the label; below, the instruments are lost
-SEARCH_ROLLS_EVERY = 6  # frames between searches for other rolls, since drifting states may have small misfits
-GIVEN_PRIOR = (4.0, 4.0, 8.0)  # deg, mm, deg of joints: standard deviations of a given state
-SEARCH_EVERY_S = 0.2  # between searches anywhere
-LOW_TRUST, LOW_TRUST_SEARCH_EVERY_S = 0.5, 0.4  # trust below which a followed state is searched anywhere; between these
+
+@dataclass(frozen=True, kw_only=True)
+class FollowSettings:
+    """Settings of following states from frame to frame."""
+
+    unusual: float = 1.3  # times the usual misfit, above which another state is searched for
+    better: float = 0.85  # of such a fit's misfit, that the other must be below
+    n_recent: int = 10  # frames whose median misfit is usual
+    min_overlap: float = 0.5  # of the label; below, the instruments are lost
+    search_rolls_every: int = 6  # frames between searches for other rolls, since drifting states may have small misfits
+    # deg, mm, deg of joints: standard deviations of a given state
+    given_prior: tuple[float, float, float] = (4.0, 4.0, 8.0)
+    search_every_s: float = 0.2  # between searches anywhere
+    low_trust: float = 0.5  # trust below which a followed state is searched anywhere; between these
+    low_trust_search_every_s: float = 0.4
+
+
+FOLLOW = FollowSettings()
+
 
 NEVER = -1e9  # s
 
@@ -95,7 +106,7 @@ class Follower:
 
     def begin(self, frame: int, given: State) -> Step:
         """Return the first step from a state that is approximately known."""
-        prior = loose_prior(self.fitter.parameters, *GIVEN_PRIOR)
+        prior = loose_prior(self.fitter.parameters, *FOLLOW.given_prior)
         fit = self.fitter.fit(
             self._view(frame, given), given, prior, levels=(0.125, 0.25, 0.5, 1.0), steps=(3, 3, 3, 4)
         )
@@ -116,13 +127,13 @@ class Follower:
     def follow(self, before: Step, frame: int) -> Step:
         """Return the step of a frame next in time to that of `before`."""
         time = self.frames[frame].state.time
-        if before.how == "lost" and abs(time - before.found_at) > MAX_GAP_S:
+        if before.how == "lost" and abs(time - before.found_at) > MOTION.max_gap_s:
             return self._searched(before, frame, None)
         motion = self.motion.predict(before.motion, time - before.motion.state.time)
         predicted = replace(motion, state=replace(motion.state, time=time))
         view = self._view(frame, predicted.state)
         fit = self.fitter.fit(view, predicted.state, self.motion.precision(predicted), steps=(2, 4))
-        unusual = UNUSUAL * self._usual_misfit(before)
+        unusual = FOLLOW.unusual * self._usual_misfit(before)
         how: How = "followed"
         if fit is None or fit.misfit > unusual:
             other = self.search.near(view, predicted, [before.motion.state], unusual)
@@ -130,13 +141,13 @@ class Follower:
                 fit, how, predicted = other, "beside", self.motion.released(predicted)
         if fit is None:
             return self._searched(before, frame, view)
-        search_rolls = before.unsearched >= SEARCH_ROLLS_EVERY
+        search_rolls = before.unsearched >= FOLLOW.search_rolls_every
         trust, other = self.judge.judge(fit, search_rolls)
         if is_lost(trust):
             return self._searched(before, frame, view)
         unsearched = 0 if trust.single < 1 or other is not None or search_rolls else before.unsearched + 1
         if other is not None and other.gain > fit.gain:
-            prior = loose_prior(self.fitter.parameters, *GIVEN_PRIOR)
+            prior = loose_prior(self.fitter.parameters, *FOLLOW.given_prior)
             better = self.fitter.fit(view, other.state, prior, levels=(0.5, 1.0), steps=(3, 4))
             if better is not None and better.gain > fit.gain:
                 fit, how, predicted = better, "beside", self.motion.released(predicted)
@@ -144,7 +155,7 @@ class Follower:
         elif unsearched > 0:  # until the next search
             trust = replace(trust, single=before.trust.single)
         searched_at, motion = before.searched_at, self.motion.update(predicted, fit)
-        if trust.value < LOW_TRUST and abs(time - searched_at) >= LOW_TRUST_SEARCH_EVERY_S:
+        if trust.value < FOLLOW.low_trust and abs(time - searched_at) >= FOLLOW.low_trust_search_every_s:
             best, searched_at = self.search.anywhere(view), time
             if best is not None and _refutes(best, fit):
                 fit, how, motion = best, "found", self.motion.begin(replace(best.state, time=time), best.information)
@@ -155,8 +166,8 @@ class Follower:
             motion=motion,
             misfit=fit.misfit,
             gain=fit.gain,
-            trust=replace(trust, determined=self.motion.probability_within(motion, WRONG_DEG)),
-            recent=(*before.recent, fit.misfit)[-N_RECENT:],
+            trust=replace(trust, determined=self.motion.probability_within(motion, TRUST.wrong_deg)),
+            recent=(*before.recent, fit.misfit)[-FOLLOW.n_recent :],
             found_at=time,
             searched_at=searched_at,
             unsearched=unsearched,
@@ -165,7 +176,7 @@ class Follower:
     def _searched(self, before: Step, frame: int, view: FrameView | None) -> Step:
         """Return the step after a search anywhere; lost where that fails, or the last one was a moment ago."""
         time, searched_at = self.frames[frame].state.time, before.searched_at
-        if abs(time - searched_at) >= SEARCH_EVERY_S:
+        if abs(time - searched_at) >= FOLLOW.search_every_s:
             best, searched_at = self.search.anywhere(self._view(frame, None) if view is None else view), time
             if best is not None and (step := self._begun(frame, "found", best)).how != "lost":
                 return step
@@ -185,7 +196,7 @@ class Follower:
             motion=motion,
             misfit=fit.misfit,
             gain=fit.gain,
-            trust=replace(trust, determined=self.motion.probability_within(motion, WRONG_DEG)),
+            trust=replace(trust, determined=self.motion.probability_within(motion, TRUST.wrong_deg)),
             recent=(fit.misfit,),
             found_at=time,
             searched_at=time,
@@ -199,7 +210,7 @@ class Follower:
         usual = [self.judge.reference.misfit]
         if before.recent:
             usual.append(median(before.recent))
-            usual += [before.misfit] if before.unsearched < SEARCH_ROLLS_EVERY else []
+            usual += [before.misfit] if before.unsearched < FOLLOW.search_rolls_every else []
         return max(usual)
 
     def _view(self, frame: int, state: State | None) -> FrameView:
@@ -209,9 +220,9 @@ class Follower:
 def _refutes(other: StateFit, fit: StateFit) -> bool:
     """Return whether another fit leaves much less unexplained, and explains more of the image: an instrument that
     hardly shows in it leaves little unexplained, too."""
-    return other.misfit < BETTER * fit.misfit and other.gain > fit.gain
+    return other.misfit < FOLLOW.better * fit.misfit and other.gain > fit.gain
 
 
 def is_lost(trust: TrackTrust) -> bool:
     """Return whether a state is not that of the instruments."""
-    return trust.overlap < MIN_OVERLAP
+    return trust.overlap < FOLLOW.min_overlap

@@ -19,12 +19,24 @@ from neeco.capture.model import State
 from neeco.states.fitter import StateFit
 from neeco.tracking.parameters import TrackedParameters
 
-MIN_DIFFERENCES = 8  # second differences from which accelerations are estimated
+
+@dataclass(frozen=True, kw_only=True)
+class MotionSettings:
+    """Settings of the motion prior."""
+
+    min_differences: int = 8  # second differences from which accelerations are estimated
+    # deg, mm, deg and mm of joints: least second difference between frames
+    min_difference: tuple[float, float, float, float] = (0.05, 0.03, 0.1, 0.05)
+    # the same: standard deviations of a state just found
+    initial_sd: tuple[float, float, float, float] = (2.0, 2.0, 3.0, 1.0)
+    # the same: of a state that no image determines
+    unknown_sd: tuple[float, float, float, float] = (60.0, 30.0, 40.0, 10.0)
+    max_gap_s: float = 0.4  # for which a state is predicted; after a longer one it is searched for
+
+
+MOTION = MotionSettings()
+
 MAD_TO_SD = 1.4826  # standard deviation of a normal distribution, in median absolute deviations
-MIN_DIFFERENCE = (0.05, 0.03, 0.1, 0.05)  # deg, mm, deg and mm of joints: least second difference between frames
-INITIAL_SD = (2.0, 2.0, 3.0, 1.0)  # the same: standard deviations of a state just found
-UNKNOWN_SD = (60.0, 30.0, 40.0, 10.0)  # the same: of a state that no image determines
-MAX_GAP_S = 0.4  # for which a state is predicted; after a longer one it is searched for
 
 
 @dataclass(frozen=True)
@@ -59,9 +71,12 @@ class MotionModel:
             steps.append(parameters.increments_between(before, after) if consecutive else None)
         known = [step for step in steps if step is not None]
         differences = [b - a for a, b in pairwise(steps) if a is not None and b is not None]
-        if len(differences) < MIN_DIFFERENCES:
+        if len(differences) < MOTION.min_differences:
             differences = known
-        deviation, place = parameters.vector_from_degrees(*MIN_DIFFERENCE), parameters.vector_from_degrees(*INITIAL_SD)
+        deviation, place = (
+            parameters.vector_from_degrees(*MOTION.min_difference),
+            parameters.vector_from_degrees(*MOTION.initial_sd),
+        )
         if differences:
             deviation = torch.maximum(deviation, MAD_TO_SD * torch.stack(differences).abs().median(0).values)
         velocities = torch.diag((deviation if differences else place) / interval) ** 2
@@ -75,10 +90,10 @@ class MotionModel:
 
         information [P, P]: of the image on the state, little on jaws outside of it; None: as much as is usual.
         """
-        place = torch.diag(self.parameters.vector_from_degrees(*INITIAL_SD) ** 2)
+        place = torch.diag(self.parameters.vector_from_degrees(*MOTION.initial_sd) ** 2)
         if information is not None:
             place = place + torch.linalg.inv(
-                information + torch.diag(self.parameters.vector_from_degrees(*UNKNOWN_SD) ** -2)
+                information + torch.diag(self.parameters.vector_from_degrees(*MOTION.unknown_sd) ** -2)
             )
         return MotionState(state, torch.zeros_like(place[0]), torch.block_diag(place, self.velocities))
 
@@ -131,6 +146,6 @@ class MotionModel:
 
     def released(self, predicted: MotionState) -> MotionState:
         """Return a prediction without its prior, to be updated by a fit that the motion did not foresee."""
-        place = torch.diag(self.parameters.vector_from_degrees(*UNKNOWN_SD) ** 2)
+        place = torch.diag(self.parameters.vector_from_degrees(*MOTION.unknown_sd) ** 2)
         covariance = predicted.covariance + torch.block_diag(place, self.velocities)
         return MotionState(predicted.state, predicted.velocity, covariance)

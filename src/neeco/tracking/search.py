@@ -12,26 +12,36 @@ from neeco.capture.model import InstrumentState, State, evenly_spaced
 from neeco.geometry.camera import Camera
 from neeco.scene import Recorded
 from neeco.states.crop_rendering import FrameView
-from neeco.states.fitter import MARGIN_PX, StateFit, loose_prior
+from neeco.states.fitter import FIT, StateFit, loose_prior
 from neeco.states.parameters import DEG
 from neeco.tracking.motion import MotionModel, MotionState
 from neeco.tracking.parameters import TrackedParameters, TrackingFitter
 
-SHIFTS_MM = (-5.0, -2.5, 0.0, 2.5, 5.0)  # along the shaft: its teeth, rings and end hold a fit where it was
-ROLLS_DEG = (-8.0, 0.0, 8.0)
-N_SAMPLES = 48  # of the prediction
-PRIOR_SCALE = 3.0  # by which the prediction's standard deviations are widened
-N_FITTED_NEAR = 3  # starts near the prediction that are fitted
-ANYWHERE_PRIOR = (30.0, 30.0, 40.0)  # deg, mm, deg of joints
 
-N_RECORDED = 96  # recorded states tried
-N_STARTS = 6  # of them fitted
-N_TURNED = 3  # of the best one with other rolls and joints
-N_FINALISTS = 2  # fitted at full size
-APART_MM, APART_DEG, APART_JOINT_DEG = 8.0, 15.0, 15.0  # closer states lead to the same fit
-OTHER_ROLLS_DEG = (-90.0, -60.0, -40.0, -25.0, 25.0, 40.0, 60.0, 90.0, 180.0)
-OTHER_JOINTS_DEG = (-15.0, 15.0)
-MM_PER_DEG = 0.25  # of prismatic joints, wherever a number of degrees is asked for
+@dataclass(frozen=True, kw_only=True)
+class TrackSearchSettings:
+    """Settings of searches from afar."""
+
+    # along the shaft: its teeth, rings and end hold a fit where it was
+    shifts_mm: tuple[float, ...] = (-5.0, -2.5, 0.0, 2.5, 5.0)
+    rolls_deg: tuple[float, float, float] = (-8.0, 0.0, 8.0)
+    n_samples: int = 48  # of the prediction
+    prior_scale: float = 3.0  # by which the prediction's standard deviations are widened
+    n_fitted_near: int = 3  # starts near the prediction that are fitted
+    anywhere_prior: tuple[float, float, float] = (30.0, 30.0, 40.0)  # deg, mm, deg of joints
+    n_recorded: int = 96  # recorded states tried
+    n_starts: int = 6  # of them fitted
+    n_turned: int = 3  # of the best one with other rolls and joints
+    n_finalists: int = 2  # fitted at full size
+    apart_mm: float = 8.0  # closer states lead to the same fit
+    apart_deg: float = 15.0
+    apart_joint_deg: float = 15.0
+    other_rolls_deg: tuple[float, ...] = (-90.0, -60.0, -40.0, -25.0, 25.0, 40.0, 60.0, 90.0, 180.0)
+    other_joints_deg: tuple[float, float] = (-15.0, 15.0)
+    mm_per_deg: float = 0.25  # of prismatic joints, wherever a number of degrees is asked for
+
+
+SEARCH = TrackSearchSettings()
 
 
 @dataclass(frozen=True)
@@ -60,17 +70,17 @@ class Search:
             for k in range(len(parameters.instruments)):
                 tried += [
                     parameters.moved(base, parameters.along(k, shift, roll * DEG))
-                    for shift in SHIFTS_MM
-                    for roll in ROLLS_DEG
+                    for shift in SEARCH.shifts_mm
+                    for roll in SEARCH.rolls_deg
                 ]
         size, generator = parameters.size, torch.Generator().manual_seed(0)
         root = torch.linalg.cholesky(predicted.covariance[:size, :size])
-        normal = torch.randn(N_SAMPLES, size, generator=generator, dtype=torch.float64)
+        normal = torch.randn(SEARCH.n_samples, size, generator=generator, dtype=torch.float64)
         tried += [parameters.moved(predicted.state, increments) for increments in normal @ root.T]
-        precision = self.motion.precision(predicted) / PRIOR_SCALE**2
+        precision = self.motion.precision(predicted) / SEARCH.prior_scale**2
         best: StateFit | None = None
-        crop = self.fitter.crop_around(view, predicted.state, 2 * MARGIN_PX)
-        for start in self.fitter.ranked(view if crop is None else crop, tried, 0.25)[:N_FITTED_NEAR]:
+        crop = self.fitter.crop_around(view, predicted.state, 2 * FIT.margin_px)
+        for start in self.fitter.ranked(view if crop is None else crop, tried, 0.25)[: SEARCH.n_fitted_near]:
             fit = self.fitter.fit(view, predicted.state, precision, start, levels=(0.25, 0.5), steps=(4, 4))
             if fit is not None and (best is None or fit.gain > best.gain):
                 best = fit
@@ -85,15 +95,17 @@ class Search:
 
         None where no state explains the image better than the tissue alone.
         """
-        fitter, prior = self.fitter, loose_prior(self.fitter.parameters, *ANYWHERE_PRIOR)
-        starts = self._different(fitter.ranked(view, self.recorded_states(view.camera), 0.125), N_STARTS)
+        fitter, prior = self.fitter, loose_prior(self.fitter.parameters, *SEARCH.anywhere_prior)
+        starts = self._different(fitter.ranked(view, self.recorded_states(view.camera), 0.125), SEARCH.n_starts)
         fits = [fitter.fit(view, state, prior, levels=(0.125, 0.25), steps=(6, 4)) for state in starts]
         found = _by_gain(fits)
         if found:
-            others = self._different(fitter.ranked(view, self.turned(found[0].state), 0.25), N_TURNED)
+            others = self._different(fitter.ranked(view, self.turned(found[0].state), 0.25), SEARCH.n_turned)
             fits = [fitter.fit(view, state, prior, levels=(0.25,), steps=(6,)) for state in others]
             found = _by_gain([*found, *fits])
-        last = [fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4)) for fit in found[:N_FINALISTS]]
+        last = [
+            fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4)) for fit in found[: SEARCH.n_finalists]
+        ]
         best = _by_gain(last)
         return best[0] if best and best[0].gain > 0 else None
 
@@ -101,7 +113,7 @@ class Search:
         """Return recorded states, moved so that `camera` observes them as their own cameras did."""
         recorded, world = self.recorded, camera.world_from_camera.double().cpu()
         states = []
-        for k in evenly_spaced(len(recorded.states), N_RECORDED):
+        for k in evenly_spaced(len(recorded.states), SEARCH.n_recorded):
             carry = world @ torch.linalg.inv(recorded.cameras[k].world_from_camera.double().cpu())
             instruments = {
                 name: InstrumentState(carry @ given.pose.double().cpu(), given.joints)
@@ -116,13 +128,13 @@ class Search:
         for k, item in enumerate(parameters.instruments):
             given = state.instruments[item.name].joints
             values = [given[name] for name in item.joints]
-            for roll in (0.0, *OTHER_ROLLS_DEG):
+            for roll in (0.0, *SEARCH.other_rolls_deg):
                 rolled = parameters.moved(state, parameters.along(k, roll=roll * DEG))
                 found += [rolled] if roll else []
                 for j, slides in enumerate(item.slides):
-                    for change in OTHER_JOINTS_DEG:
+                    for change in SEARCH.other_joints_deg:
                         moved = [*values]
-                        moved[j] += change * (MM_PER_DEG if slides else DEG)
+                        moved[j] += change * (SEARCH.mm_per_deg if slides else DEG)
                         found.append(parameters.with_joints(rolled, k, moved))
         return found
 
@@ -130,7 +142,7 @@ class Search:
         """Return the first `count` states that lead to different fits."""
         chosen: list[State] = []
         for state in states:
-            limits = APART_DEG, APART_JOINT_DEG, APART_MM
+            limits = SEARCH.apart_deg, SEARCH.apart_joint_deg, SEARCH.apart_mm
             if all(differ(self.fitter.parameters, state, other, *limits) for other in chosen):
                 chosen.append(state)
             if len(chosen) == count:
@@ -153,7 +165,7 @@ def differ(
     """Return whether two states differ by more than `degrees` of rotation, `millimetres`, or `joint_degrees`."""
     apart = parameters.increments_between(one, other)
     for item, (pose, rows) in zip(parameters.instruments, parameters.rows, strict=True):
-        units = torch.tensor([MM_PER_DEG if slides else DEG for slides in item.slides], dtype=torch.float64)
+        units = torch.tensor([SEARCH.mm_per_deg if slides else DEG for slides in item.slides], dtype=torch.float64)
         turned, shifted = float(apart[pose][:3].norm()) / DEG, float(apart[pose][3:].norm())
         if turned > degrees or shifted > millimetres or bool((apart[rows].abs() > joint_degrees * units).any()):
             return True

@@ -28,7 +28,7 @@ from neeco.capture.writer import fingerprint, write_capture
 from neeco.scene import Recorded
 from neeco.scene.io import save_scene
 from neeco.synthesis.mixing import merged_scene
-from neeco.tracking.follow import SEARCH_ROLLS_EVERY, Follower, Step
+from neeco.tracking.follow import FOLLOW, Follower, Step
 from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.trust import Reference
 from neeco.training.run import SCENE_FILE, scene_digest, stored_config, write_config
@@ -42,12 +42,22 @@ INFO = "track.json"
 STEPS = "steps"  # the folder of finished steps, removed at the end
 PAGE = "track.html"
 RUN = "run"  # the folder of the run with which footage over another tissue was tracked
-OTHER_TISSUE_MISFIT = 3.0  # of instruments over another run's tissue, times that over their own
-MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
-MIN_TRUSTED_SHARE = 0.5  # of the frames, below which the result is DOUBTFUL
-CERTAIN = 0.8  # trust with which following begins at once
-N_BEGINNINGS = 8  # frames in which the instruments are searched for, until one is CERTAIN
-FOLLOW_AGAIN = 0.7  # trust below which a stretch is followed once more, from its far end
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackSettings:
+    """Thresholds of tracks."""
+
+    other_tissue_misfit: float = 3.0  # of instruments over another run's tissue, times that over their own
+    min_trust: float = 0.5  # of a frame's state, below which the frame is left out
+    min_trusted_share: float = 0.5  # of the frames, below which the result is DOUBTFUL
+    certain: float = 0.8  # trust with which following begins at once
+    n_beginnings: int = 8  # frames in which the instruments are searched for, until one is certain
+    follow_again: float = 0.7  # trust below which a stretch is followed once more, from its far end
+
+
+TRACK = TrackSettings()
+
 LEARN_TISSUE = "`neeco train --method 3dgs FOOTAGE --output RUN2`, then `neeco track RUN FOOTAGE --tissue RUN2`"
 
 Start = Literal["first", "none"]
@@ -79,7 +89,7 @@ class Tracked:
         typical = median(record["trust"]["value"] for record in self.records)
         found = f"trust is {typical:.2f} in the median"
         found += f", and in {missing} of {count} frames nothing was found" if missing else ""
-        if self.written < MIN_TRUSTED_SHARE * count:
+        if self.written < TRACK.min_trusted_share * count:
             return f"DOUBTFUL: {found}; is it the run's instrument, over its tissue?"
         return f"{'good' if self.written == count else 'usable'}: {found}"
 
@@ -100,7 +110,7 @@ def track_footage(
     *,
     start: Start = "none",
     tissue: GaussianRun | None = None,
-    min_trust: float = MIN_TRUST,
+    min_trust: float = TRACK.min_trust,
     resume: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Tracked:
@@ -144,7 +154,7 @@ def track_footage(
             fitter, allowance = fitter_of(run.scene), 1.0
             reference = Reference.of(fitter, trained_on.split("train"))
             if tissue is not None:
-                fitter, allowance = fitter_of(scene), OTHER_TISSUE_MISFIT
+                fitter, allowance = fitter_of(scene), TRACK.other_tissue_misfit
             follower = Follower.of(frames, fitter, reference, allowance)
             steps = StepFiles(output / STEPS, follower, on_progress).all_steps(given)
             records = [_record(frames[k], step, parameters) for k, step in enumerate(steps)]
@@ -223,10 +233,10 @@ class StepFiles:
     def _beginning(self) -> Step:
         """Return the first step: the most trusted of a few frames spread over the footage."""
         count, found = len(self.follower.frames), []
-        spread = [k * count // N_BEGINNINGS for k in range(N_BEGINNINGS)]
+        spread = [k * count // TRACK.n_beginnings for k in range(TRACK.n_beginnings)]
         for frame in dict.fromkeys(spread):
             found.append(self._step(f"find-{frame}", partial(self.follower.find, frame)))
-            if found[-1].trust.value >= CERTAIN:
+            if found[-1].trust.value >= TRACK.certain:
                 break
         return max(found, key=lambda step: step.trust.value)
 
@@ -237,14 +247,14 @@ class StepFiles:
         """
         before: Step | None = None
         for frame in range(len(steps) - 1, -1, -1):
-            if steps[frame].trust.value >= FOLLOW_AGAIN:
+            if steps[frame].trust.value >= TRACK.follow_again:
                 before = steps[frame]
                 continue
             if before is None:
                 continue
             if before is steps.get(frame + 1):  # its motion was learned the other way
                 before = replace(before, motion=self.follower.motion.begin(before.motion.state))
-            before = self._follow("again", replace(before, unsearched=SEARCH_ROLLS_EVERY), frame)
+            before = self._follow("again", replace(before, unsearched=FOLLOW.search_rolls_every), frame)
             if before.trust.value > steps[frame].trust.value:
                 steps[frame] = before
 

@@ -37,23 +37,35 @@ from neeco.states.parameters import DEG
 from neeco.tracking.parameters import TrackedInstrument, TrackingFitter
 from neeco.tracking.search import Search, differ
 
-N_REFERENCE_FRAMES = 16  # training frames that tell usual misfits
-USUAL_QUANTILE = 0.9  # of their misfits
-MIN_MISFIT = 0.08  # smaller ones count as much: about 4 of 255 grey levels
-MIN_ERROR = 0.012  # the same, of a pixel's colour in [0, 1]
-HALF_TRUST_MISFIT = 4.0  # times the usual one, where `explained` is 1/2
-STEEPNESS = 4.0
-HALVING_DEG = 8.0  # from the nearest recorded direction: the misfit must be half as large, since the scene is a guess
-MIN_OBSERVED = 0.9  # of the share in the worst reference frame, that counts as fully observed
-CONFIDENT = 0.9  # product of the other factors below which another state is searched for
-N_OTHERS_FITTED = 2
-OTHER_PRIOR = (20.0, 5.0, 20.0)  # deg, mm, deg of joints: standard deviations of the other state
-OTHER_LEVELS = ((0.25, 4), (0.5, 2))  # sizes of the images compared, and steps at each
-MAX_OTHER_MISFIT = 2.0  # times that of the fit: of states that are not fitted further
-OTHER_DEG, OTHER_JOINT_DEG = 10.0, 8.0  # closer states are the same
-MISFIT_RATIOS = (1.3, 1.0)  # of another state: where `single` is 1, and where it is lowest
-AMBIGUOUS = 0.6  # by which it is lowered there
-WRONG_DEG = 10.0  # error of rotation or a joint with which a state is wrong
+
+@dataclass(frozen=True, kw_only=True)
+class TrackTrustSettings:
+    """Settings of the trust in tracked states."""
+
+    n_reference_frames: int = 16  # training frames that tell usual misfits
+    usual_quantile: float = 0.9  # of their misfits
+    min_misfit: float = 0.08  # smaller ones count as much: about 4 of 255 grey levels
+    min_error: float = 0.012  # the same, of a pixel's colour in [0, 1]
+    half_trust_misfit: float = 4.0  # times the usual one, where `explained` is 1/2
+    steepness: float = 4.0
+    # from the nearest recorded direction: the misfit must be half as large, since the scene is a guess
+    halving_deg: float = 8.0
+    min_observed: float = 0.9  # of the share in the worst reference frame, that counts as fully observed
+    confident: float = 0.9  # product of the other factors below which another state is searched for
+    n_others_fitted: int = 2
+    # deg, mm, deg of joints: standard deviations of the other state
+    other_prior: tuple[float, float, float] = (20.0, 5.0, 20.0)
+    # sizes of the images compared, and steps at each
+    other_levels: tuple[tuple[float, int], tuple[float, int]] = ((0.25, 4), (0.5, 2))
+    max_other_misfit: float = 2.0  # times that of the fit: of states that are not fitted further
+    other_deg: float = 10.0  # closer states are the same
+    other_joint_deg: float = 8.0
+    misfit_ratios: tuple[float, float] = (1.3, 1.0)  # of another state: where `single` is 1, and where it is lowest
+    ambiguous: float = 0.6  # by which it is lowered there
+    wrong_deg: float = 10.0  # error of rotation or a joint with which a state is wrong
+
+
+TRUST = TrackTrustSettings()
 
 
 @dataclass(frozen=True)
@@ -132,7 +144,7 @@ class Reference:
     """Typical misfit and errors of the scene in frames that it was learned from."""
 
     errors: TypicalErrors
-    misfit: float  # the USUAL_QUANTILE of theirs
+    misfit: float  # the usual_quantile of theirs
     observed: float  # share of the label's pixels, in the worst of them
 
     @classmethod
@@ -143,7 +155,7 @@ class Reference:
         states = dict(zip(recorded.names, recorded.states, strict=True))
         prior = loose_prior(fitter.parameters, 2.0, 2.0, 4.0)
         judged, misfits, shares = [], [], []
-        for k in evenly_spaced(len(frames), N_REFERENCE_FRAMES):
+        for k in evenly_spaced(len(frames), TRUST.n_reference_frames):
             start = states.get(frames[k].name, frames[k].state)
             fit = fitter.fit(fitter.view(frames[k], start), start, prior)
             if fit is None:
@@ -155,8 +167,8 @@ class Reference:
         if not misfits:
             raise NeecoError("track: no training frame of the run shows an instrument; train it again")
         typical = typical_errors_of(judged)
-        errors = TypicalErrors(max(MIN_ERROR, typical.inside), max(MIN_ERROR, typical.nearby))
-        return cls(errors, max(MIN_MISFIT, float(np.quantile(misfits, USUAL_QUANTILE))), min(shares))
+        errors = TypicalErrors(max(TRUST.min_error, typical.inside), max(TRUST.min_error, typical.nearby))
+        return cls(errors, max(TRUST.min_misfit, float(np.quantile(misfits, TRUST.usual_quantile))), min(shares))
 
     def to_json(self) -> dict[str, float]:
         """Return plain values for files."""
@@ -218,31 +230,31 @@ class Judge:
         neighbourhood = SETTINGS.neighbourhood * view.diagonal / math.hypot(view.camera.width, view.camera.height)
         overlap = estimate_trust(drawing, view.image, view.weight > 0, self.reference.errors, neighbourhood).value
         beyond = self.directions.beyond(fit.state, view.camera)
-        half = HALF_TRUST_MISFIT * self.allowance * self.reference.misfit / (1 + beyond / HALVING_DEG)
-        explained = 1 / (1 + (fit.misfit / half) ** STEEPNESS)
-        observed = min(1.0, drawing.observed_share / (MIN_OBSERVED * self.reference.observed))
+        half = TRUST.half_trust_misfit * self.allowance * self.reference.misfit / (1 + beyond / TRUST.halving_deg)
+        explained = 1 / (1 + (fit.misfit / half) ** TRUST.steepness)
+        observed = min(1.0, drawing.observed_share / (TRUST.min_observed * self.reference.observed))
         trust = TrackTrust(overlap, explained, observed, 1.0)
-        if not search_rolls and trust.value >= CONFIDENT:
+        if not search_rolls and trust.value >= TRUST.confident:
             return trust, None
         other = self._other(fit)
-        highest, lowest = MISFIT_RATIOS
+        highest, lowest = TRUST.misfit_ratios
         ratio = highest if other is None else other.misfit / max(fit.misfit, 1e-9)
         taken = min(1.0, max(0.0, (ratio - highest) / (lowest - highest)))
-        return replace(trust, single=1 - AMBIGUOUS * taken), other
+        return replace(trust, single=1 - TRUST.ambiguous * taken), other
 
     def _other(self, fit: StateFit) -> StateFit | None:
         """Return the best fit, at half size, of a state that differs."""
         parameters, best, view = self.fitter.parameters, None, fit.view
-        prior = loose_prior(parameters, *OTHER_PRIOR)
-        for state in self.fitter.ranked(view, self.search.turned(fit.state), 0.25)[:N_OTHERS_FITTED]:
+        prior = loose_prior(parameters, *TRUST.other_prior)
+        for state in self.fitter.ranked(view, self.search.turned(fit.state), 0.25)[: TRUST.n_others_fitted]:
             found: StateFit | None = None
-            for level, steps in OTHER_LEVELS:
+            for level, steps in TRUST.other_levels:
                 start = state if found is None else found.state
                 found = self.fitter.fit(view, state, prior, start, levels=(level,), steps=(steps,))
                 if (
                     found is None
-                    or found.misfit > MAX_OTHER_MISFIT * fit.misfit
-                    or not differ(parameters, found.state, fit.state, OTHER_DEG, OTHER_JOINT_DEG)
+                    or found.misfit > TRUST.max_other_misfit * fit.misfit
+                    or not differ(parameters, found.state, fit.state, TRUST.other_deg, TRUST.other_joint_deg)
                 ):
                     found = None
                     break

@@ -18,7 +18,7 @@ from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated_fit import (
-    WIDTHS_PX,
+    LINKED_FIT,
     ArticulatedFit,
     ArticulatedProblem,
     contours_of,
@@ -29,8 +29,7 @@ from neeco.ingest.registration.articulated_fit import (
     with_pose_errors,
 )
 from neeco.ingest.registration.base import (
-    MIN_FRAMES,
-    N_BLOCKS,
+    BASES,
     BaseRegistration,
     Prior,
     in_camera,
@@ -39,26 +38,40 @@ from neeco.ingest.registration.base import (
     too_few_shafts,
     unmoved,
 )
-from neeco.ingest.registration.layers import EXCHANGED_SHARES
-from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S, BasePrior
+from neeco.ingest.registration.layers import LAYERS
+from neeco.ingest.registration.silhouette_fit import RIGID_FIT, BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
 from neeco.ingest.registration.silhouette_search import distance_to, search_bases
 from neeco.states.outline_model import ArticulatedModel, bends, joint_values, with_motion
 
-START_FRAMES, FIT_FRAMES = 16, 48  # on which starts are compared, and that the result is fitted to
-ALONG_MM = (-10.0, -5.0, 5.0, 10.0)  # starts along the shaft
-ROLLS_RAD = (-0.25, 0.25)  # starts turned about it
-N_REFINED = 3  # starts that are fitted to all frames
-APART_MM, APART_RAD = 3.0, 0.035  # between results that count as different
-# added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
-FLOOR_MM, FLOOR_DEPTH_MM, FLOOR_DEG = 0.25, 0.35, 0.25
-SCATTER = 1.3  # factor on standard deviations; assumed, as the floors are: few recordings were measured
-USUAL_OVERLAP, MIN_GAIN = 0.85, 0.1  # of the silhouette with the masks, and by which another base betters the stated
-LEAST_OVERLAP, MAX_RESIDUAL_PX = 0.4, 2.5  # beyond, nothing is found
-REVERSED_SHARE = 0.8  # of the cost, from which a joint counts as reversed
-MIN_EXCHANGED = 1.25  # times the cost, with poses of other moments
-MAX_SDS = 3.2  # from its prior, by which a stated length or angle, or the base, may be off
-MAX_SHIFT_SDS = 3.5  # of the base's prior
+
+@dataclass(frozen=True, kw_only=True)
+class ArticulatedSettings:
+    """Settings of the search for a base by links."""
+
+    start_frames: int = 16  # on which starts are compared, and that the result is fitted to
+    fit_frames: int = 48
+    along_mm: tuple[float, float, float, float] = (-10.0, -5.0, 5.0, 10.0)  # starts along the shaft
+    rolls_rad: tuple[float, float] = (-0.25, 0.25)  # starts turned about it
+    n_refined: int = 3  # starts that are fitted to all frames
+    apart_mm: float = 3.0  # between results that count as different
+    apart_rad: float = 0.035
+    # added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
+    floor_mm: float = 0.25
+    floor_depth_mm: float = 0.35
+    floor_deg: float = 0.25
+    scatter: float = 1.3  # factor on standard deviations; assumed, as the floors are: few recordings were measured
+    usual_overlap: float = 0.85  # of the silhouette with the masks, and by which another base betters the stated
+    min_gain: float = 0.1
+    least_overlap: float = 0.4  # beyond, nothing is found
+    max_residual_px: float = 2.5
+    reversed_share: float = 0.8  # of the cost, from which a joint counts as reversed
+    min_exchanged: float = 1.25  # times the cost, with poses of other moments
+    max_sds: float = 3.2  # from its prior, by which a stated length or angle, or the base, may be off
+    max_shift_sds: float = 3.5  # of the base's prior
+
+
+LINKED = ArticulatedSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,7 +91,7 @@ class ArticulatedMotion:
             return False
         values = joint_values(self.tree, readings)
         values = values[np.isfinite(values).all(1)]
-        return len(values) >= MIN_FRAMES and bends(self.tree, values)
+        return len(values) >= BASES.min_frames and bends(self.tree, values)
 
 
 def find_articulated_base(
@@ -99,19 +112,25 @@ def find_articulated_base(
     instrument nor key, where the foreground is not the instrument.
     """
     problem = problem_of(
-        masks, intrinsics, camera_from_world, motion, prior, hidden=hidden, sd_clock=0.0 if clock_known else CLOCK_SD_S
+        masks,
+        intrinsics,
+        camera_from_world,
+        motion,
+        prior,
+        hidden=hidden,
+        sd_clock=0.0 if clock_known else RIGID_FIT.clock_sd_s,
     )
     if problem is None:
         raise NeecoError(
-            f"poses, readings and what moves are there together in fewer than {MIN_FRAMES} frames; give the transform "
-            "exactly, or a recording that shows more of it"
+            f"poses, readings and what moves are there together in fewer than {BASES.min_frames} frames; give the "
+            "transform exactly, or a recording that shows more of it"
         )
     if prior is None:
         fits = _explaining(problem, unknown_starts(problem, seed))
     else:
         fits = _explaining(problem, known_starts(problem))
     reached = overlap(problem, fits[0]) if fits else 0.0
-    if prior is not None and reached < USUAL_OVERLAP and (words := _elsewhere(problem, reached, seed)):
+    if prior is not None and reached < LINKED.usual_overlap and (words := _elsewhere(problem, reached, seed)):
         raise NeecoError(words)
     if not fits:
         raise NeecoError(unmoved(stated=prior is not None, linked=True))
@@ -122,7 +141,7 @@ def _explaining(problem: ArticulatedProblem, starts: list[np.ndarray]) -> list[A
     """Fits from different starts, the best first; none where that does not explain the masks, or poses of other moments
     do so about as well."""
     fits = _fits(problem, starts)
-    if not fits or fits[0].residual_px > MAX_RESIDUAL_PX or overlap(problem, fits[0]) < LEAST_OVERLAP:
+    if not fits or fits[0].residual_px > LINKED.max_residual_px or overlap(problem, fits[0]) < LINKED.least_overlap:
         return []
     return [] if _exchangeable(problem, fits[0]) else fits
 
@@ -130,11 +149,11 @@ def _explaining(problem: ArticulatedProblem, starts: list[np.ndarray]) -> list[A
 def _elsewhere(problem: ArticulatedProblem, reached: float, seed: int) -> str:
     """Error for a stated base that explains the masks worse, by `reached` of their overlap, than one far from it; else
     empty."""
-    if problem.silhouettes.shafts.visible.sum() < MIN_FRAMES:
+    if problem.silhouettes.shafts.visible.sum() < BASES.min_frames:
         return ""
     free = replace(problem, prior=BasePrior.of(None, problem.prior.sd_clock))
     fits = _explaining(free, unknown_starts(free, seed))
-    if not fits or overlap(free, fits[0]) < max(USUAL_OVERLAP, reached + MIN_GAIN):
+    if not fits or overlap(free, fits[0]) < max(LINKED.usual_overlap, reached + LINKED.min_gain):
         return ""
     off = moved_from(problem.prior.world_from_base, fits[0].world_from_base, problem.middle)
     return (
@@ -154,16 +173,16 @@ def problem_of(
     hidden: np.ndarray | None,
     sd_clock: float,
 ) -> ArticulatedProblem | None:
-    """At most FIT_FRAMES frames with masks whose poses and readings are known at all clocks tried."""
+    """At most `fit_frames` frames with masks whose poses and readings are known at all clocks tried."""
     poses = np.stack([motion.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
     by_shift = [motion.readings_at(float(shift)) for shift in CLOCK_SHIFTS_S]
     readings = {key: np.stack([at[key] for at in by_shift]) for key in motion.tree.readings}
     values = joint_values(motion.tree, readings)
     known = np.isfinite(poses).all((0, 2, 3)) & np.isfinite(values).all((0, 2))
     rows = np.flatnonzero(known & masks.any((1, 2)))
-    if len(rows) < MIN_FRAMES:
+    if len(rows) < BASES.min_frames:
         return None
-    rows = rows[evenly_spaced(len(rows), FIT_FRAMES)]
+    rows = rows[evenly_spaced(len(rows), LINKED.fit_frames)]
     return ArticulatedProblem(
         model=ArticulatedModel(motion.tree, poses[len(CLOCK_SHIFTS_S) // 2][known]),
         silhouettes=silhouettes_of(masks[rows], intrinsics, hidden),
@@ -172,19 +191,19 @@ def problem_of(
         poses=poses[:, rows],
         readings={key: part[:, rows] for key, part in readings.items()},
         values=with_motion(values[:, rows]),
-        blocks=np.arange(len(rows)) * N_BLOCKS // len(rows),
+        blocks=np.arange(len(rows)) * BASES.n_blocks // len(rows),
         prior=BasePrior.of(prior, sd_clock),
     )
 
 
 def _fits(problem: ArticulatedProblem, starts: list[np.ndarray]) -> list[ArticulatedFit]:
     """Fits from different starts world_from_base, the best first; of similar ones the best."""
-    few = problem.take(np.array(evenly_spaced(len(problem.blocks), START_FRAMES)))
+    few = problem.take(np.array(evenly_spaced(len(problem.blocks), LINKED.start_frames)))
     first = [ArticulatedFit(start, 0.0, problem.model.means.copy()) for start in starts]
-    coarse = [fit_articulated(few, start, WIDTHS_PX[:2], 10, rough=True) for start in first]
-    chosen = _distinct(problem, coarse)[:N_REFINED]
-    fits = _distinct(problem, [fit_articulated(problem, fit, WIDTHS_PX[1:]) for fit in chosen])
-    return [minimise(problem, fits[0], WIDTHS_PX[-1], 20), *fits[1:]] if fits else []
+    coarse = [fit_articulated(few, start, LINKED_FIT.widths_px[:2], 10, rough=True) for start in first]
+    chosen = _distinct(problem, coarse)[: LINKED.n_refined]
+    fits = _distinct(problem, [fit_articulated(problem, fit, LINKED_FIT.widths_px[1:]) for fit in chosen])
+    return [minimise(problem, fits[0], LINKED_FIT.widths_px[-1], 20), *fits[1:]] if fits else []
 
 
 def known_starts(problem: ArticulatedProblem) -> list[np.ndarray]:
@@ -193,15 +212,15 @@ def known_starts(problem: ArticulatedProblem) -> list[np.ndarray]:
     shaft = (base[:3, :3] @ problem.poses[len(CLOCK_SHIFTS_S) // 2][:, :3, :3] @ problem.model.axis).mean(0)
     shaft /= np.linalg.norm(shaft)
     steps = [np.zeros(6)]
-    steps += [np.append(np.zeros(3), along * shaft) for along in ALONG_MM]
-    steps += [np.append(roll * shaft, np.zeros(3)) for roll in ROLLS_RAD]
+    steps += [np.append(np.zeros(3), along * shaft) for along in LINKED.along_mm]
+    steps += [np.append(roll * shaft, np.zeros(3)) for roll in LINKED.rolls_rad]
     return [moved_base(base, problem.pivot(base), step) for step in steps]
 
 
 def unknown_starts(problem: ArticulatedProblem, seed: int) -> list[np.ndarray]:
     """The best bases of all, by lines and tips of the masks' shafts. Raises NeecoError where too few show one."""
     shafts, model = problem.silhouettes.shafts, problem.model
-    if shafts.visible.sum() < MIN_FRAMES:
+    if shafts.visible.sum() < BASES.min_frames:
         raise NeecoError(too_few_shafts(shafts))
     ends = model.cones_at(model.means, problem.values[len(CLOCK_SHIFTS_S) // 2])[0]
     outermost = [2 + index for index, cone in enumerate(model.cones) if cone.child is None]
@@ -223,7 +242,7 @@ def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[A
     found: list[ArticulatedFit] = []
     for fit in sorted(fits, key=lambda fit: fit.cost):
         steps = [_step(problem, other, fit) for other in found]
-        if all(np.linalg.norm(s[:3]) > APART_RAD or np.linalg.norm(s[3:]) > APART_MM for s in steps):
+        if all(np.linalg.norm(s[:3]) > LINKED.apart_rad or np.linalg.norm(s[3:]) > LINKED.apart_mm for s in steps):
             found.append(fit)
     return found
 
@@ -236,11 +255,14 @@ def _step(problem: ArticulatedProblem, first: ArticulatedFit, second: Articulate
 
 def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
     """Whether poses and readings of other moments explain the masks about as well."""
-    for share in EXCHANGED_SHARES:
+    for share in LAYERS.exchanged_shares:
         by = round(share * len(problem.blocks))
         poses, values = (np.roll(part, by, axis=1) for part in (problem.poses, problem.values))
         other = replace(problem, poses=poses, values=values)
-        if minimise(other, fit, WIDTHS_PX[1], 6).cost < MIN_EXCHANGED * minimise(problem, fit, WIDTHS_PX[1], 3).cost:
+        if (
+            minimise(other, fit, LINKED_FIT.widths_px[1], 6).cost
+            < LINKED.min_exchanged * minimise(problem, fit, LINKED_FIT.widths_px[1], 3).cost
+        ):
             return True
     return False
 
@@ -248,13 +270,13 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
 def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: ArticulatedMotion) -> BaseRegistration:
     best, prior = with_pose_errors(problem, fits[0]), problem.prior
     full = covariance(problem, best)
-    spread = SCATTER**2 * full[:6, :6]
+    spread = LINKED.scatter**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
         weight = float(np.exp(-0.5 * (other.cost - fits[0].cost)))
         off = _step(problem, best, other)
         spread = spread + weight / (1 + weight) * np.outer(off, off)
     in_view = in_camera(spread, problem.camera_from_world[0])
-    floor = np.array([np.radians(FLOOR_DEG)] * 3 + [FLOOR_MM, FLOOR_MM, FLOOR_DEPTH_MM])
+    floor = np.array([np.radians(LINKED.floor_deg)] * 3 + [LINKED.floor_mm, LINKED.floor_mm, LINKED.floor_depth_mm])
     spread = in_view + np.diag(floor**2)
     poses = problem.camera_from_world[0] @ best.world_from_base @ poses_at_clock(problem.poses, best.clock)
     shaft = (poses[:, :3, :3] @ problem.model.axis).mean(0)
@@ -265,7 +287,7 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
     return BaseRegistration(
         world_from_base=best.world_from_base,
         clock_s=best.clock,
-        clock_sd_s=SCATTER * float(np.sqrt(full[6, 6])),
+        clock_sd_s=LINKED.scatter * float(np.sqrt(full[6, 6])),
         covariance=spread,
         open_directions=(),
         overlap=overlap(problem, best),
@@ -287,7 +309,7 @@ def _doubts(
     model, prior = problem.model, problem.prior
     starts = [rigid]
     known = prior.sd_mm is not None and prior.sd_rad is not None
-    if known and overlap(problem, fit) < USUAL_OVERLAP:  # a reversed joint may have led it astray
+    if known and overlap(problem, fit) < LINKED.usual_overlap:  # a reversed joint may have led it astray
         starts.append(replace(rigid, world_from_base=prior.world_from_base, parameters=model.means.copy()))
     reversed_ = [
         reading
@@ -298,13 +320,13 @@ def _doubts(
     if prior.sd_mm is not None and prior.sd_rad is not None:
         step = _step(problem, replace(fit, world_from_base=prior.world_from_base), fit)
         off = np.linalg.norm(step[3:]) / prior.sd_mm, np.linalg.norm(step[:3]) / prior.sd_rad
-        if max(off) > MAX_SHIFT_SDS:
+        if max(off) > LINKED.max_shift_sds:
             found.append(
                 f"the base found is {max(off):.1f} standard deviations from the one stated: check its transform, "
                 "axes and unit, and which arm it is of"
             )
     sds = (fit.parameters - model.means) / model.sds
-    for index in np.flatnonzero(np.abs(sds) > MAX_SDS) if not reversed_ else ():  # they follow from it
+    for index in np.flatnonzero(np.abs(sds) > LINKED.max_sds) if not reversed_ else ():  # they follow from it
         part = model.names[index]
         if part.startswith(("pivot", "offset")) and not any(part in words for words in found):
             found.append(
@@ -323,6 +345,6 @@ def _reversed(
     for index, link in enumerate(motion.tree.links):
         values[:, :, index] -= 2 * link.value.get(reading, 0.0) * problem.readings[reading]
     other = replace(problem, values=with_motion(values))
-    widths = WIDTHS_PX[1:3] if start is fit else WIDTHS_PX[:3]
+    widths = LINKED_FIT.widths_px[1:3] if start is fit else LINKED_FIT.widths_px[:3]
     trial = fit_articulated(other, start, widths, 5 if start is fit else 10)
-    return minimise(other, trial, WIDTHS_PX[-1], 8).cost < REVERSED_SHARE * fit.cost
+    return minimise(other, trial, LINKED_FIT.widths_px[-1], 8).cost < LINKED.reversed_share * fit.cost

@@ -22,16 +22,29 @@ from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSil
 from neeco.states.outline_model import ArticulatedModel, Outlines
 
 BASE = 7  # parameters of the base (turn rad [3], shift mm [3]) and the clock (s); the model's follow
-MAX_POINTS = 90  # of a mask's outline
-WIDTHS_PX = (10.0, 5.0, 2.5, 1.5)  # of the robust loss, one after the other; px of masks 160 wide
-NOISE_PX = 0.6  # standard deviation of an outline, px of masks 160 wide
-SHARE = 0.05  # of an outline's points that count as independent
-STEPS = (0.005, 0.3, 0.01)  # of differences: turns rad, shifts mm, clock s
-PARAMETER_STEP = 0.1  # of differences, in standard deviations of priors
-INSIDE_PX = -0.7  # of another cone's outline, from which a point is no outline
-MAX_TURN_RAD, MAX_SHIFT_MM, MAX_SDS = 0.15, 12.0, 2.0  # of one step
-DAMPING, TOLERANCE = 1e-2, 1e-4
-POSE_BLOCKS = 2  # of the recording, after which errors of logged poses are independent
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArticulatedFitSettings:
+    """Settings of the fit."""
+
+    max_points: int = 90  # of a mask's outline
+    # of the robust loss, one after the other; px of masks 160 wide
+    widths_px: tuple[float, float, float, float] = (10.0, 5.0, 2.5, 1.5)
+    noise_px: float = 0.6  # standard deviation of an outline, px of masks 160 wide
+    share: float = 0.05  # of an outline's points that count as independent
+    steps: tuple[float, float, float] = (0.005, 0.3, 0.01)  # of differences: turns rad, shifts mm, clock s
+    parameter_step: float = 0.1  # of differences, in standard deviations of priors
+    inside_px: float = -0.7  # of another cone's outline, from which a point is no outline
+    max_turn_rad: float = 0.15  # of one step
+    max_shift_mm: float = 12.0
+    max_sds: float = 2.0
+    damping: float = 1e-2
+    tolerance: float = 1e-4
+    pose_blocks: int = 2  # of the recording, after which errors of logged poses are independent
+
+
+LINKED_FIT = ArticulatedFitSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,7 +84,7 @@ class ArticulatedFit:
 
 
 def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
-    """Evenly spaced points [F, MAX_POINTS, 2] px of the outlines of masks bool [F, h, w]; NaN where there are fewer.
+    """Evenly spaced points [F, `max_points`, 2] px of the outlines of masks bool [F, h, w]; NaN where there are fewer.
     Those at the image's border, or beside what is hidden (bool [h, w]), do not count."""
     height, width = masks.shape[1:]
     open_ = np.zeros((height, width), bool)
@@ -79,7 +92,7 @@ def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
     if hidden is not None:
         grown = cv2.dilate(hidden.astype(np.uint8), np.ones((2 * EDGE_PX + 1,) * 2, np.uint8))
         open_ &= ~grown.astype(bool)
-    found = np.full((len(masks), MAX_POINTS, 2), np.nan)
+    found = np.full((len(masks), LINKED_FIT.max_points, 2), np.nan)
     for row, mask in enumerate(masks):
         lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         if not lines:
@@ -87,7 +100,7 @@ def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
         points = np.concatenate(lines)[:, 0]
         points = points[open_[points[:, 1], points[:, 0]]]
         if len(points):
-            chosen = np.unique(np.linspace(0, len(points) - 1, MAX_POINTS).astype(int))
+            chosen = np.unique(np.linspace(0, len(points) - 1, LINKED_FIT.max_points).astype(int))
             found[row, : len(chosen)] = points[chosen] + 0.5
     return found
 
@@ -119,7 +132,7 @@ def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
     others = found.distances(points)[0]
     others[:, owner, np.arange(len(owner))] = -1e3
     others[:, 1, owner == 0] = others[:, 0, owner == 1] = -1e3  # the tube continues in its end
-    valid = found.valid[:, owner] & (others.max(1) < INSIDE_PX)
+    valid = found.valid[:, owner] & (others.max(1) < LINKED_FIT.inside_px)
     valid &= problem.silhouettes.inside(points, margin=1.0 + EDGE_PX)
     given = np.isfinite(problem.contours[..., 0])
     return _Points(valid, given, np.nan_to_num(problem.contours))
@@ -155,7 +168,14 @@ def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, fr
     frame, point = np.indices(nearest.shape)
     place, way = places[frame, nearest, point], ways[frame, nearest, point]
     share = np.stack([1 - place, place], -1)  # [F, M, 2] of both ends
-    steps = np.concatenate([[STEPS[0]] * 3, [STEPS[1]] * 3, [STEPS[2]], PARAMETER_STEP * model.sds])
+    steps = np.concatenate(
+        [
+            [LINKED_FIT.steps[0]] * 3,
+            [LINKED_FIT.steps[1]] * 3,
+            [LINKED_FIT.steps[2]],
+            LINKED_FIT.parameter_step * model.sds,
+        ]
+    )
 
     def slopes(plus_fit: ArticulatedFit, minus_fit: ArticulatedFit, size: float) -> np.ndarray:
         plus, minus = outlines(problem, plus_fit), outlines(problem, minus_fit)
@@ -233,14 +253,14 @@ def _free(problem: ArticulatedProblem, rough: bool = False) -> np.ndarray:
 
 
 def _loss(px: np.ndarray, width: float, noise: float) -> float:
-    return SHARE * float(np.log1p((px / width) ** 2).sum()) * (width / noise) ** 2
+    return LINKED_FIT.share * float(np.log1p((px / width) ** 2).sum()) * (width / noise) ** 2
 
 
 def minimise(
     problem: ArticulatedProblem, fit: ArticulatedFit, width: float, max_steps: int = 12, *, rough: bool = False
 ) -> ArticulatedFit:
     """The nearest fit under a Cauchy loss of a width px (of masks 160 wide); rough: of few parameters."""
-    free, width, noise = _free(problem, rough), width * problem.px_scale, NOISE_PX * problem.px_scale
+    free, width, noise = _free(problem, rough), width * problem.px_scale, LINKED_FIT.noise_px * problem.px_scale
     sds = problem.model.sds
     count = BASE + len(sds)
 
@@ -248,7 +268,7 @@ def minimise(
         use = _points(problem, fit)
         px = _residuals(problem, fit, use)
         columns = _jacobian(problem, fit, use, free)
-        weights = SHARE / noise**2 / (1 + (px / width) ** 2)
+        weights = LINKED_FIT.share / noise**2 / (1 + (px / width) ** 2)
         off, scale = prior_residuals(problem, fit)
         fitted = np.append(free, np.arange(count, len(scale)))
 
@@ -263,12 +283,14 @@ def minimise(
     def move(fit: ArticulatedFit, fitted_step: np.ndarray) -> ArticulatedFit:
         step = np.zeros(count + len(fitted_step) - len(free))
         step[free], step[count:] = fitted_step[: len(free)], fitted_step[len(free) :]
-        step[:3] = np.clip(step[:3], -MAX_TURN_RAD, MAX_TURN_RAD)
-        step[3:6] = np.clip(step[3:6], -MAX_SHIFT_MM, MAX_SHIFT_MM)
-        step[BASE:count] = np.clip(step[BASE:count], -MAX_SDS * sds, MAX_SDS * sds)
+        step[:3] = np.clip(step[:3], -LINKED_FIT.max_turn_rad, LINKED_FIT.max_turn_rad)
+        step[3:6] = np.clip(step[3:6], -LINKED_FIT.max_shift_mm, LINKED_FIT.max_shift_mm)
+        step[BASE:count] = np.clip(step[BASE:count], -LINKED_FIT.max_sds * sds, LINKED_FIT.max_sds * sds)
         return moved(problem, fit, step)
 
-    fit = levenberg_marquardt(fit, linearise, move, max_steps=max_steps, damping=DAMPING, tolerance=TOLERANCE)
+    fit = levenberg_marquardt(
+        fit, linearise, move, max_steps=max_steps, damping=LINKED_FIT.damping, tolerance=LINKED_FIT.tolerance
+    )
     use = _points(problem, fit)
     px = _residuals(problem, fit, use)
     counted = np.concatenate([use.model, use.masks], 1)
@@ -279,7 +301,7 @@ def minimise(
 def fit_articulated(
     problem: ArticulatedProblem,
     start: ArticulatedFit,
-    widths: tuple[float, ...] = WIDTHS_PX,
+    widths: tuple[float, ...] = LINKED_FIT.widths_px,
     max_steps: int = 12,
     *,
     rough: bool = False,
@@ -293,17 +315,23 @@ def fit_articulated(
 
 def with_pose_errors(problem: ArticulatedProblem, fit: ArticulatedFit, max_steps: int = 20) -> ArticulatedFit:
     """The nearest fit in which every frame's pose has an error of its own, under the narrowest loss."""
-    return minimise(problem, replace(fit, pose_errors=np.zeros((len(problem.blocks), 6))), WIDTHS_PX[-1], max_steps)
+    return minimise(
+        problem, replace(fit, pose_errors=np.zeros((len(problem.blocks), 6))), LINKED_FIT.widths_px[-1], max_steps
+    )
 
 
 def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     """Covariance [BASE + P, BASE + P] at a minimum, with outlines' and poses' errors that are correlated within the
     recording's blocks (sandwich estimator); the clock's rows are 0 where it is known."""
-    free, width, noise = _free(problem), WIDTHS_PX[-1] * problem.px_scale, NOISE_PX * problem.px_scale
+    free, width, noise = (
+        _free(problem),
+        LINKED_FIT.widths_px[-1] * problem.px_scale,
+        LINKED_FIT.noise_px * problem.px_scale,
+    )
     use = _points(problem, fit)
     px = _residuals(problem, fit, use)
     columns = _jacobian(problem, fit, use, free)
-    weights = SHARE / noise**2 / (1 + (px / width) ** 2)
+    weights = LINKED_FIT.share / noise**2 / (1 + (px / width) ** 2)
     scores = _scores(columns, weights * px, len(free))
     scale = prior_residuals(problem, fit)[1]
     count = BASE + len(problem.model.means)
@@ -315,7 +343,7 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     scatter = blocks.T @ blocks * len(blocks) / max(len(blocks) - 1, 1)
     scatter[: len(free), : len(free)] += prior
     if fit.pose_errors is not None:  # they last for a block or two, though the fit takes them to be independent
-        apart = np.abs(problem.blocks[:, None] - problem.blocks) / POSE_BLOCKS
+        apart = np.abs(problem.blocks[:, None] - problem.blocks) / LINKED_FIT.pose_blocks
         scatter[len(free) :, len(free) :] += np.kron(np.clip(1 - apart, 0, 1), np.diag(scale[count : count + 6] ** 2))
     full = np.zeros((count, count))
     full[np.ix_(free, free)] = inverse @ scatter @ inverse.T

@@ -9,23 +9,31 @@ within tolerance, off by 2.7 mm, with it all, off by 0.3 mm (measured once).
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from neeco.ingest.registration.silhouette_fit import FRONT_SHARE
+from neeco.ingest.registration.silhouette_fit import RIGID_FIT
 from neeco.ingest.registration.silhouette_model import SilhouetteFit, SilhouetteProblem, surface_points
 
-STEP_PX = 1.0  # between samples of a profile
-SIDES_RAD = (-0.7, -0.35, 0.0, 0.35, 0.7)  # about the line, from the side that faces the camera
-MAX_SHIFT_PX = 14.0  # of a first fit
-NOISE = 0.04  # standard deviation of the logarithm of a colour
-DARK = 12.0  # of 255, added before logarithms are taken
-N_ROUNDS = 5
-MIN_MARKED = 0.5  # share of the frames, whose shift must be known
-MIN_OVERLAP = 0.6  # of the template's information, that a frame must show
-MAX_SD_PX = 1.0  # of a frame's shift
+
+@dataclass(frozen=True, kw_only=True)
+class TextureSettings:
+    """Settings of the comparison of profiles."""
+
+    step_px: float = 1.0  # between samples of a profile
+    sides_rad: tuple[float, ...] = (-0.7, -0.35, 0.0, 0.35, 0.7)  # about the line, from the side that faces the camera
+    max_shift_px: float = 14.0  # of a first fit
+    noise: float = 0.04  # standard deviation of the logarithm of a colour
+    dark: float = 12.0  # of 255, added before logarithms are taken
+    n_rounds: int = 5
+    min_marked: float = 0.5  # share of the frames, whose shift must be known
+    min_overlap: float = 0.6  # of the template's information, that a frame must show
+    max_sd_px: float = 1.0  # of a frame's shift
+
+
+TEXTURE = TextureSettings()
 
 
 def with_marks(problem: SilhouetteProblem, fit: SilhouetteFit) -> tuple[SilhouetteProblem, SilhouetteFit]:
@@ -35,17 +43,17 @@ def with_marks(problem: SilhouetteProblem, fit: SilhouetteFit) -> tuple[Silhouet
         return problem, fit
     camera_from_base = problem.camera_from_world @ fit.world_from_base
     depth = np.median(camera_from_base[:, 2, :3] @ problem.middle + camera_from_base[:, 2, 3])
-    step = STEP_PX * float(depth) / problem.silhouettes.intrinsics[0]  # mm
+    step = TEXTURE.step_px * float(depth) / problem.silhouettes.intrinsics[0]  # mm
     if step <= 0:  # a fit that went astray, behind the camera
         return replace(problem, marks=None), fit
-    behind = np.arange(FRONT_SHARE * fit.stations[-1], fit.stations[-1], step)
+    behind = np.arange(RIGID_FIT.front_share * fit.stations[-1], fit.stations[-1], step)
     colors = _profiles(problem, fit, problem.images, behind)
-    shifts, deviations, weights = _align(colors, round(MAX_SHIFT_PX / STEP_PX))
+    shifts, deviations, weights = _align(colors, round(TEXTURE.max_shift_px / TEXTURE.step_px))
     place = float((weights * behind).sum() / max(weights.sum(), 1e-12))
     at = place + shifts[:, None] * step
     places = problem.project(surface_points(problem, fit, at)[:, 0])
-    places[deviations * STEP_PX >= MAX_SD_PX] = np.nan
-    if np.isfinite(places[:, 0]).mean() < MIN_MARKED:
+    places[deviations * TEXTURE.step_px >= TEXTURE.max_sd_px] = np.nan
+    if np.isfinite(places[:, 0]).mean() < TEXTURE.min_marked:
         return replace(problem, marks=None), fit
     return replace(problem, marks=places), replace(fit, mark=place)
 
@@ -53,7 +61,7 @@ def with_marks(problem: SilhouetteProblem, fit: SilhouetteFit) -> tuple[Silhouet
 def _profiles(problem: SilhouetteProblem, fit: SilhouetteFit, images: np.ndarray, behind: np.ndarray) -> np.ndarray:
     """Logarithms of colours [F, K, 3] along the line, NaN where a frame's mask does not show the instrument."""
     found, count = [], np.zeros((len(images), len(behind)))
-    for side in SIDES_RAD:
+    for side in TEXTURE.sides_rad:
         pixels = problem.project(surface_points(problem, fit, behind, side))
         inside = problem.silhouettes.inside(pixels, margin=1.0) & (problem.silhouettes.look_up(pixels)[0] > 0)
         places = (pixels - 0.5).astype(np.float32)
@@ -61,10 +69,10 @@ def _profiles(problem: SilhouetteProblem, fit: SilhouetteFit, images: np.ndarray
             cv2.remap(image, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
             for image, at in zip(images, places, strict=True)
         ])  # fmt: skip
-        found.append(np.where(inside[..., None], np.log(sampled.astype(np.float64) + DARK), 0.0))
+        found.append(np.where(inside[..., None], np.log(sampled.astype(np.float64) + TEXTURE.dark), 0.0))
         count += inside
     colors = np.sum(found, 0) / np.maximum(count, 1)[..., None]
-    return np.where((count > len(SIDES_RAD) / 2)[..., None], colors, np.nan)
+    return np.where((count > len(TEXTURE.sides_rad) / 2)[..., None], colors, np.nan)
 
 
 def _align(colors: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -74,12 +82,12 @@ def _align(colors: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.n
     shifts = np.zeros(frames)
     grid = np.arange(-reach, reach + 1)
     deviations = np.full(frames, np.inf)
-    for _ in range(N_ROUNDS):
+    for _ in range(TEXTURE.n_rounds):
         moved = _shifted(colors, shifts)
         shown = np.isfinite(moved[..., 0])
         template, variance = _common(moved, shown)
         used = shown.mean(0) > 0.4
-        weight = np.where(used, 1 / (variance + NOISE**2), 0.0)  # [K]
+        weight = np.where(used, 1 / (variance + TEXTURE.noise**2), 0.0)  # [K]
         inner = used & np.roll(used, 1) & np.roll(used, -1)
         inner[[0, -1]] = False
         information = weight * np.square(np.where(inner[:, None], np.gradient(template, axis=0), 0.0)).sum(-1)
@@ -92,7 +100,7 @@ def _align(colors: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.n
             off = np.where(valid[..., None], other - template, 0.0)
             off = off - ((w[..., None] * off).sum(1) / np.maximum(total, 1e-9)[:, None])[:, None]
             cost = (w[..., None] * np.where(valid[..., None], off, 0.0) ** 2).sum((1, 2)) / np.maximum(total, 1e-9)
-            enough = (information * valid).sum(1) > MIN_OVERLAP * information.sum()
+            enough = (information * valid).sum(1) > TEXTURE.min_overlap * information.sum()
             costs[:, column] = np.where(enough, cost, np.inf)
         best = costs.argmin(1)
         middle = np.clip(best, 1, len(grid) - 2)

@@ -23,19 +23,11 @@ from neeco.capture.model import BaseUncertainty, evenly_spaced
 from neeco.geometry.trocar import ShaftLine
 from neeco.ingest.foreground.silhouettes import ShaftLines, silhouettes_of
 from neeco.ingest.registration.axial_texture import with_marks
-from neeco.ingest.registration.layers import EXCHANGED_SHARES, LayerFit
-from neeco.ingest.registration.silhouette_fit import (
-    CLOCK_SD_S,
-    FRONT_SHARE,
-    WIDTHS_PX,
-    BasePrior,
-    fit_covariance,
-    fit_silhouettes,
-    refine,
-)
+from neeco.ingest.registration.layers import LAYERS, LayerFit
+from neeco.ingest.registration.silhouette_fit import RIGID_FIT, BasePrior, fit_covariance, fit_silhouettes, refine
 from neeco.ingest.registration.silhouette_model import (
     CLOCK_SHIFTS_S,
-    MAX_LENGTH_MM,
+    RIGID,
     SilhouetteFit,
     SilhouetteProblem,
     instrument_in_base,
@@ -43,24 +35,37 @@ from neeco.ingest.registration.silhouette_model import (
     resized,
     sides,
 )
-from neeco.ingest.registration.silhouette_search import TYPICAL_RADIUS_MM, distance_to, search_bases
+from neeco.ingest.registration.silhouette_search import SEARCH, distance_to, search_bases
 
-MIN_FRAMES = 12  # that show a shaft
-SEARCH_FRAMES, FIT_FRAMES = 40, 140  # on which starts are compared, and that the result is fitted to
-N_BLOCKS = 10  # stretches of a recording whose errors are taken to be independent
-SIZE_FACTORS, MAX_SIZE_STEPS = (1.25, 1.1), 8  # by which the scale is varied, and how often at most
-LOG_SIZE_RANGE, SIZE_SAMPLES = 0.15, 9  # of the loss about its minimum
-MIN_OVERLAP_RATIO = 0.95  # to the overlap before: less of an instrument fits more easily
-MIN_OVERLAP = 0.25  # of the instrument's silhouette with the masks
-# Standard deviations that more frames do not lower, as wrists and jaws blur the tip: of the logarithm of the size, and
-# of the place along the shaft, which a rigid shape hardly determines (measured once)
-SIZE_SD, ALONG_SD_MM = 0.03, 4.0
-RADIUS_RANGE_MM = (1.5, 5.5)  # of shafts; one outside is first taken to be typical
-LEVER_MM = 40.0  # from the instrument's middle, at which a turn counts as a shift
-OPEN_SD_MM = 3.0  # at that lever, from which a direction counts as undetermined
-OPEN_SHARE = 0.7  # of the prior's standard deviation: the images have hardly reduced it
-MIN_EXCHANGED_COST = 1.5  # times the cost with the right poses
-MAX_RESIDUAL_PX = 1.5  # median, of masks 160 wide
+
+@dataclass(frozen=True, kw_only=True)
+class BaseSettings:
+    """Settings of the search for a base, and of what counts as undetermined."""
+
+    min_frames: int = 12  # that show a shaft
+    search_frames: int = 40  # on which starts are compared, and that the result is fitted to
+    fit_frames: int = 140
+    n_blocks: int = 10  # stretches of a recording whose errors are taken to be independent
+    size_factors: tuple[float, float] = (1.25, 1.1)  # by which the scale is varied, and how often at most
+    max_size_steps: int = 8
+    log_size_range: float = 0.15  # of the loss about its minimum
+    size_samples: int = 9
+    min_overlap_ratio: float = 0.95  # to the overlap before: less of an instrument fits more easily
+    min_overlap: float = 0.25  # of the instrument's silhouette with the masks
+    # Standard deviations that more frames do not lower, as wrists and jaws blur the tip: of the logarithm of the
+    # size, and of the place along the shaft, which a rigid shape hardly determines (measured once)
+    size_sd: float = 0.03
+    along_sd_mm: float = 4.0
+    radius_range_mm: tuple[float, float] = (1.5, 5.5)  # of shafts; one outside is first taken to be typical
+    lever_mm: float = 40.0  # from the instrument's middle, at which a turn counts as a shift
+    open_sd_mm: float = 3.0  # at that lever, from which a direction counts as undetermined
+    open_share: float = 0.7  # of the prior's standard deviation: the images have hardly reduced it
+    min_exchanged_cost: float = 1.5  # times the cost with the right poses
+    max_residual_px: float = 1.5  # median, of masks 160 wide
+
+
+BASES = BaseSettings()
+
 BY_SIZE = "a shift towards where the instrument comes in, together with its size"
 
 Prior = tuple[np.ndarray, float, float]  # world_from_base [4, 4], standard deviations mm at the instrument, and degrees
@@ -182,11 +187,11 @@ def find_base(
     generator = np.random.default_rng(seed)
     problem = _problem(masks, intrinsics, camera_from_world, poses_at, readings=readings, hidden=hidden, images=images)
     shafts = problem.silhouettes.shafts
-    if shafts.visible.sum() < MIN_FRAMES:
+    if shafts.visible.sum() < BASES.min_frames:
         raise NeecoError(too_few_shafts(shafts))
     problem = problem.take(np.flatnonzero(shafts.visible))
-    few = problem.take(np.array(evenly_spaced(len(problem.blocks), SEARCH_FRAMES)))
-    known = BasePrior.of(prior, 0.0 if clock_known else CLOCK_SD_S)
+    few = problem.take(np.array(evenly_spaced(len(problem.blocks), BASES.search_frames)))
+    known = BasePrior.of(prior, 0.0 if clock_known else RIGID_FIT.clock_sd_s)
     found = search_bases(few, known, distance_to(problem, known), generator)
     starts = [
         SilhouetteFit.of_line(base, 0.0, tip, axis, problem.readings.shape[1])
@@ -196,10 +201,10 @@ def find_base(
         raise NeecoError(unmoved(stated=prior is not None))
     best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
     radius = float(np.median(best.shape[len(best.shape) // 2 :, 0, 0]))
-    if not RADIUS_RANGE_MM[0] < radius < RADIUS_RANGE_MM[1]:
-        best = refine(few, known, resized(few, best, TYPICAL_RADIUS_MM / radius))
+    if not BASES.radius_range_mm[0] < radius < BASES.radius_range_mm[1]:
+        best = refine(few, known, resized(few, best, SEARCH.typical_radius_mm / radius))
     best = _best_size(few, known, best)
-    fit = fit_silhouettes(problem, known, best, WIDTHS_PX[-2:])
+    fit = fit_silhouettes(problem, known, best, RIGID_FIT.widths_px[-2:])
     problem, fit = with_marks(problem, fit)
     fit = _settle_size(problem, known, refine(problem, known, fit))
     problem, fit = with_marks(problem, fit)
@@ -218,12 +223,12 @@ def _problem(
     hidden: np.ndarray | None,
     images: np.ndarray | None,
 ) -> SilhouetteProblem:
-    """The frames whose poses are known at all clocks tried, at most FIT_FRAMES."""
+    """The frames whose poses are known at all clocks tried, at most `fit_frames`."""
     poses = np.stack([poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
     values = np.zeros((len(masks), 0)) if readings is None else np.asarray(readings, np.float64)
     known = np.isfinite(poses).all((0, 2, 3)) & np.isfinite(values).all(1)
     rows = np.flatnonzero(known & masks.any((1, 2)))
-    rows = rows[evenly_spaced(len(rows), FIT_FRAMES)] if len(rows) else rows
+    rows = rows[evenly_spaced(len(rows), BASES.fit_frames)] if len(rows) else rows
     values = values[rows]
     if len(rows):
         moving = values.std(0) > 1e-3
@@ -233,7 +238,7 @@ def _problem(
         camera_from_world=camera_from_world[rows],
         poses=poses[:, rows],
         readings=values,
-        blocks=np.minimum(np.arange(len(rows)) * N_BLOCKS // max(len(rows), 1), N_BLOCKS - 1),
+        blocks=np.minimum(np.arange(len(rows)) * BASES.n_blocks // max(len(rows), 1), BASES.n_blocks - 1),
         images=None if images is None else images[rows],
     )
 
@@ -241,11 +246,13 @@ def _problem(
 def _best_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> SilhouetteFit:
     """The best of fits to instruments of other sizes at other distances, in ever smaller steps: for one still camera
     that is a valley along which least squares creep."""
-    for step in SIZE_FACTORS:
+    for step in BASES.size_factors:
         for factor in (step, 1 / step):
-            for _ in range(MAX_SIZE_STEPS):
+            for _ in range(BASES.max_size_steps):
                 other = refine(problem, known, resized(problem, fit, factor), 8)
-                if not (other.loss < fit.loss and overlap(problem, other) > MIN_OVERLAP_RATIO * overlap(problem, fit)):
+                if not (
+                    other.loss < fit.loss and overlap(problem, other) > BASES.min_overlap_ratio * overlap(problem, fit)
+                ):
                     break
                 fit = other
     return fit
@@ -253,11 +260,11 @@ def _best_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit)
 
 def _settle_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> SilhouetteFit:
     """The fit at the size of least loss, by a parabola through those of sizes around."""
-    logs = np.linspace(-LOG_SIZE_RANGE, LOG_SIZE_RANGE, SIZE_SAMPLES)
+    logs = np.linspace(-BASES.log_size_range, BASES.log_size_range, BASES.size_samples)
     fits = [refine(problem, known, resized(problem, fit, float(np.exp(log))), 8) for log in logs]
     losses = np.array([other.loss for other in fits])
     near = losses < losses.min() + 0.5 * (np.median(losses) - losses.min()) + 1e-9
-    near |= np.abs(np.arange(SIZE_SAMPLES) - int(np.argmin(losses))) <= 2
+    near |= np.abs(np.arange(BASES.size_samples) - int(np.argmin(losses))) <= 2
     curve = np.polyfit(logs[near], losses[near], 2)
     least = logs[np.argmin(losses)]
     if curve[0] > 0:
@@ -280,8 +287,8 @@ def overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
 def shaft_overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
     """Intersection over union of the fit's shaft with the masks behind its front, over all frames: wrists and jaws are
     no part of the rigid shape."""
-    counted = fit.stations > FRONT_SHARE * fit.stations[-1]
-    stations = np.append(fit.stations[counted], fit.stations[-1] + MAX_LENGTH_MM)
+    counted = fit.stations > RIGID_FIT.front_share * fit.stations[-1]
+    stations = np.append(fit.stations[counted], fit.stations[-1] + RIGID.max_length_mm)
     shape = np.concatenate([fit.shape[counted], fit.shape[-1:]])
     left, right = np.split(sides(problem, replace(fit, stations=stations, shape=shape)).pixels, 2, axis=1)
     front, back = (left[:, 0] + right[:, 0]) / 2, (left[:, -2] + right[:, -2]) / 2
@@ -307,12 +314,12 @@ def _filled(left: np.ndarray, right: np.ndarray, shape: tuple[int, ...]) -> np.n
 
 def _require_moved(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> None:
     """Raise NeecoError where poses of other moments, or none, explain the masks as well."""
-    if not (fit.residual_px < MAX_RESIDUAL_PX * problem.px_scale and overlap(problem, fit) > MIN_OVERLAP):
+    if not (fit.residual_px < BASES.max_residual_px * problem.px_scale and overlap(problem, fit) > BASES.min_overlap):
         raise NeecoError(unmoved(stated=known.sd_mm is not None))
-    for share in EXCHANGED_SHARES:
+    for share in LAYERS.exchanged_shares:
         exchanged = replace(problem, poses=np.roll(problem.poses, round(share * len(problem.blocks)), axis=1))
         other = refine(exchanged, replace(known, sd_clock=0.0), fit, 12)
-        if other.cost < MIN_EXCHANGED_COST * fit.cost:
+        if other.cost < BASES.min_exchanged_cost * fit.cost:
             raise NeecoError(unmoved(stated=known.sd_mm is not None))
 
 
@@ -320,8 +327,8 @@ def too_few_shafts(shafts: ShaftLines) -> str:
     """Error where too few masks show a shaft."""
     return (
         f"what moves looks like a shaft in {int(shafts.visible.sum())} of {len(shafts.visible)} frames, at least "
-        f"{MIN_FRAMES} are needed; give the transform, exactly or, before a still scope, of an arm with a trocar, "
-        "roughly (sd_mm, sd_deg), or a recording that shows more of it"
+        f"{BASES.min_frames} are needed; give the transform, exactly or, before a still scope, of an arm with a "
+        "trocar, roughly (sd_mm, sd_deg), or a recording that shows more of it"
     )
 
 
@@ -389,13 +396,13 @@ def _covariance(
     covariance = fit_covariance(problem, known, fit)
     clock_sd = float(np.sqrt(covariance[6, 6])) if known.sd_clock > 0 else 0.0
     covariance = covariance[:6, :6]
-    valleys = [ALONG_SD_MM * shaft] + ([SIZE_SD * away] if still else [])
+    valleys = [BASES.along_sd_mm * shaft] + ([BASES.size_sd * away] if still else [])
     for valley in valleys:
         covariance[3:6, 3:6] += np.outer(valley, valley)
-    units = np.array([1 / LEVER_MM] * 3 + [1.0] * 3)  # about as much motion of a silhouette each
-    limit = OPEN_SD_MM**2
+    units = np.array([1 / BASES.lever_mm] * 3 + [1.0] * 3)  # about as much motion of a silhouette each
+    limit = BASES.open_sd_mm**2
     if known.sd_rad is not None and known.sd_mm is not None:
-        units, limit = np.array([known.sd_rad] * 3 + [known.sd_mm] * 3), OPEN_SHARE**2
+        units, limit = np.array([known.sd_rad] * 3 + [known.sd_mm] * 3), BASES.open_share**2
     values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
     if known.sd_mm is not None:  # no less is known than before
         values = np.minimum(values, 1.0)
@@ -422,7 +429,7 @@ def sd_motion(covariance: np.ndarray, poses: np.ndarray) -> float:
 
 
 def _direction(view: np.ndarray, valleys: Sequence[np.ndarray], vector: np.ndarray) -> str:
-    """Describe a direction in which the base may move: turns and shifts [6], world, at LEVER_MM. view:
+    """Describe a direction in which the base may move: turns and shifts [6], world, at `lever_mm`. view:
     camera_from_world [3, 3]; valleys [3] each: the shaft's direction, world, and that of a change of size."""
     shaft = valleys[0] / np.linalg.norm(valleys[0])
     turns = np.square(vector[:3]).sum() > 0.5 * np.square(vector).sum()
@@ -450,13 +457,13 @@ def base_from_layers(
     base = world_from_camera @ found.camera_from_base
     shaft = (found.camera_from_base[:3, :3] @ poses[:, :3, :3] @ line.axis).mean(0)
     shaft /= np.linalg.norm(shaft)
-    units = np.array([1 / LEVER_MM] * 3 + [1.0] * 3)
+    units = np.array([1 / BASES.lever_mm] * 3 + [1.0] * 3)
     after, before = found.covariance[:6, :6] / np.outer(units, units), np.square(found.given[:6] / units)
     values, vectors = np.linalg.eigh(after)
     words = [
         _direction(np.eye(3), [shaft], vector)
         for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
-        if value > OPEN_SHARE**2 / (np.square(vector) @ (1 / before))
+        if value > BASES.open_share**2 / (np.square(vector) @ (1 / before))
     ]
     return BaseRegistration(
         world_from_base=base,

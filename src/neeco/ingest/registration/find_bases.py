@@ -21,20 +21,31 @@ from neeco.ingest.readers.logs import ReadingLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
 from neeco.ingest.registration.articulated import ArticulatedMotion, find_articulated_base
-from neeco.ingest.registration.base import MIN_FRAMES, BaseRegistration, base_from_layers, find_base
-from neeco.ingest.registration.hand_eye import PLACED_DEG, PLACED_MM, Registration
+from neeco.ingest.registration.base import BASES, BaseRegistration, base_from_layers, find_base
+from neeco.ingest.registration.hand_eye import HAND_EYE, Registration
 from neeco.ingest.registration.layers import ArmImages, covered_by, evenly_lit, fit_layers
-from neeco.ingest.registration.silhouette_fit import CLOCK_SD_S
+from neeco.ingest.registration.silhouette_fit import RIGID_FIT
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, ClockOffset
 from neeco.ingest.timing.episodes import Episode, Episodes
 
-N_FRAMES = 140  # searched, evenly spaced
-MIN_BEND_MM = 2.0  # from the root to the logged link: nearer, nothing bends there
-MIN_READ_SHARE = 0.5  # of the frames, that a joint's log has to cover: those without a reading are left out
-MIN_OVERLAP, MIN_OVERLAP_GAIN = 0.85, 0.2  # of an instrument's outline with what moves, where its place is corrected
-MAX_PRIOR_MM, MAX_PRIOR_DEG = 8.0, 5.0  # standard deviations of a place, from which outlines find it
-MIN_TRAVEL_MM = 2.0  # root mean square, from which an arm counts as moving
+
+@dataclass(frozen=True, kw_only=True)
+class FindBasesSettings:
+    """Thresholds of what is corrected by images."""
+
+    n_frames: int = 140  # searched, evenly spaced
+    min_bend_mm: float = 2.0  # from the root to the logged link: nearer, nothing bends there
+    min_read_share: float = 0.5  # of the frames, that a joint's log has to cover: those without a reading are left out
+    min_overlap: float = 0.85  # of an instrument's outline with what moves, where its place is corrected
+    min_overlap_gain: float = 0.2
+    max_prior_mm: float = 8.0  # standard deviations of a place, from which outlines find it
+    max_prior_deg: float = 5.0
+    min_travel_mm: float = 2.0  # root mean square, from which an arm counts as moving
+
+
+PLACING = FindBasesSettings()
+
 KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
 
 
@@ -160,10 +171,14 @@ def correct_placement(
     if data.clock(logs[name].clock) is None:
         return data, {}
     poses, known = data.instrument_poses(name, views.times)
-    if known.sum() < MIN_FRAMES:
+    if known.sum() < BASES.min_frames:
         return data, {}
     sds = registration.placement_sd(poses[known, :3, 3])
-    if (sds[0] <= PLACED_MM and sds[1] <= PLACED_DEG) or sds[0] > MAX_PRIOR_MM or sds[1] > MAX_PRIOR_DEG:
+    if (
+        (sds[0] <= HAND_EYE.placed_mm and sds[1] <= HAND_EYE.placed_deg)
+        or sds[0] > PLACING.max_prior_mm
+        or sds[1] > PLACING.max_prior_deg
+    ):
         return data, {}
     progress("correcting the instrument's place", 0, 0)
     stated = StatedBase(np.eye(4), 0.0, 0.0, to_world=True)
@@ -173,7 +188,11 @@ def correct_placement(
         found, _ = _find(arm, observed, observed.visible, alone=True)
     except NeecoError:  # the images do not determine it
         return data, {}
-    least = MIN_OVERLAP if found is None else max(MIN_OVERLAP, found.overlap_before + MIN_OVERLAP_GAIN)
+    least = (
+        PLACING.min_overlap
+        if found is None
+        else max(PLACING.min_overlap, found.overlap_before + PLACING.min_overlap_gain)
+    )
     if found is None or found.doubts or not found.overlap > least:
         return data, {}
     data.notes.add(
@@ -206,14 +225,14 @@ def follow_cameras(
 
 @dataclass(frozen=True, eq=False)
 class _Observed:
-    """N_FRAMES rows [F] of the views, or all, and what is derived from them once."""
+    """`n_frames` rows [F] of the views, or all, and what is derived from them once."""
 
     views: Views
     moving: Callable[[np.ndarray], np.ndarray]
 
     @cached_property
     def rows(self) -> np.ndarray:
-        return np.array(evenly_spaced(len(self.views.times), N_FRAMES))
+        return np.array(evenly_spaced(len(self.views.times), PLACING.n_frames))
 
     @cached_property
     def images(self) -> np.ndarray:
@@ -296,7 +315,9 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
         return found
 
     readings = {
-        joint: values for joint, values in readings_later(0.0).items() if np.isfinite(values).mean() > MIN_READ_SHARE
+        joint: values
+        for joint, values in readings_later(0.0).items()
+        if np.isfinite(values).mean() > PLACING.min_read_share
     }
     tree = None if item.kinematics is None or item.kinematics.pose_of is None else item.kinematics
 
@@ -311,7 +332,7 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
         return poses if tree is None else poses @ np.linalg.inv(root_from_logged(tree, shift))
 
     wrists = None if tree is None else root_from_logged(tree, 0.0)[:, :3, 3]
-    if wrists is not None and not np.nanmin(np.linalg.norm(wrists, axis=1), initial=np.inf) > MIN_BEND_MM:
+    if wrists is not None and not np.nanmin(np.linalg.norm(wrists, axis=1), initial=np.inf) > PLACING.min_bend_mm:
         wrists = None
     prior = None
     if stated.matrix is not None:
@@ -366,7 +387,7 @@ def _find(
     except NeecoError as error:
         if alone and (found := _without_masks(arm, observed, usable)) is not None:
             return found
-        if not alone and arm.prior is not None and arm.travel < MIN_TRAVEL_MM:
+        if not alone and arm.prior is not None and arm.travel < PLACING.min_travel_mm:
             return None, np.zeros_like(usable)
         assert arm.item.base is not None
         raise NeecoError(f"{arm.where}: instrument {arm.item.name!r}: {arm.item.base.key}: {error}") from error
@@ -387,7 +408,7 @@ def _without_masks(arm: _Arm, observed: _Observed, usable: np.ndarray) -> tuple[
     if arm.clock.source in KNOWN:  # no other clock is tried
         poses = np.tile(arm.poses_at(0.0), (len(CLOCK_SHIFTS_S), 1, 1, 1))
         known = np.flatnonzero(np.isfinite(poses[0]).all((1, 2)))
-    line = line_through_trocar(poses[len(CLOCK_SHIFTS_S) // 2, known]) if len(known) >= MIN_FRAMES else None
+    line = line_through_trocar(poses[len(CLOCK_SHIFTS_S) // 2, known]) if len(known) >= BASES.min_frames else None
     if line is None:
         return None
     wrists = None if arm.wrists is None else arm.wrists[known]
@@ -401,7 +422,7 @@ def _without_masks(arm: _Arm, observed: _Observed, usable: np.ndarray) -> tuple[
         wrists=wrists,
     )
     prior = np.linalg.inv(cameras[0]) @ given, sd_mm, sd_deg
-    sd_clock = 0.0 if arm.clock.source in KNOWN else CLOCK_SD_S
+    sd_clock = 0.0 if arm.clock.source in KNOWN else RIGID_FIT.clock_sd_s
     found = fit_layers(images, prior, sd_clock, np.random.default_rng(0))
     if not found.found:
         return None

@@ -24,15 +24,28 @@ from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.model import IngestSettings
 from neeco.ingest.timing.clock_search import RATE_SIGNIFICANCE, SCOPE_MOTION, ClockOffset, clock_from_turning
 
-MIN_FRAMES = 12
-MIN_TURN_RAD = 0.05  # rad, spread of the scope's directions below which the hand-eye rotation is not determined
-MIN_TRAVEL_MM = 3.0  # mm, spread of the scope's positions below which the scale is not determined
-MIN_DEVIATION = 1e-6  # rad, mm: no covariance is smaller
-KNOT_SPACING_S = 2.5  # s between the knots of the tracker's drift
-CORRELATED_S = (0.1, 0.3, 1.0)  # over which a tracker's errors may be correlated; slower drift is told by its knots
-LAGS_S = (0.0, 1e-6, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # bins of the autocovariance: a frame with itself, with later ones
+
+@dataclass(frozen=True, kw_only=True)
+class HandEyeSettings:
+    """Settings of the calibration."""
+
+    min_frames: int = 12
+    # rad, spread of the scope's directions below which the hand-eye rotation is not determined
+    min_turn_rad: float = 0.05
+    min_travel_mm: float = 3.0  # mm, spread of the scope's positions below which the scale is not determined
+    min_deviation: float = 1e-6  # rad, mm: no covariance is smaller
+    knot_spacing_s: float = 2.5  # s between the knots of the tracker's drift
+    # over which a tracker's errors may be correlated; slower drift is told by its knots
+    correlated_s: tuple[float, float, float] = (0.1, 0.3, 1.0)
+    # bins of the autocovariance: a frame with itself, with later ones
+    lags_s: tuple[float, ...] = (0.0, 1e-6, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
+    placed_mm: float = 1.0  # standard deviations of the cameras' place in the tracker's frame: usual, or less
+    placed_deg: float = 0.7
+
+
+HAND_EYE = HandEyeSettings()
+
 LAG, STRETCH = 13, 14  # the unknowns of the clock
-PLACED_MM, PLACED_DEG = 1.0, 0.7  # standard deviations of the cameras' place in the tracker's frame: usual, or less
 N_UNKNOWNS = 15  # in addition to the drift: scale, rotation, origin, hand-eye rotation, lever, clock
 
 
@@ -74,7 +87,7 @@ class Registration:
         moves = np.concatenate([np.eye(7)[1:4], self._moves(center[None])[0]])
         shared = max(moves @ self.covariances @ moves.T, key=lambda covariance: float(np.trace(covariance[3:, 3:])))
         # the reader asks for a positive definite one
-        covariance = (shared + shared.T) / 2 + MIN_DEVIATION**2 * np.eye(6)
+        covariance = (shared + shared.T) / 2 + HAND_EYE.min_deviation**2 * np.eye(6)
         return BaseUncertainty(tuple(center.tolist()), tuple(map(tuple, covariance.tolist())))
 
     def _moves(self, places: np.ndarray) -> np.ndarray:
@@ -165,9 +178,11 @@ class _HandEye:
         self.sensor_poses = lru_cache(maxsize=4)(
             lambda lag, stretch: poses_at(near, times + lag + stretch * (times - self.now))
         )
-        knots = np.arange(times[0] - KNOT_SPACING_S / 2, times[-1] + 1.5 * KNOT_SPACING_S, KNOT_SPACING_S)
+        knots = np.arange(
+            times[0] - HAND_EYE.knot_spacing_s / 2, times[-1] + 1.5 * HAND_EYE.knot_spacing_s, HAND_EYE.knot_spacing_s
+        )
         # [N, K] weights of piecewise linear interpolation between knots
-        self.hats = np.maximum(0.0, 1 - np.abs(times[:, None] - knots) / KNOT_SPACING_S)
+        self.hats = np.maximum(0.0, 1 - np.abs(times[:, None] - knots) / HAND_EYE.knot_spacing_s)
         self.start = np.zeros(N_UNKNOWNS + 3 * len(knots))
 
     def unpack(self, x: np.ndarray) -> tuple[float, Rotation, np.ndarray, Rotation, np.ndarray, float, float]:
@@ -218,11 +233,11 @@ class _HandEye:
 
 def _covariances(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Covariances [2, U, U] of the unknowns, of which the larger holds: by the stated noise; and by the tracker's own
-    errors, white and correlated over CORRELATED_S, whose variances explain the residuals' autocovariance.
+    errors, white and correlated over `correlated_s`, whose variances explain the residuals' autocovariance.
 
     The unknowns absorb much of slow errors: what is left in residuals looks smaller and less correlated than the errors
     are. So the variances (Rao 1972, "Estimation of variance and covariance components") are those whose residuals,
-    after that absorption, have the autocovariances at LAGS_S that were found. residuals [Q] and jacobian [Q, U] as
+    after that absorption, have the autocovariances at `lags_s` that were found. residuals [Q] and jacobian [Q, U] as
     `least_squares` returns them: the first are not yet weighted by the soft-L1 loss. times [N] s of the frames, whose
     positions and rotations come first.
     """
@@ -232,14 +247,14 @@ def _covariances(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.nda
     slopes = jacobian[: 6 * count].reshape(2, count, 3, unknowns).transpose(0, 2, 1, 3)
     apart = np.abs(times[:, None] - times)
     # [C][2, 3, U, N] gain times the errors' correlation: white ones, and correlated ones
-    spread = [gain, *(gain @ _correlation(apart, seconds) for seconds in CORRELATED_S)]
+    spread = [gain, *(gain @ _correlation(apart, seconds) for seconds in HAND_EYE.correlated_s)]
     absorbed = np.stack([np.einsum("kaun,kavn->kuv", some, gain, optimize=True) for some in spread], 1)  # [2, C, U, U]
     found, expected = list[float](), list[np.ndarray]()
-    for low, high in pairwise(LAGS_S):
+    for low, high in pairwise(HAND_EYE.lags_s):
         pairs = ((apart >= low) & (apart < high)).astype(np.float64)
         if not (total := pairs.sum()):
             continue
-        own = [np.trace(pairs), *(_correlation(apart[pairs > 0], seconds).sum() for seconds in CORRELATED_S)]
+        own = [np.trace(pairs), *(_correlation(apart[pairs > 0], seconds).sum() for seconds in HAND_EYE.correlated_s)]
         for kind in range(2):  # positions, rotations
             near = pairs @ slopes[kind] / total  # [3, N, U]
             row = np.einsum("kcuv,anu,anv->kc", absorbed, slopes[kind], near, optimize=True)
@@ -264,10 +279,11 @@ def _clock_deviations(covariances: np.ndarray) -> np.ndarray:
 
 def _sensor_poses(times: np.ndarray, log: PoseLog, clock: ClockOffset) -> tuple[np.ndarray, np.ndarray]:
     poses, valid = poses_at(log, clock.at(times))
-    if valid.sum() < MIN_FRAMES:
+    if valid.sum() < HAND_EYE.min_frames:
         raise NeecoError(
-            f"{log.path}: only {int(valid.sum())} video frames fall on its samples (at least {MIN_FRAMES} are needed); "
-            "check the clock offset in `sync` and that log and video are of the same recording"
+            f"{log.path}: only {int(valid.sum())} video frames fall on its samples (at least "
+            f"{HAND_EYE.min_frames} are needed); check the clock offset in `sync` and that log and video "
+            "are of the same recording"
         )
     return poses, valid
 
@@ -289,7 +305,7 @@ def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog,
         for turns in (camera_turns, sensor_turns)
     )
     spread = np.linalg.svd(b, compute_uv=False) / np.sqrt(len(b))
-    if spread[1] < MIN_TURN_RAD:
+    if spread[1] < HAND_EYE.min_turn_rad:
         raise NeecoError(
             f"{log.path}: the laparoscope turned about hardly more than one axis ({np.degrees(spread[1]):.1f} deg "
             "across the others), so its hand-eye calibration cannot be found; record the scope turning about two axes "
@@ -301,7 +317,7 @@ def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog,
     travel = cameras[:, :3, 3] @ world_from_sfm.as_matrix().T  # [N, 3]
     system = np.concatenate([travel[:, :, None], np.tile(np.eye(3), (len(cameras), 1, 1)), turned], -1).reshape(-1, 7)
     solution = np.linalg.lstsq(system, sensors[:, :3, 3].ravel(), rcond=None)[0]
-    if solution[0] <= 0 or np.linalg.norm(travel.std(0)) * solution[0] < MIN_TRAVEL_MM:
+    if solution[0] <= 0 or np.linalg.norm(travel.std(0)) * solution[0] < HAND_EYE.min_travel_mm:
         raise NeecoError(
             f"{log.path}: the laparoscope travelled too little to tell the scale; move it by 20 mm or more"
         )

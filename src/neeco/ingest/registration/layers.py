@@ -16,30 +16,50 @@ import numpy as np
 from neeco.capture.model import evenly_spaced
 from neeco.geometry.trocar import ShaftLine
 from neeco.ingest.foreground.background import exposure, find_background
-from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, NEAREST_MM, moved_base, poses_at_clock
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, RIGID, moved_base, poses_at_clock
 
-RADIUS_MM, LOG_RADIUS_SD = 3.8, 0.2  # of a shaft
-AHEAD_MM, AHEAD_SD_MM = 8.0, 6.0  # from the logged frame's origin to the instrument's end
-LENGTH_MM = 140.0  # of the shaft that is modelled
-MAX_WRIST_MM = 40.0  # length beyond the bend
-WIDTHS_PX, N_IMAGES = (40, 80, 160), (30, 36, 48)  # of images, one after the other, and how many of them
-COLOR_SCALE = 20.0  # of 255, of the robust loss on colours
-STEP_MM, N_COLUMNS = 2.0, 5  # cells of the shaft's colours along it, and across
-MIN_BACKGROUND = 2.0  # images that show a pixel's background, for it to count
-PRIOR_WEIGHT = 1e-4  # of the mean loss: cost of a parameter one standard deviation off
-# cross-entropy search: bases tried and rounds at first, then in each size of image
-N_FIRST, FIRST_SD, N_TRIED = 400, 1.2, ((60, 9), (30, 5), (24, 5))
-WIDENING = 1.5  # of the search from one size of image to the next
-MAX_ELITE = 15  # of the bases tried, at most half, about which the next are tried
+
+@dataclass(frozen=True, kw_only=True)
+class LayerSettings:
+    """Settings of the fit of layers."""
+
+    radius_mm: float = 3.8  # of a shaft
+    log_radius_sd: float = 0.2
+    ahead_mm: float = 8.0  # from the logged frame's origin to the instrument's end
+    ahead_sd_mm: float = 6.0
+    length_mm: float = 140.0  # of the shaft that is modelled
+    max_wrist_mm: float = 40.0  # length beyond the bend
+    widths_px: tuple[int, int, int] = (40, 80, 160)  # of images, one after the other, and how many of them
+    n_images: tuple[int, int, int] = (30, 36, 48)
+    color_scale: float = 20.0  # of 255, of the robust loss on colours
+    step_mm: float = 2.0  # cells of the shaft's colours along it, and across
+    n_columns: int = 5
+    min_background: float = 2.0  # images that show a pixel's background, for it to count
+    prior_weight: float = 1e-4  # of the mean loss: cost of a parameter one standard deviation off
+    # cross-entropy search: bases tried and rounds at first, then in each size of image
+    n_first: int = 400
+    first_sd: float = 1.2
+    n_tried: tuple[tuple[int, int], tuple[int, int], tuple[int, int]] = ((60, 9), (30, 5), (24, 5))
+    widening: float = 1.5  # of the search from one size of image to the next
+    max_elite: int = 15  # of the bases tried, at most half, about which the next are tried
+    exchanged_sd: float = 0.5  # standard deviations about the result, within which exchanged poses are tried
+    exchanged_shares: tuple[float, float] = (0.37, 0.61)  # of the recording, by which poses are shifted for comparison
+    # standard deviations by which poses must explain images better than those of other moments
+    min_certainty: float = 3.0
+    probe_sd: float = 0.25  # about the minimum, of the loss's second derivatives
+    n_probes: int = 140
+    size_sd: float = 0.03  # errors common to all images: of the distance, along, and anywhere
+    end_sd_mm: float = 4.0
+    edge_sd_mm: float = 1.0
+    min_curvature: float = 1e-4  # of the loss
+    grown: float = 1.3  # times the radius, and beyond the end, that a shaft is taken to cover
+    beyond_mm: float = 10.0
+    n_blocks: int = 10  # stretches of a recording whose errors are taken to be independent
+
+
+LAYERS = LayerSettings()
+
 N_PARAMETERS = 9  # turn rad [3], shift mm [3], clock s, logarithm of the radius, mm ahead
-EXCHANGED_SD = 0.5  # standard deviations about the result, within which exchanged poses are tried
-EXCHANGED_SHARES = (0.37, 0.61)  # of the recording, by which poses are shifted for comparison
-MIN_CERTAINTY = 3.0  # standard deviations by which poses must explain images better than those of other moments
-PROBE_SD, N_PROBES = 0.25, 140  # about the minimum, of the loss's second derivatives
-SIZE_SD, END_SD_MM, EDGE_SD_MM = 0.03, 4.0, 1.0  # errors common to all images: of the distance, along, and anywhere
-MIN_CURVATURE = 1e-4  # of the loss
-GROWN, BEYOND_MM = 1.3, 10.0  # times the radius, and beyond the end, that a shaft is taken to cover
-N_BLOCKS = 10  # stretches of a recording whose errors are taken to be independent
 
 Parameters = tuple[np.ndarray, float, float, float]  # camera_from_base [4, 4], clock s, radius mm, mm ahead
 
@@ -100,7 +120,7 @@ class LayerModel:
         poses = camera_from_base @ poses_at_clock(self.arm.poses, clock)
         axis = poses[:, :3, :3] @ self.arm.line.axis
         middle = poses[:, :3, :3] @ self.arm.line.point + poses[:, :3, 3]
-        back = middle - LENGTH_MM * axis
+        back = middle - LAYERS.length_mm * axis
         if self.arm.wrists is None:
             return self._tube(middle + ahead * axis, back, radius)
         inside, mm, across = self._tube(middle, back, radius)
@@ -109,14 +129,14 @@ class LayerModel:
         of_wrist = self._tube(tips + ahead * beyond, middle, radius)
         wrist = of_wrist[0] > inside
         inside, mm, across = (
-            np.where(wrist, *both) for both in zip(of_wrist, (inside, mm + MAX_WRIST_MM, across), strict=True)
+            np.where(wrist, *both) for both in zip(of_wrist, (inside, mm + LAYERS.max_wrist_mm, across), strict=True)
         )
         return inside, mm, across
 
     def _tube(self, start: np.ndarray, end: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`covered` by a tube from `start` to `end`, both [F, 3] mm in the camera's frame."""
         fx, fy, cx, cy = self.intrinsics
-        depths = [np.maximum(point[:, 2], NEAREST_MM) for point in (start, end)]
+        depths = [np.maximum(point[:, 2], RIGID.nearest_mm) for point in (start, end)]
         front, back = (
             np.stack([point[:, 0] / depth * fx + cx, point[:, 1] / depth * fy + cy], -1).astype(np.float32)
             for point, depth in zip((start, end), depths, strict=True)
@@ -133,7 +153,7 @@ class LayerModel:
         first, last = (depth[:, None].astype(np.float32) for depth in depths)
         whole = np.linalg.norm(end - start, axis=1)[:, None].astype(np.float32)
         mm = share * first / np.maximum(last + share * (first - last), 1e-3) * whole
-        return inside * (depths[0] > NEAREST_MM)[:, None], mm, across / half
+        return inside * (depths[0] > RIGID.nearest_mm)[:, None], mm, across / half
 
     def losses(self, camera_from_base: np.ndarray, clock: float, radius: float, ahead: float) -> np.ndarray:
         """Mean robust deviations [F] of an image's pixels from their layers, in [0, 1]."""
@@ -144,28 +164,30 @@ class LayerModel:
             mean = np.einsum("fp,fpc->pc", weights, self.colors) / np.maximum(weights.sum(0), 1e-3)[:, None]
             off = np.square(self.colors - mean).mean(-1)
             weights = behind * _robust_weights(off)
-        known = behind.sum(0) > MIN_BACKGROUND
-        loss = np.where(known, behind * off / (off + COLOR_SCALE**2), 0.0).sum(1)
+        known = behind.sum(0) > LAYERS.min_background
+        loss = np.where(known, behind * off / (off + LAYERS.color_scale**2), 0.0).sum(1)
         front = inside * self.usable
         rows, columns = np.nonzero(front > 0.02)
         if len(rows):
             front, colors = front[rows, columns], self.colors[rows, columns]
-            along = np.clip(mm[rows, columns] / STEP_MM, 0, (LENGTH_MM + 100) / STEP_MM).astype(np.int64)
-            side = np.clip((across[rows, columns] + 1) * N_COLUMNS / 2, 0, N_COLUMNS - 1).astype(np.int64)
-            cells = along * N_COLUMNS + side
+            along = np.clip(mm[rows, columns] / LAYERS.step_mm, 0, (LAYERS.length_mm + 100) / LAYERS.step_mm).astype(
+                np.int64
+            )
+            side = np.clip((across[rows, columns] + 1) * LAYERS.n_columns / 2, 0, LAYERS.n_columns - 1).astype(np.int64)
+            cells = along * LAYERS.n_columns + side
             weights = front
             for _ in range(3):
                 total = np.maximum(np.bincount(cells, weights), 1e-3)
                 mean = np.stack([np.bincount(cells, weights * color) / total for color in colors.T], -1)
                 off = np.square(colors - mean[cells]).mean(-1)
                 weights = front * _robust_weights(off)
-            loss = loss + np.bincount(rows, front * off / (off + COLOR_SCALE**2), len(loss))
+            loss = loss + np.bincount(rows, front * off / (off + LAYERS.color_scale**2), len(loss))
         return np.asarray(len(loss) * loss / self.usable.sum())
 
 
 def _robust_weights(squares: np.ndarray) -> np.ndarray:
     """Weights of the Geman-McClure loss from squared deviations of colours."""
-    return np.asarray((COLOR_SCALE**2 / (COLOR_SCALE**2 + squares)) ** 2)
+    return np.asarray((LAYERS.color_scale**2 / (LAYERS.color_scale**2 + squares)) ** 2)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -185,7 +207,7 @@ class LayerFit:
     @property
     def found(self) -> bool:
         """Whether the arm's own poses explain more than those of other moments."""
-        return self.certainty > MIN_CERTAINTY
+        return self.certainty > LAYERS.min_certainty
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,13 +223,13 @@ class _Trial:
         """Arguments of `LayerModel.losses` from parameters [N_PARAMETERS]."""
         step = x * self.sds
         base = moved_base(self.given, self.given[:3, :3] @ self.middle + self.given[:3, 3], step[:6])
-        return base, float(step[6]), RADIUS_MM * float(np.exp(step[7])), AHEAD_MM + float(step[8])
+        return base, float(step[6]), LAYERS.radius_mm * float(np.exp(step[7])), LAYERS.ahead_mm + float(step[8])
 
     def losses(self, x: np.ndarray) -> np.ndarray:
         return self.model.losses(*self.at(x))
 
     def cost(self, x: np.ndarray) -> float:
-        return float(self.losses(x).mean()) + PRIOR_WEIGHT / 2 * float(x @ x)
+        return float(self.losses(x).mean()) + LAYERS.prior_weight / 2 * float(x @ x)
 
 
 def fit_layers(
@@ -215,27 +237,27 @@ def fit_layers(
 ) -> LayerFit:
     """Estimate the base of one arm before a still camera, about a prior: (camera_from_base, sd mm at the instrument, sd
     degrees). sd_clock s: 0 where the clock is known."""
-    sds = np.array([np.radians(prior[2])] * 3 + [prior[1]] * 3 + [sd_clock, LOG_RADIUS_SD, AHEAD_SD_MM])
+    sds = np.array([np.radians(prior[2])] * 3 + [prior[1]] * 3 + [sd_clock, LAYERS.log_radius_sd, LAYERS.ahead_sd_mm])
     middle = arm.poses[len(CLOCK_SHIFTS_S) // 2, :, :3, 3].mean(0)
     coarse, medium, fine = (
         _Trial(LayerModel(arm.take(evenly_spaced(len(arm.images), count, floor=True)), width), prior[0], middle, sds)
-        for width, count in zip(WIDTHS_PX, N_IMAGES, strict=True)
+        for width, count in zip(LAYERS.widths_px, LAYERS.n_images, strict=True)
     )
-    start = np.zeros(N_PARAMETERS), FIRST_SD**2 * np.eye(N_PARAMETERS)
-    mean, spread = _narrowed(coarse, *start, (N_FIRST, 1), generator)
-    mean, spread = _narrowed(coarse, mean, WIDENING**2 * spread, N_TRIED[0], generator)
-    mean, spread = _narrowed(medium, mean, WIDENING**2 * spread, N_TRIED[1], generator)
+    start = np.zeros(N_PARAMETERS), LAYERS.first_sd**2 * np.eye(N_PARAMETERS)
+    mean, spread = _narrowed(coarse, *start, (LAYERS.n_first, 1), generator)
+    mean, spread = _narrowed(coarse, mean, LAYERS.widening**2 * spread, LAYERS.n_tried[0], generator)
+    mean, spread = _narrowed(medium, mean, LAYERS.widening**2 * spread, LAYERS.n_tried[1], generator)
     losses = medium.losses(mean)
     behind_camera = np.diag([1.0, 1.0, -1.0, 1.0]) @ prior[0]
     without = medium.model.losses(behind_camera, 0.0, 0.1, 0.0)
     certainty = np.inf
-    for share in EXCHANGED_SHARES:
-        other = replace(medium, model=LayerModel(medium.model.arm.exchanged(share), WIDTHS_PX[1]))
-        best, _ = _narrowed(other, mean, EXCHANGED_SD**2 * np.eye(N_PARAMETERS), N_TRIED[1], generator)
+    for share in LAYERS.exchanged_shares:
+        other = replace(medium, model=LayerModel(medium.model.arm.exchanged(share), LAYERS.widths_px[1]))
+        best, _ = _narrowed(other, mean, LAYERS.exchanged_sd**2 * np.eye(N_PARAMETERS), LAYERS.n_tried[1], generator)
         # in standard deviations, where differences of one stretch are correlated
-        parts = np.array([part.mean() for part in np.array_split(other.losses(best) - losses, N_BLOCKS)])
-        certainty = min(certainty, float(parts.mean() / max(parts.std(ddof=1) / np.sqrt(N_BLOCKS), 1e-12)))
-    mean, spread = _narrowed(fine, mean, WIDENING**2 * spread, N_TRIED[2], generator)
+        parts = np.array([part.mean() for part in np.array_split(other.losses(best) - losses, LAYERS.n_blocks)])
+        certainty = min(certainty, float(parts.mean() / max(parts.std(ddof=1) / np.sqrt(LAYERS.n_blocks), 1e-12)))
+    mean, spread = _narrowed(fine, mean, LAYERS.widening**2 * spread, LAYERS.n_tried[2], generator)
     base, clock, radius, ahead = fine.at(mean)
     return LayerFit(
         camera_from_base=base,
@@ -253,7 +275,9 @@ def fit_layers(
 def covered_by(fit: LayerFit, arm: ArmImages) -> np.ndarray:
     """Pixels bool [F, H, W] of an arm's images that the shaft of a fit covers, and its wrist."""
     model = LayerModel(arm, arm.images.shape[2])
-    inside, _, _ = model.covered(fit.camera_from_base, fit.clock, GROWN * fit.radius, fit.ahead + BEYOND_MM)
+    inside, _, _ = model.covered(
+        fit.camera_from_base, fit.clock, LAYERS.grown * fit.radius, fit.ahead + LAYERS.beyond_mm
+    )
     return (inside > 0).reshape(arm.images.shape[:3])
 
 
@@ -266,7 +290,7 @@ def _narrowed(
         samples = generator.multivariate_normal(mean, spread, count, method="eigh")
         samples[0] = mean
         order = np.argsort([trial.cost(x) for x in samples], kind="stable")
-        best = samples[order[: min(MAX_ELITE, count // 2)]]
+        best = samples[order[: min(LAYERS.max_elite, count // 2)]]
         mean, spread = best.mean(0), 1.2 * np.cov(best.T)
     return mean, spread
 
@@ -274,17 +298,17 @@ def _narrowed(
 def _covariance(trial: _Trial, mean: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Posterior covariance [7, 7] of base and clock, in prior standard deviations: from the loss's curvature, the
     scatter of its gradient over stretches of the recording, and errors common to all images."""
-    probes = PROBE_SD * generator.normal(size=(N_PROBES, N_PARAMETERS))
+    probes = LAYERS.probe_sd * generator.normal(size=(LAYERS.n_probes, N_PARAMETERS))
     losses = np.stack([trial.losses(mean + x) for x in probes])  # [N, F]
     pairs = np.triu_indices(N_PARAMETERS)
-    terms = np.concatenate([np.ones((N_PROBES, 1)), probes, probes[:, pairs[0]] * probes[:, pairs[1]]], 1)
+    terms = np.concatenate([np.ones((LAYERS.n_probes, 1)), probes, probes[:, pairs[0]] * probes[:, pairs[1]]], 1)
     found = np.linalg.lstsq(terms, losses, rcond=None)[0] / losses.shape[1]  # [T, F]
-    slopes = np.stack([part.sum(1) for part in np.array_split(found[1 : 1 + N_PARAMETERS], N_BLOCKS, axis=1)])
+    slopes = np.stack([part.sum(1) for part in np.array_split(found[1 : 1 + N_PARAMETERS], LAYERS.n_blocks, axis=1)])
     curves = np.zeros((N_PARAMETERS, N_PARAMETERS))
     curves[pairs] = found[1 + N_PARAMETERS :].sum(1)
     values, vectors = np.linalg.eigh(curves + curves.T)
-    scatter = N_BLOCKS * np.cov(slopes.T)
-    variances = np.einsum("ip,ij,jp->p", vectors, scatter, vectors) / np.maximum(values, MIN_CURVATURE) ** 2
+    scatter = LAYERS.n_blocks * np.cov(slopes.T)
+    variances = np.einsum("ip,ij,jp->p", vectors, scatter, vectors) / np.maximum(values, LAYERS.min_curvature) ** 2
     images = (vectors @ np.diag(np.maximum(variances, 1e-6)) @ vectors.T)[:7, :7]
     images[3:6, 3:6] += _common_errors(trial, mean) / np.outer(trial.sds[3:6], trial.sds[3:6])
     return np.asarray(np.linalg.inv(np.linalg.inv(images) + np.eye(7)))
@@ -297,8 +321,8 @@ def _common_errors(trial: _Trial, mean: np.ndarray) -> np.ndarray:
     place = base[:3, :3] @ trial.middle + base[:3, 3]
     shaft = base[:3, :3] @ (arm.poses[len(CLOCK_SHIFTS_S) // 2, :, :3, :3] @ arm.line.axis).mean(0)
     shaft = shaft / np.linalg.norm(shaft)
-    along_view, along_shaft = SIZE_SD**2 * np.outer(place, place), END_SD_MM**2 * np.outer(shaft, shaft)
-    return np.asarray(along_view + along_shaft + EDGE_SD_MM**2 * np.eye(3))
+    along_view, along_shaft = LAYERS.size_sd**2 * np.outer(place, place), LAYERS.end_sd_mm**2 * np.outer(shaft, shaft)
+    return np.asarray(along_view + along_shaft + LAYERS.edge_sd_mm**2 * np.eye(3))
 
 
 def evenly_lit(images: np.ndarray) -> np.ndarray:

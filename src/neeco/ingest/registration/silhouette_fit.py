@@ -26,20 +26,35 @@ from neeco.ingest.registration.silhouette_model import (
     sides,
 )
 
-SHAPE_SD_MM = (10.0, 1.0, 0.7)  # of orders 0 (about the first guess), 1 and 2 at each station
-JOINT_SD_MM = 2.0  # of what a standard deviation of a reading adds to any order
-LEVEL_SD_MM = 1.0  # of the difference of neighbouring radii: shafts are tubes
-LINE_SD_MM, LINE_SD_RAD = 30.0, 0.5  # of the line about its first guess
-END_SD_MM = 4.0  # of what a standard deviation of a reading, or its square, moves the tip
-MARK_SD_MM = 1e4  # of the marks' place along the line
-CLOCK_SD_S = 0.1  # of a clock that nothing gives
-FRONT_SHARE = 0.4  # of the line, from the tip, whose sides do not count: jaws and wrist move there
-MIN_MEDIANS = 3.0  # width of a station's loss, in medians of its residuals
-WIDTHS_PX = (12.0, 6.0, 3.0, 1.5, 1.0)  # of the robust loss, one after the other; px of masks 160 wide
-MARK_SHARE = 0.125  # of that width for marks, which are exact; outlines have correlated errors in a frame
-MAX_STEPS, TOLERANCE = 12, 1e-5  # of Levenberg-Marquardt, at each width; share of the loss
-DAMPING, SMOOTH_DAMPING = 1e-2, 1e-4  # at first
-MAX_TURN_RAD, MAX_SHIFT_MM = 0.15, 15.0  # of the base in one step
+
+@dataclass(frozen=True, kw_only=True)
+class SilhouetteFitSettings:
+    """Priors and settings of the fit."""
+
+    # of orders 0 (about the first guess), 1 and 2 at each station
+    shape_sd_mm: tuple[float, float, float] = (10.0, 1.0, 0.7)
+    joint_sd_mm: float = 2.0  # of what a standard deviation of a reading adds to any order
+    level_sd_mm: float = 1.0  # of the difference of neighbouring radii: shafts are tubes
+    line_sd_mm: float = 30.0  # of the line about its first guess
+    line_sd_rad: float = 0.5
+    end_sd_mm: float = 4.0  # of what a standard deviation of a reading, or its square, moves the tip
+    mark_sd_mm: float = 1e4  # of the marks' place along the line
+    clock_sd_s: float = 0.1  # of a clock that nothing gives
+    front_share: float = 0.4  # of the line, from the tip, whose sides do not count: jaws and wrist move there
+    min_medians: float = 3.0  # width of a station's loss, in medians of its residuals
+    # of the robust loss, one after the other; px of masks 160 wide
+    widths_px: tuple[float, ...] = (12.0, 6.0, 3.0, 1.5, 1.0)
+    mark_share: float = 0.125  # of that width for marks, which are exact; outlines have correlated errors in a frame
+    max_steps: int = 12  # of Levenberg-Marquardt, at each width; share of the loss
+    tolerance: float = 1e-5
+    damping: float = 1e-2  # at first
+    smooth_damping: float = 1e-4
+    max_turn_rad: float = 0.15  # of the base in one step
+    max_shift_mm: float = 15.0
+
+
+RIGID_FIT = SilhouetteFitSettings()
+
 # errors of a log's poses that last, rad and mm along each axis: trackers and robots drift by 0.2 to 0.4 mm
 POSE_SDS = np.array([0.0015] * 3 + [0.3] * 3)
 STEPS = np.array([0.012] * 3 + [0.8] * 3 + [0.02] + [0.012] * 2 + [0.8] * 2)  # of differences, by parameter
@@ -53,7 +68,7 @@ class BasePrior:
     world_from_base: np.ndarray
     sd_rad: float | None
     sd_mm: float | None
-    sd_clock: float = CLOCK_SD_S
+    sd_clock: float = RIGID_FIT.clock_sd_s
 
     @classmethod
     def of(cls, stated: tuple[np.ndarray, float, float] | None, sd_clock: float) -> BasePrior:
@@ -80,7 +95,7 @@ class _System:
 
     def __init__(self, problem: SilhouetteProblem, prior: BasePrior, first: SilhouetteFit) -> None:
         self.problem, self.prior, self.first = problem, prior, first
-        counted = first.stations > FRONT_SHARE * first.stations[-1]
+        counted = first.stations > RIGID_FIT.front_share * first.stations[-1]
         self.on_shaft = np.flatnonzero(counted[1:] & counted[:-1])[1:] + 1  # stations with a neighbour before
         self.front = np.tile(~counted, 2)
         self.free = np.ones(BASE + LINE + first.shape[1:].size + len(first.ends) + 1, dtype=bool)
@@ -155,7 +170,9 @@ class _System:
             offsets.append(off.ravel())
             sds.append(np.broadcast_to(sd, off.shape).ravel())
 
-        add(np.arange(BASE, start), np.zeros(LINE), np.array([LINE_SD_RAD] * 2 + [LINE_SD_MM] * 2))  # of a step
+        add(
+            np.arange(BASE, start), np.zeros(LINE), np.array([RIGID_FIT.line_sd_rad] * 2 + [RIGID_FIT.line_sd_mm] * 2)
+        )  # of a step
         prior, given = self.prior, self.prior.world_from_base
         if prior.sd_rad is not None and prior.sd_mm is not None:
             turn = Rotation.from_matrix(fit.world_from_base[:3, :3] @ given[:3, :3].T)
@@ -165,20 +182,22 @@ class _System:
             add(np.array([6]), np.array([fit.clock]), prior.sd_clock)
         off = fit.shape.copy()
         off[:, 0, 0] -= self.first.shape[:, 0, 0]
-        shape_sd = np.full(off.shape[1:], JOINT_SD_MM)
-        shape_sd[0] = [SHAPE_SD_MM[0]] + [SHAPE_SD_MM[order] for order in range(1, ORDERS + 1) for _ in range(2)]
+        shape_sd = np.full(off.shape[1:], RIGID_FIT.joint_sd_mm)
+        shape_sd[0] = [RIGID_FIT.shape_sd_mm[0]] + [
+            RIGID_FIT.shape_sd_mm[order] for order in range(1, ORDERS + 1) for _ in range(2)
+        ]
         add(start + np.arange(off[1:].size), off[1:], shape_sd)
-        end_sd = np.where(np.arange(len(fit.ends)), END_SD_MM, LINE_SD_MM)
+        end_sd = np.where(np.arange(len(fit.ends)), RIGID_FIT.end_sd_mm, RIGID_FIT.line_sd_mm)
         add(np.arange(count - 1 - len(fit.ends), count - 1), fit.ends, end_sd)
-        add(np.array([count - 1]), np.zeros(1), MARK_SD_MM)
+        add(np.array([count - 1]), np.zeros(1), RIGID_FIT.mark_sd_mm)
         index, values, sd = (np.concatenate(part) for part in (indices, offsets, sds))
         rows = np.zeros((len(index) + len(self.on_shaft), count))
         rows[np.arange(len(index)), index] = 1 / sd
         radii = start + fit.shape[0].size * (self.on_shaft - 1)  # parameters
-        rows[np.arange(len(index), len(rows)), radii] = 1 / LEVEL_SD_MM
-        rows[np.arange(len(index), len(rows)), radii - fit.shape[0].size] = -1 / LEVEL_SD_MM
+        rows[np.arange(len(index), len(rows)), radii] = 1 / RIGID_FIT.level_sd_mm
+        rows[np.arange(len(index), len(rows)), radii - fit.shape[0].size] = -1 / RIGID_FIT.level_sd_mm
         steps = fit.shape[self.on_shaft, 0, 0] - fit.shape[self.on_shaft - 1, 0, 0]
-        return np.concatenate([values / sd, steps / LEVEL_SD_MM]), rows
+        return np.concatenate([values / sd, steps / RIGID_FIT.level_sd_mm]), rows
 
     def prior_loss(self, fit: SilhouetteFit) -> float:
         """Sum of squares of the priors' residuals."""
@@ -186,7 +205,7 @@ class _System:
 
 
 def fit_silhouettes(
-    problem: SilhouetteProblem, prior: BasePrior, start: SilhouetteFit, widths: tuple[float, ...] = WIDTHS_PX
+    problem: SilhouetteProblem, prior: BasePrior, start: SilhouetteFit, widths: tuple[float, ...] = RIGID_FIT.widths_px
 ) -> SilhouetteFit:
     """The nearest fit to the silhouettes, from a first one, under a Cauchy loss that narrows."""
     fit = start
@@ -200,7 +219,7 @@ def refine(problem: SilhouetteProblem, prior: BasePrior, fit: SilhouetteFit, max
     """The fit with the narrowest loss."""
     # with marks, the place along the line is known: the solver has to follow what outlines leave open
     smooth = problem.marks is not None
-    return _minimise(_System(problem, prior, fit), fit, WIDTHS_PX[-1] * problem.px_scale, max_steps, smooth)
+    return _minimise(_System(problem, prior, fit), fit, RIGID_FIT.widths_px[-1] * problem.px_scale, max_steps, smooth)
 
 
 def _widths(at: _Residuals, width: float) -> np.ndarray:
@@ -208,11 +227,11 @@ def _widths(at: _Residuals, width: float) -> np.ndarray:
     stations = at.px.shape[1] // 2 - 1
     both, valid = (np.concatenate([part[:, :stations], part[:, stations:-2]]) for part in (np.abs(at.px), at.valid))
     typical = [np.median(column[use]) if use.any() else 0.0 for column, use in zip(both.T, valid.T, strict=True)]
-    widths = [*np.tile(np.maximum(width, MIN_MEDIANS * np.array(typical)), 2)]
-    for column, narrow in ((-2, width), (-1, MARK_SHARE * width)):
+    widths = [*np.tile(np.maximum(width, RIGID_FIT.min_medians * np.array(typical)), 2)]
+    for column, narrow in ((-2, width), (-1, RIGID_FIT.mark_share * width)):
         last = at.px[at.valid[:, column], column]
         spread = float(np.median(np.abs(last - np.median(last)))) if len(last) else 0.0
-        widths.append(max(narrow, MIN_MEDIANS * spread))
+        widths.append(max(narrow, RIGID_FIT.min_medians * spread))
     return np.array(widths)
 
 
@@ -227,7 +246,7 @@ def _loss(px: np.ndarray, valid: np.ndarray, widths: np.ndarray) -> float:
 
 
 def _minimise(
-    system: _System, fit: SilhouetteFit, width: float, max_steps: int = MAX_STEPS, smooth: bool = False
+    system: _System, fit: SilhouetteFit, width: float, max_steps: int = RIGID_FIT.max_steps, smooth: bool = False
 ) -> SilhouetteFit:
     free = system.free
 
@@ -249,16 +268,16 @@ def _minimise(
     def move(fit: SilhouetteFit, free_step: np.ndarray) -> SilhouetteFit:
         step = np.zeros(len(free))
         step[free] = free_step
-        step[:3] = np.clip(step[:3], -MAX_TURN_RAD, MAX_TURN_RAD)
-        step[3:6] = np.clip(step[3:6], -MAX_SHIFT_MM, MAX_SHIFT_MM)
+        step[:3] = np.clip(step[:3], -RIGID_FIT.max_turn_rad, RIGID_FIT.max_turn_rad)
+        step[3:6] = np.clip(step[3:6], -RIGID_FIT.max_shift_mm, RIGID_FIT.max_shift_mm)
         return system.moved(fit, step)
 
-    damping = SMOOTH_DAMPING if smooth else DAMPING
-    fit = levenberg_marquardt(fit, linearise, move, max_steps=max_steps, damping=damping, tolerance=TOLERANCE)
+    damping = RIGID_FIT.smooth_damping if smooth else RIGID_FIT.damping
+    fit = levenberg_marquardt(fit, linearise, move, max_steps=max_steps, damping=damping, tolerance=RIGID_FIT.tolerance)
     at = system.residuals(fit)
     median = float(np.median(np.abs(at.px[at.valid]))) if at.valid.any() else np.inf
     count = max(int(at.valid.sum()), 1)
-    cost = _loss(at.px, at.valid, width * np.append(np.ones(at.px.shape[1] - 1), MARK_SHARE)) / count
+    cost = _loss(at.px, at.valid, width * np.append(np.ones(at.px.shape[1] - 1), RIGID_FIT.mark_share)) / count
     # where residuals fit they are far smaller than the loss's width, so priors count by the square of that ratio
     noise = median / 0.67 / width if at.valid.any() else 1.0
     return replace(fit, cost=cost, loss=cost + noise**2 * system.prior_loss(fit) / count, residual_px=median)
@@ -274,7 +293,7 @@ def fit_covariance(problem: SilhouetteProblem, prior: BasePrior, fit: Silhouette
     system = _System(problem, prior, fit)
     at = system.residuals(fit)
     columns = system.jacobian(fit, at, smooth=True)
-    weights = _robust_weights(at, _widths(at, WIDTHS_PX[-1] * problem.px_scale))
+    weights = _robust_weights(at, _widths(at, RIGID_FIT.widths_px[-1] * problem.px_scale))
     by_pose = np.einsum("fkp,fk,fkq->fpq", columns, weights, columns[..., :6])  # of scores, by errors of a frame's pose
     scores = np.einsum("fkp,fk,fk->fp", columns, weights, at.px)
     blocks = [problem.blocks == block for block in np.unique(problem.blocks)]

@@ -23,10 +23,21 @@ N_TERMS = 1 + 2 * ORDERS
 CLOCK_SHIFTS_S = np.arange(-0.16, 0.161, 0.02)  # about the clock's first guess, at which poses are known
 BASE = 7  # parameters of the base (turn rad [3], shift mm [3]) and the clock (s)
 LINE = 4  # parameters of the line: two turns rad, two shifts mm
-NEAREST_MM = 5.0  # depth at which points are projected at least
-MIN_RADIUS_MM = 0.3
-MAX_LENGTH_MM, MIN_LENGTH_MM = 150.0, 15.0  # of the line, from the tip
-RADIUS_RANGE_MM, DEFAULT_RADIUS_MM = (0.5, 15.0), 3.0  # of a first guess
+
+
+@dataclass(frozen=True, kw_only=True)
+class SilhouetteModelSettings:
+    """Limits of the shape."""
+
+    nearest_mm: float = 5.0  # depth at which points are projected at least
+    min_radius_mm: float = 0.3
+    max_length_mm: float = 150.0  # of the line, from the tip
+    min_length_mm: float = 15.0
+    radius_range_mm: tuple[float, float] = (0.5, 15.0)  # of a first guess
+    default_radius_mm: float = 3.0
+
+
+RIGID = SilhouetteModelSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,7 +86,7 @@ class SilhouetteProblem(LoggedSilhouettes):
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixels [..., 2] of points [..., 3] mm in the cameras' frames."""
-        return np.stack(project(points, *self.silhouettes.intrinsics, nearest=NEAREST_MM), -1)
+        return np.stack(project(points, *self.silhouettes.intrinsics, nearest=RIGID.nearest_mm), -1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -152,7 +163,7 @@ def sides(problem: SilhouetteProblem, fit: SilhouetteFit) -> Sides:
     middle = fit.tip - fit.stations[:, None] * fit.axis  # [K, 3]
     eye = -np.einsum("fji,fj->fi", rotation, shift)  # [F, 3] the camera, instrument frame
     local = (eye[:, None] - middle) @ basis  # [F, K, 3]: towards it, in the line's frame
-    flat = np.maximum(np.hypot(local[..., 0], local[..., 1]), NEAREST_MM)
+    flat = np.maximum(np.hypot(local[..., 0], local[..., 1]), RIGID.nearest_mm)
     towards = np.arctan2(local[..., 1], local[..., 0])
     shapes = fit.shape[:, 0] + np.einsum("fj,kjm->fkm", problem.readings, fit.shape[:, 1:])  # [F, K, N_TERMS]
     side = np.repeat([1.0, -1.0], len(fit.stations))  # [2K]
@@ -165,11 +176,11 @@ def sides(problem: SilhouetteProblem, fit: SilhouetteFit) -> Sides:
     normals = np.cos(angles)[..., None] * basis[:, 0] + np.sin(angles)[..., None] * basis[:, 1]
     points = np.concatenate([middle, middle]) + height[..., None] * normals
     camera = points @ rotation.transpose(0, 2, 1) + shift[:, None]
-    depth = np.maximum(camera[..., 2:], NEAREST_MM)
+    depth = np.maximum(camera[..., 2:], RIGID.nearest_mm)
     outwards = normals @ rotation.transpose(0, 2, 1)
     focal = np.array(problem.silhouettes.intrinsics[:2])
     px_per_mm = focal * (outwards[..., :2] - camera[..., :2] / depth * outwards[..., 2:]) / depth
-    return Sides(problem.project(camera), angles, np.where(camera[..., 2:] > NEAREST_MM, px_per_mm, 0.0))
+    return Sides(problem.project(camera), angles, np.where(camera[..., 2:] > RIGID.nearest_mm, px_per_mm, 0.0))
 
 
 def reach(problem: SilhouetteProblem, fit: SilhouetteFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -182,7 +193,7 @@ def reach(problem: SilhouetteProblem, fit: SilhouetteFit) -> tuple[np.ndarray, n
     rotation, shift = _instrument_in_camera(problem, fit)
     fx, fy, _, _ = problem.silhouettes.intrinsics
     axis, end = rotation @ fit.axis, rotation @ fit.tip + shift
-    depth = np.maximum(end[:, 2], NEAREST_MM)
+    depth = np.maximum(end[:, 2], RIGID.nearest_mm)
     x, y = end[:, 0] / depth, end[:, 1] / depth
     slope = np.stack([fx * (axis[:, 0] - x * axis[:, 2]), fy * (axis[:, 1] - y * axis[:, 2])], -1)
     along = slope / np.maximum(np.linalg.norm(slope, axis=1), 1e-6)[:, None]
@@ -248,10 +259,10 @@ def first_shape(problem: SilhouetteProblem, fit: SilhouetteFit) -> SilhouetteFit
         pixels, px_per_mm = found.pixels[:, : len(stations)], found.px_per_mm[:, : len(stations)]
         return pixels, px_per_mm, problem.silhouettes.inside(pixels) & px_per_mm.any(-1)
 
-    behind = np.linspace(0, MAX_LENGTH_MM, 61)
+    behind = np.linspace(0, RIGID.max_length_mm, 61)
     _, _, visible = line_at(behind)
     last = np.where(visible.any(1), behind[len(behind) - 1 - np.argmax(visible[:, ::-1], 1)], 0.0)
-    length = max(float(np.quantile(last, 0.8)), MIN_LENGTH_MM)
+    length = max(float(np.quantile(last, 0.8)), RIGID.min_length_mm)
     stations = length * (np.arange(N_STATIONS) / (N_STATIONS - 1)) ** 1.4
     pixels, px_per_mm, visible = line_at(stations)
     half, _ = problem.silhouettes.look_up(pixels)
@@ -259,9 +270,9 @@ def first_shape(problem: SilhouetteProblem, fit: SilhouetteFit) -> SilhouetteFit
     radii[visible] = half[visible] / np.linalg.norm(px_per_mm[visible], axis=-1)
     typical = np.array([np.nanmedian(column) if np.isfinite(column).any() else np.nan for column in radii.T])
     back = typical[N_STATIONS // 2 :]
-    inner = np.nanmedian(back) if np.isfinite(back).any() else DEFAULT_RADIUS_MM
+    inner = np.nanmedian(back) if np.isfinite(back).any() else RIGID.default_radius_mm
     shape = np.zeros((N_STATIONS, kinds, N_TERMS))
-    shape[1:, 0, 0] = np.clip(np.where(np.isfinite(typical), typical, inner), *RADIUS_RANGE_MM)[1:]
+    shape[1:, 0, 0] = np.clip(np.where(np.isfinite(typical), typical, inner), *RIGID.radius_range_mm)[1:]
     ends = fit.ends if len(fit.ends) else np.zeros(2 * kinds - 1 + kinds * N_TERMS)
     return replace(fit, stations=stations, shape=shape, ends=ends)
 
@@ -276,7 +287,7 @@ def moved(fit: SilhouetteFit, step: np.ndarray, pivot: np.ndarray) -> Silhouette
     shape, ends, mark = fit.shape.copy(), fit.ends, fit.mark
     if len(rest):
         shape[1:] += rest[: shape[1:].size].reshape(shape[1:].shape)
-        shape[1:, 0, 0] = np.maximum(shape[1:, 0, 0], MIN_RADIUS_MM)
+        shape[1:, 0, 0] = np.maximum(shape[1:, 0, 0], RIGID.min_radius_mm)
         ends, mark = ends + rest[shape[1:].size : -1], mark + float(rest[-1])
     return replace(
         fit,

@@ -18,20 +18,34 @@ from neeco.ingest.foreground.silhouettes import ShaftLines
 from neeco.ingest.registration.silhouette_fit import BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSilhouettes
 
-N_ROTATIONS, N_UNIFORM = 500, 4000  # tried about a rough base, and without one
-MAX_START_COST = 2.0  # of robust losses below 1 each, and the prior's
-TYPICAL_RADIUS_MM = 3.5  # of shafts
-LINE_SD_RAD = 0.03  # of a shaft's direction in a mask: jaws open, masks fray
-TIP_SD_PX, LINE_SD_PX = 5.0, 2.0  # of masks: the tip's place moves with the jaws
-TIP_SD_MM, STATED_TIP_SD_MM = 60.0, 5.0  # prior distance of the tip from the tracked frame's origin, or as stated
-SIDEWAYS_WEIGHT = 5e-4  # of a line's weight: where motion leaves it open, shafts are viewed from the side
-N_ROUNDS = 3  # of robust reweighting
-CHUNK = 500  # rotations tried at once
-MIN_STEP_RAD = 0.004  # to which rotations are narrowed down
-N_FIRST, N_NEXT, N_AROUND, N_BEST = 40, 20, 12, 6  # candidates kept at first and then, rotations about each, results
-DISTINCT_RAD = 0.05  # between results
-PRIOR_WEIGHT = 0.02  # of the mean residual: cost of a base one standard deviation off
-FAR_COST = 1e9  # of a base behind the cameras
+
+@dataclass(frozen=True, kw_only=True)
+class SilhouetteSearchSettings:
+    """Settings of the search."""
+
+    n_rotations: int = 500  # tried about a rough base, and without one
+    n_uniform: int = 4000
+    max_start_cost: float = 2.0  # of robust losses below 1 each, and the prior's
+    typical_radius_mm: float = 3.5  # of shafts
+    line_sd_rad: float = 0.03  # of a shaft's direction in a mask: jaws open, masks fray
+    tip_sd_px: float = 5.0  # of masks: the tip's place moves with the jaws
+    line_sd_px: float = 2.0
+    tip_sd_mm: float = 60.0  # prior distance of the tip from the tracked frame's origin, or as stated
+    stated_tip_sd_mm: float = 5.0
+    sideways_weight: float = 5e-4  # of a line's weight: where motion leaves it open, shafts are viewed from the side
+    n_rounds: int = 3  # of robust reweighting
+    chunk: int = 500  # rotations tried at once
+    min_step_rad: float = 0.004  # to which rotations are narrowed down
+    n_first: int = 40  # candidates kept at first and then, rotations about each, results
+    n_next: int = 20
+    n_around: int = 12
+    n_best: int = 6
+    distinct_rad: float = 0.05  # between results
+    prior_weight: float = 0.02  # of the mean residual: cost of a base one standard deviation off
+    far_cost: float = 1e9  # of a base behind the cameras
+
+
+SEARCH = SilhouetteSearchSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,7 +109,7 @@ def rotations_about(center: np.ndarray, sd_rad: float, count: int, generator: np
 def distance_to(problem: LoggedSilhouettes, known: BasePrior) -> float:
     """Approximate mm from the cameras to the instrument: by the prior, else by a shaft of typical size."""
     half = float(np.median([mask.max() for mask in problem.silhouettes.distances]))
-    guess = TYPICAL_RADIUS_MM * problem.silhouettes.intrinsics[0] / max(half, 0.5)
+    guess = SEARCH.typical_radius_mm * problem.silhouettes.intrinsics[0] / max(half, 0.5)
     if known.sd_mm is None:
         return guess
     place = problem.pivot(known.world_from_base)
@@ -114,12 +128,12 @@ def search_bases(
     """The best bases by lines (the masks' shafts where None) and tips of the masks. distance: as `distance_to` has it;
     stated: what links say of the shaft (see `ShaftViews`)."""
     if known.sd_rad is None or known.sd_mm is None:
-        rotations = uniform_rotations(N_UNIFORM, generator)
+        rotations = uniform_rotations(SEARCH.n_uniform, generator)
         cameras = np.linalg.inv(problem.camera_from_world)  # the instrument is where most of them look
         center, sd_mm, step = (cameras[:, :3, 3] + distance * cameras[:, :3, 2]).mean(0), distance, 0.2
     else:
         given = known.world_from_base
-        rotations = rotations_about(given[:3, :3], known.sd_rad, N_ROTATIONS, generator)
+        rotations = rotations_about(given[:3, :3], known.sd_rad, SEARCH.n_rotations, generator)
         center, sd_mm, step = problem.pivot(given), known.sd_mm, 0.5 * known.sd_rad
     views = ShaftViews(
         lines=problem.silhouettes.shafts if lines is None else lines,
@@ -132,24 +146,24 @@ def search_bases(
         **stated,
     )
     found = search(views, rotations, generator, step)
-    return found.take(np.flatnonzero(found.costs < MAX_START_COST))
+    return found.take(np.flatnonzero(found.costs < SEARCH.max_start_cost))
 
 
 def search(views: ShaftViews, rotations: np.ndarray, generator: np.random.Generator, first_step: float) -> Candidates:
     """The best bases, different from each other, after narrowing down around the best rotations [B, 3, 3]; first_step
     rad: between these."""
-    best = _solve_all(views, rotations).distinct(N_FIRST, first_step)
+    best = _solve_all(views, rotations).distinct(SEARCH.n_first, first_step)
     step = first_step
-    while step > MIN_STEP_RAD:
-        around = [rotations_about(base[:3, :3], step, N_AROUND, generator) for base in best.world_from_base]
+    while step > SEARCH.min_step_rad:
+        around = [rotations_about(base[:3, :3], step, SEARCH.n_around, generator) for base in best.world_from_base]
         step /= 2
-        best = _solve_all(views, np.concatenate(around)).distinct(N_NEXT, step)
-    return best.distinct(N_BEST, DISTINCT_RAD)
+        best = _solve_all(views, np.concatenate(around)).distinct(SEARCH.n_next, step)
+    return best.distinct(SEARCH.n_best, SEARCH.distinct_rad)
 
 
 def _solve_all(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     """The best base and instrument for each rotation, the cheapest first."""
-    parts = [_solve(views, rotations[first : first + CHUNK]) for first in range(0, len(rotations), CHUNK)]
+    parts = [_solve(views, rotations[first : first + SEARCH.chunk]) for first in range(0, len(rotations), SEARCH.chunk)]
     found = [np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)]
     order = np.argsort(found[0], kind="stable")
     return Candidates(*(values[order] for values in found))
@@ -179,13 +193,13 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     across = unit(np.cross(tip_rays, cameras[:, :3, 0]))
     # equations [F, 3, 3] that are 0 where the tip projects onto its place, and onto its line
     rows = np.stack([across, unit(np.cross(tip_rays, across)), normals], 1)
-    scale = (fx + fy) / 2 / distance / np.array([TIP_SD_PX, TIP_SD_PX, LINE_SD_PX])
+    scale = (fx + fy) / 2 / distance / np.array([SEARCH.tip_sd_px, SEARCH.tip_sd_px, SEARCH.line_sd_px])
     given = np.stack([has_tip, has_tip, has_line], -1)
 
     count = len(rotations)
     along = np.einsum("fi,bfij->bfj", normals, turned)  # [B, F, 3]
     towards = np.einsum("fi,bfij->bfj", unit(rays(on_line)), turned)
-    sideways = SIDEWAYS_WEIGHT * np.einsum("bfi,bfj->bij", towards, towards)
+    sideways = SEARCH.sideways_weight * np.einsum("bfi,bfj->bij", towards, towards)
     weight = np.broadcast_to(has_line, (count, len(has_line))).astype(float)
     weights = np.broadcast_to(given, (count, *given.shape)).astype(float)
     on_tip = np.einsum("fri,bfij->bfrj", rows, turned)
@@ -197,13 +211,13 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     if views.end is not None:
         wanted[:, :, 2] = np.einsum("fi,bfi->bf", normals, places - ends)
     wanted = wanted * scale
-    tip_sd = TIP_SD_MM if views.tips is None else STATED_TIP_SD_MM
+    tip_sd = SEARCH.tip_sd_mm if views.tips is None else SEARCH.stated_tip_sd_mm
     prior = np.diag([views.sd_mm**-2.0] * 3 + [tip_sd**-2.0] * 3)
     target = np.append(prior[:3, :3] @ views.center, np.zeros(3))
-    for _ in range(N_ROUNDS):
+    for _ in range(SEARCH.n_rounds):
         moments = np.einsum("bf,bfi,bfj->bij", weight, along, along) + sideways
         axes = np.linalg.eigh(moments)[1][:, :, 0] if views.axis is None else np.tile(views.axis, (count, 1))
-        line_off = np.einsum("bfj,bj->bf", along, axes) / LINE_SD_RAD
+        line_off = np.einsum("bfj,bj->bf", along, axes) / SEARCH.line_sd_rad
         weight = has_line / (1 + line_off**2)
         matrix = np.einsum("bfr,bfri,bfrj->bij", weights, linear, linear) + prior
         right = np.einsum("bfr,bfri,bfr->bi", weights, linear, wanted) + target
@@ -215,8 +229,8 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
         off = off * (distance / np.maximum(depth, 0.1 * distance))[..., None]  # as pixels
         weights = given / (1 + off**2)
     costs = _mean(line_off**2 / (1 + line_off**2), has_line) + _mean(off**2 / (1 + off**2), given)
-    costs = costs + PRIOR_WEIGHT * np.square((shift - views.center) / views.sd_mm).sum(-1)
-    costs = np.where((depth > 0).mean(1) > 0.9, costs, FAR_COST)
+    costs = costs + SEARCH.prior_weight * np.square((shift - views.center) / views.sd_mm).sum(-1)
+    costs = np.where((depth > 0).mean(1) > 0.9, costs, SEARCH.far_cost)
     # of the axis' two directions, the one that leads to the tip in most images
     behind = at - 0.1 * distance * np.einsum("bfij,bj->bfi", turned, axes)
     ends = [np.einsum("fij,bfj->bfi", cameras[:, :3, :3].transpose(0, 2, 1), end - places) for end in (at, behind)]
@@ -225,7 +239,7 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     if views.axis is None:
         axes = axes * np.where(agreement >= 0, 1.0, -1.0)[:, None]
     else:
-        costs = np.where(agreement >= 0, costs, FAR_COST)
+        costs = np.where(agreement >= 0, costs, SEARCH.far_cost)
     bases = np.tile(np.eye(4), (count, 1, 1))
     bases[:, :3, :3] = rotations
     bases[:, :3, 3] = shift - rotations @ middle

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
@@ -16,10 +17,20 @@ from neeco.scene.drawable import JointMotion, Skeleton
 
 LINK_LOGITS = "part_logits"  # the per-Gaussian extra [N, logit_count] that link weights are the softmax of
 MODULES = "hinges"  # the articulations' name in files of scenes, since version 0.1
-GATE_RADII = 1.0  # shaft radii behind the first joint up to which a link that it moves may reach
-GATE_WIDTH_RADII = 0.25  # width of that limit
-MAX_SCALE_RADII = 0.6  # standard deviation of what turns, or its far end would swing out behind the joint
-MAX_GATE_MM, MAX_GATE_WIDTH_MM = 1e9, 1e6  # where the radius is not known: everything is beyond the gate
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateSettings:
+    """Settings of the gate behind which nothing moves."""
+
+    gate_radii: float = 1.0  # shaft radii behind the first joint up to which a link that it moves may reach
+    gate_width_radii: float = 0.25  # width of that limit
+    max_scale_radii: float = 0.6  # standard deviation of what turns, or its far end would swing out behind the joint
+    max_gate_mm: float = 1e9  # where the radius is not known: everything is beyond the gate
+    max_gate_width_mm: float = 1e6
+
+
+GATE = GateSettings()
 
 
 class Articulation(nn.Module):
@@ -105,7 +116,7 @@ class Articulation(nn.Module):
             spin_end=self.round_until(),
             gate_start=gate[0],
             gate_width=gate[1],
-            longest=MAX_SCALE_RADII * self.radius,
+            longest=GATE.max_scale_radii * self.radius,
             roll=roll,
             slides=self.slides,
         )
@@ -113,8 +124,8 @@ class Articulation(nn.Module):
     @torch.no_grad()
     def _gate(self) -> tuple[Tensor, Tensor]:
         """Return (start [], width []) mm along the shaft of the gate behind which nothing moves with the joints."""
-        start = self.first_joint() - (GATE_RADII * self.radius).clamp_max(MAX_GATE_MM)
-        return start, GATE_WIDTH_RADII * self.radius.clamp_max(MAX_GATE_WIDTH_MM)
+        start = self.first_joint() - (GATE.gate_radii * self.radius).clamp_max(GATE.max_gate_mm)
+        return start, GATE.gate_width_radii * self.radius.clamp_max(GATE.max_gate_width_mm)
 
     def link_weights(self, points: Tensor, logits: Tensor) -> Tensor:
         """Return link weights [M, link_count] of Gaussians at points [M, 3] mm with logits [M, link_count or more]."""
@@ -144,7 +155,7 @@ class Articulation(nn.Module):
         """Return the largest standard deviation [M, 1] mm of Gaussians with link weights [M, link_count]; those that do
         not move are not limited."""
         moving = 1 - weights[:, :1]
-        return MAX_SCALE_RADII * self.radius / moving.clamp_min(1e-6)
+        return GATE.max_scale_radii * self.radius / moving.clamp_min(1e-6)
 
     def parts(self, points: Tensor, weights: Tensor) -> Tensor:
         """Return the shares [M, len(part_names)] of each part in Gaussians at points [M, 3] mm with link weights

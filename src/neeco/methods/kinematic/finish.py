@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -12,13 +12,7 @@ from torch import Tensor
 from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
 from neeco.geometry.projection import in_image
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments, Articulation
-from neeco.methods.kinematic.wrist import (
-    MIN_SOLID_GAUSSIANS,
-    SOLID_OPACITY,
-    color_boundary,
-    solid_extent,
-    solid_gaussians,
-)
+from neeco.methods.kinematic.wrist import WRIST, color_boundary, solid_extent, solid_gaussians
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Recorded
@@ -26,13 +20,21 @@ from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.visibility import visible_pixels
 from neeco.training.session import GaussianSession
 
-MIN_VISIBLE_SHARE = 0.2  # of the pixels that a Gaussian covers of its instrument rendered alone
-MIN_PIXELS_ALONE = 0.05  # px covered there, in all frames together: below, its own instrument occludes it
-MAX_OCCLUSION_FRAMES = 64  # evenly spaced
-MIN_COVERAGE = 0.08  # share of training frames that must observe a position of the shaft for it to be copied
-MAX_END_COVERAGE = 0.3  # share of frames above which the observed rear end is the real end
-MIN_JOINT_EXPLAINED = 0.35  # share of the moving parts' error that a found joint explains
-SLAB_RADII = 1.5  # length of the repeated slab, in shaft radii
+
+@dataclass(frozen=True, kw_only=True)
+class FinishSettings:
+    """Thresholds of what is concluded after training."""
+
+    min_visible_share: float = 0.2  # of the pixels that a Gaussian covers of its instrument rendered alone
+    min_pixels_alone: float = 0.05  # px covered there, in all frames together: below, its own instrument occludes it
+    max_occlusion_frames: int = 64  # evenly spaced
+    min_coverage: float = 0.08  # share of training frames that must observe a position of the shaft for it to be copied
+    max_end_coverage: float = 0.3  # share of frames above which the observed rear end is the real end
+    min_joint_explained: float = 0.35  # share of the moving parts' error that a found joint explains
+    slab_radii: float = 1.5  # length of the repeated slab, in shaft radii
+
+
+FINISH = FinishSettings()
 
 
 @torch.no_grad()
@@ -56,7 +58,7 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
         scene = session.scene
         count = int(solid_gaussians(scene.canonical, index).sum())
         scene.diagnostics.setdefault("instruments", {}).setdefault(instrument.name, {})["solid_gaussians"] = count
-        if count < MIN_SOLID_GAUSSIANS:
+        if count < WRIST.min_solid_gaussians:
             session.report(
                 f"warning: {instrument.name}: hardly anything was learned of it ({count} solid Gaussians), so its "
                 f"labels will be empty; {session.iteration} iterations are too few, the images show it too little, or "
@@ -112,7 +114,7 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
         errors = [float((r.color - target).abs().mean(-1)[covered].sum()) for r in renderings]
         given, middle = given + errors[0], middle + errors[1]
     explained = 1 - given / middle if middle > 0 else 0.0
-    explains = bool(explained > MIN_JOINT_EXPLAINED and math.isfinite(explained))
+    explains = bool(explained > FINISH.min_joint_explained and math.isfinite(explained))
     warning = scene.diagnostics.get("doubted_readings", {}).get(f"{instrument.name}.{name}")
     usual = replace(session.config, iterations=None).for_frames(len(session.views.frames)).length
     if short := usual.is_short(session.iteration):
@@ -164,14 +166,14 @@ def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
     canonical, recorded = scene.canonical, scene.recorded
     instruments = [canonical.bodies == body for body in range(1, len(canonical.counts))]  # bool [N] each
     visible, alone = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))
-    for index in evenly_spaced(len(recorded.cameras), MAX_OCCLUSION_FRAMES):
+    for index in evenly_spaced(len(recorded.cameras), FINISH.max_occlusion_frames):
         camera = recorded.cameras[index].within(REFERENCE_PIXELS)
         with torch.no_grad():
             posed = scene.at(recorded.states[index])
         visible += visible_pixels(posed, camera)
         for own in instruments:
             alone[own] += visible_pixels(posed.select(own), camera)
-    stays = (canonical.bodies == 0) | (alone < MIN_PIXELS_ALONE) | (visible >= MIN_VISIBLE_SHARE * alone)
+    stays = (canonical.bodies == 0) | (alone < FINISH.min_pixels_alone) | (visible >= FINISH.min_visible_share * alone)
     counts = tuple(int(stays[canonical.body(body)].sum()) for body in range(len(canonical.counts)))
     return canonical.map(lambda tensor: tensor[stays], counts)
 
@@ -188,7 +190,7 @@ def extend_shaft(
     """
     rows = canonical.body(body)
     along = articulation.along_shaft(canonical.means[rows])  # [M]
-    solid = torch.sigmoid(canonical.opacity_logits[rows]) > SOLID_OPACITY
+    solid = torch.sigmoid(canonical.opacity_logits[rows]) > WRIST.solid_opacity
     if not articulation.jointed or int(solid.sum()) < 50:
         return canonical
     rear, front = float(along[solid].quantile(0.01)), float(articulation.wrist_start)
@@ -197,10 +199,10 @@ def extend_shaft(
     device = canonical.means.device
     positions = torch.linspace(rear, front, 40, device=device)
     coverage = shaft_coverage(positions, name, articulation, recorded)
-    if float(coverage[0]) > MAX_END_COVERAGE or not bool((coverage >= MIN_COVERAGE).any()):
+    if float(coverage[0]) > FINISH.max_end_coverage or not bool((coverage >= FINISH.min_coverage).any()):
         return canonical
-    start = float(positions[coverage >= MIN_COVERAGE][0])
-    slab = SLAB_RADII * _median_radius(canonical, rows, articulation, solid)
+    start = float(positions[coverage >= FINISH.min_coverage][0])
+    slab = FINISH.slab_radii * _median_radius(canonical, rows, articulation, solid)
     copied = torch.nonzero((along >= start) & (along < start + slab))[:, 0]
     if start + slab > front or len(copied) < 10:
         return canonical

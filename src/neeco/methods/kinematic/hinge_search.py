@@ -16,16 +16,26 @@ from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, 
 from neeco.scene.training_session import Report
 from neeco.training.session import GaussianSession
 
-BODY_LOGIT = 2.0  # initial link logit of seeds on the shaft's side of the hinge
-GAINS = ((0.5, -0.5), (1.0, 0.0))  # jaw angle per reading: two jaws share the opening, or one takes it all
-SMALL_GAIN = 0.3  # a smaller rotation, which tolerates rough evidence
-MIN_READING_RANGE = 0.05  # rad: a joint that moves less is not searched
-N_STICK_POINTS = 16
+
+@dataclass(frozen=True, kw_only=True)
+class HingeSearchSettings:
+    """Settings of the search for hinges."""
+
+    body_logit: float = 2.0  # initial link logit of seeds on the shaft's side of the hinge
+    # jaw angle per reading: two jaws share the opening, or one takes it all
+    gains: tuple[tuple[float, float], tuple[float, float]] = ((0.5, -0.5), (1.0, 0.0))
+    small_gain: float = 0.3  # a smaller rotation, which tolerates rough evidence
+    min_reading_range: float = 0.05  # rad: a joint that moves less is not searched
+    n_stick_points: int = 16
+    n_hinge_angles: int = 36  # axis directions tried over half a turn
+    n_hinge_depths: int = 10  # pivots tried along the front half
+
+
+STICKS = HingeSearchSettings()
+
 STATE_LINKS = (
     "state its links (`kinematics`, from a ruler and a protractor, a dVRK tool file or a URDF: docs/capture.md)"
 )
-N_HINGE_ANGLES = 36  # axis directions tried over half a turn
-N_HINGE_DEPTHS = 10  # pivots tried along the front half
 
 
 def hinge_joints(
@@ -38,7 +48,7 @@ def hinge_joints(
             report(f"warning: {instrument.name}: joint {joint} is prismatic and moves no part; {STATE_LINKS}")
     turning = tuple(joint for joint in joints if not instrument.slides(joint))
     states = [frame.state.instruments[instrument.name] for frame in frames]
-    used = [joint for joint in turning if np.ptp([state.joints[joint] for state in states]) > MIN_READING_RANGE]
+    used = [joint for joint in turning if np.ptp([state.joints[joint] for state in states]) > STICKS.min_reading_range]
     if len(used) > 1:
         report(
             f"warning: {instrument.name}: {', '.join(used)}: several joints and no kinematics; each is learned as a "
@@ -117,20 +127,20 @@ def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Ge
     with torch.no_grad():
         along = hinges.along_shaft(seeds)
         beyond = along > hinges.hinge_depth[0]
-        logits[:, 0] += torch.where(beyond, 0.0, BODY_LOGIT)
+        logits[:, 0] += torch.where(beyond, 0.0, STICKS.body_logit)
         side = torch.randint(1, hinges.link_count, (len(seeds),), generator=generator).to(seeds.device)
-        lean = nn.functional.one_hot(side, columns) * (BODY_LOGIT / 2)
+        lean = nn.functional.one_hot(side, columns) * (STICKS.body_logit / 2)
         return logits + torch.where(beyond[:, None], lean, lean.new_zeros(()))
 
 
 @dataclass(frozen=True)
 class HingeScores:
-    """Scores of hinges at A angles (rad around the carved shaft), D depths (mm along it) and all GAINS."""
+    """Scores of hinges at A angles (rad around the carved shaft), D depths (mm along it) and all `gains`."""
 
     angles: list[float]
     depths: list[float]
-    score: np.ndarray  # [D, GAINS, A] mean evidence on the turned sticks, in [0, 1]
-    over_rigid: np.ndarray  # [D, GAINS, A] score less that of unturned sticks, times the share of the length they cover
+    score: np.ndarray  # [D, gains, A] mean evidence on the turned sticks, in [0, 1]
+    over_rigid: np.ndarray  # [D, gains, A] score less that of unturned sticks, times the share of the length they cover
 
     @property
     def depth(self) -> float:
@@ -152,7 +162,7 @@ class HingeScores:
     @property
     def gains(self) -> tuple[float, float]:
         """Gains of the best score."""
-        return GAINS[np.unravel_index(self.score.argmax(), self.score.shape)[1]]
+        return STICKS.gains[np.unravel_index(self.score.argmax(), self.score.shape)[1]]
 
 
 def search_hinge(
@@ -167,25 +177,25 @@ def search_hinge(
     recorded = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
     readings = torch.tensor(recorded, dtype=torch.float32, device=evidence.device)
     opening = readings - readings.min()
-    if float(opening.max()) < MIN_READING_RANGE:
+    if float(opening.max()) < STICKS.min_reading_range:
         return None
     closed = evidence.subset(torch.nonzero(readings <= readings.quantile(0.35))[:, 0])
     line = center_line(closed, name, shape, settings)
     if len(line) < 2:
         line = shape.center_line
     camera_from_shaft = camera_from_instrument(evidence, name) @ shape.instrument_from_shaft  # [F, 4, 4]
-    angles = torch.arange(N_HINGE_ANGLES, device=evidence.device) * (math.pi / N_HINGE_ANGLES)
+    angles = torch.arange(STICKS.n_hinge_angles, device=evidence.device) * (math.pi / STICKS.n_hinge_angles)
     length = shape.tip - shape.near
-    depths = np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, N_HINGE_DEPTHS).tolist()
+    depths = np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, STICKS.n_hinge_depths).tolist()
     score, over_rigid = [], []
     for depth in depths:
         stick = _stick(line, depth, shape.tip)
         scores = {
             gain: _stick_scores(evidence, camera_from_shaft, stick, depth, angles, turns=gain * opening, weight=opening)
-            for gain in {0.0, SMALL_GAIN, -SMALL_GAIN, *GAINS[0], *GAINS[1]}
+            for gain in {0.0, STICKS.small_gain, -STICKS.small_gain, *STICKS.gains[0], *STICKS.gains[1]}
         }
-        turned = torch.stack([(scores[first] + scores[second]) / 2 for first, second in GAINS])
-        score.append(torch.maximum(turned, (scores[SMALL_GAIN] + scores[-SMALL_GAIN]) / 2))
+        turned = torch.stack([(scores[first] + scores[second]) / 2 for first, second in STICKS.gains])
+        score.append(torch.maximum(turned, (scores[STICKS.small_gain] + scores[-STICKS.small_gain]) / 2))
         over_rigid.append((turned - scores[0.0]) * ((shape.tip - depth) / length))
     return HingeScores(angles.tolist(), depths, *(torch.stack(s).cpu().numpy() for s in (score, over_rigid)))
 
@@ -194,7 +204,7 @@ def _stick(line: Tensor, depth: float, tip: float) -> Tensor:
     """Return points [Q, 3], shaft frame, of the centre line [Z, 3] from just beyond the pivot at `depth` to just before
     the tip."""
     known = line.cpu().numpy()
-    along = np.linspace(depth + 0.15 * (tip - depth), tip - 0.1 * (tip - depth), N_STICK_POINTS)
+    along = np.linspace(depth + 0.15 * (tip - depth), tip - 0.1 * (tip - depth), STICKS.n_stick_points)
     across = [np.interp(along, known[:, 0], known[:, k]) for k in (1, 2)]
     return torch.from_numpy(np.stack([*across, along], -1)).to(line)
 

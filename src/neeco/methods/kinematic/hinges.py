@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -13,16 +14,23 @@ from neeco.geometry.rotations import rotate_about
 from neeco.methods.kinematic.articulation import Articulation
 from neeco.scene.drawable import JointMotion, Skeleton
 
-JAW_START_RADII = 0.75  # beyond the hinge, where there is nothing but jaws
-PRONGS_FROM = (
-    0.55  # radii from the middle of the hinge's axis: short of that place are only the prongs that hold the jaws
-)
-BORDER_WIDTH_RADII = 0.2  # of either border
-RULED_OUT_MARGIN = 10.0  # by which the logit of a link that positions rule out is below all others
-MAX_FIXED_JAW_GAIN = 0.25  # rad per rad of reading: a jaw that turns less is fixed
-MIN_PART_SHARE = 0.5  # of a Gaussian that counts as belonging to a part
-MIN_TIP_GAUSSIANS = 10  # of a part; with fewer its tip stays unknown
-TIP_QUANTILE = 0.97  # of the distances of a part's Gaussians from its pivot: farther ones are its tip
+
+@dataclass(frozen=True, kw_only=True)
+class HingeSettings:
+    """Places of links about a hinge, and thresholds of parts and tips."""
+
+    jaw_start_radii: float = 0.75  # beyond the hinge, where there is nothing but jaws
+    # radii from the middle of the hinge's axis: short of that place are only the prongs that hold the jaws
+    prongs_from: float = 0.55
+    border_width_radii: float = 0.2  # of either border
+    ruled_out_margin: float = 10.0  # by which the logit of a link that positions rule out is below all others
+    max_fixed_jaw_gain: float = 0.25  # rad per rad of reading: a jaw that turns less is fixed
+    min_part_share: float = 0.5  # of a Gaussian that counts as belonging to a part
+    min_tip_gaussians: int = 10  # of a part; with fewer its tip stays unknown
+    tip_quantile: float = 0.97  # of the distances of a part's Gaussians from its pivot: farther ones are its tip
+
+
+HINGES = HingeSettings()
 
 
 class Hinges(Articulation):
@@ -138,7 +146,7 @@ class Hinges(Articulation):
         along, body = self.along_shaft(points), weights[:, 0]
         jaws: list[Tensor] = []
         for joint in range(len(self.reading_names)):
-            beyond = along > self.hinge_depth[joint] + JAW_START_RADII * self.radius  # [M]
+            beyond = along > self.hinge_depth[joint] + HINGES.jaw_start_radii * self.radius  # [M]
             fixed_jaw = body[:, None] * (beyond[:, None] & self._fixed(joint))
             pair = weights[:, 1 + 2 * joint : 3 + 2 * joint] + fixed_jaw
             body = body - fixed_jaw.sum(1)
@@ -151,7 +159,7 @@ class Hinges(Articulation):
             return logits
         own, ruled_out = logits[:, : self.link_count], self._ruled_out(points) > 0.5
         lowest = own.masked_fill(ruled_out, torch.inf).amin(1, keepdim=True)
-        settled = torch.where(ruled_out, torch.minimum(own, lowest - RULED_OUT_MARGIN), own)
+        settled = torch.where(ruled_out, torch.minimum(own, lowest - HINGES.ruled_out_margin), own)
         return torch.cat([settled, logits[:, self.link_count :]], 1)
 
     @torch.no_grad()
@@ -164,9 +172,9 @@ class Hinges(Articulation):
         for joint in range(len(self.reading_names)):
             pivot, axis = self.hinge(joint)
             aside = ((points - pivot) @ axis).abs() / self.radius
-            past = (along - self.hinge_depth[joint]) / self.radius - JAW_START_RADII
-            past = (0.5 + past / BORDER_WIDTH_RADII).clamp(0, 1)
-            prongs = (0.5 + (aside - PRONGS_FROM) / BORDER_WIDTH_RADII).clamp(0, 1) * (1 - past)
+            past = (along - self.hinge_depth[joint]) / self.radius - HINGES.jaw_start_radii
+            past = (0.5 + past / HINGES.border_width_radii).clamp(0, 1)
+            prongs = (0.5 + (aside - HINGES.prongs_from) / HINGES.border_width_radii).clamp(0, 1) * (1 - past)
             columns += [prongs, prongs]
             beyond = beyond * past * ~self._fixed(joint).any()
         return torch.stack([beyond, *columns], 1)
@@ -174,7 +182,7 @@ class Hinges(Articulation):
     def _fixed(self, joint: int) -> Tensor:
         """Return which of a joint's jaws is fixed, [2] bool."""
         gains = self.gains[joint].detach().abs()
-        return (gains < MAX_FIXED_JAW_GAIN) & (gains == gains.min())
+        return (gains < HINGES.max_fixed_jaw_gain) & (gains == gains.min())
 
     def left_right_order(self, joint: int, axes: Tensor | None = None) -> Tensor:
         """Return a joint's two jaws (0 and 1) as indices [2], the left one first; `axes`: those of `axes()`, if known.
@@ -208,7 +216,7 @@ class Hinges(Articulation):
             pivot, _ = self.hinge(joint)
             found = torch.full_like(self.tips[joint], torch.nan)
             for side, part in enumerate(self.left_right_order(joint).tolist()):
-                tip = farthest(points[shares[:, 2 + 2 * joint + side] > MIN_PART_SHARE], pivot)
+                tip = farthest(points[shares[:, 2 + 2 * joint + side] > HINGES.min_part_share], pivot)
                 if tip is not None:
                     found[part] = tip
             self.tips[joint] = found
@@ -227,7 +235,7 @@ class Hinges(Articulation):
 
 def farthest(points: Tensor, pivot: Tensor) -> Tensor | None:
     """Return the mean [3] of the points [M, 3] farthest from `pivot` [3]; None for too few points."""
-    if len(points) < MIN_TIP_GAUSSIANS:
+    if len(points) < HINGES.min_tip_gaussians:
         return None
     away = (points - pivot).norm(dim=1)
-    return points[away >= away.quantile(TIP_QUANTILE)].mean(0)
+    return points[away >= away.quantile(HINGES.tip_quantile)].mean(0)

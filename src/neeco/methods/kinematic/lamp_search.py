@@ -17,21 +17,30 @@ from neeco.raster.types import Gaussians
 from neeco.scene.gaussian_scene import MAX_LAMPS
 from neeco.training.session import GaussianSession
 
-CANDIDATE_RADII = (0.04, 0.08)  # of the tissue's distance: a lamp nearer the lens would explain any dark edge
-MAX_COVERAGE = 0.05  # share of a pixel that is solid instrument, where the tissue is compared
-N_LAMP_FRAMES = 12  # in which lamps are tried
-N_LAMP_DIRECTIONS = 8  # tried around the lens
-MIN_AGREEMENT = 0.75  # share of the frames that the first lamps found improve, at least
-MIN_FURTHER_AGREEMENT = 0.5  # of further lamps
-MIN_EXPLAINED = 0.005  # share of the squared error near the instruments that each lamp explains
-MARGIN_PX = 3  # of search images, around a compared pixel without instrument
-MAX_BRIGHTNESS = 0.8  # of white: errors at highlights exceed any shadow
-MIN_BRIGHTNESS = 0.05  # of white, to which rendered colours are clamped
-MAX_RESIDUAL = 0.1  # of white, to which residuals are clamped
-FAINT_OPACITY = 0.5  # of an instrument's Gaussian: up to here it may model the shadow
-FADED_OPACITY = 0.02  # to which faint Gaussians are reset
-MAX_STRENGTH = 0.9  # initially: a lamp that gives all the light has no gradient
-MAX_COSINE = 0.5  # between directions from the lens: lamps closer than 60 degrees would share one shadow
+
+@dataclass(frozen=True, kw_only=True)
+class LampSearchSettings:
+    """Settings of the search for lamps."""
+
+    # of the tissue's distance: a lamp nearer the lens would explain any dark edge
+    candidate_radii: tuple[float, float] = (0.04, 0.08)
+    max_coverage: float = 0.05  # share of a pixel that is solid instrument, where the tissue is compared
+    n_lamp_frames: int = 12  # in which lamps are tried
+    n_lamp_directions: int = 8  # tried around the lens
+    min_agreement: float = 0.75  # share of the frames that the first lamps found improve, at least
+    min_further_agreement: float = 0.5  # of further lamps
+    min_explained: float = 0.005  # share of the squared error near the instruments that each lamp explains
+    margin_px: int = 3  # of search images, around a compared pixel without instrument
+    max_brightness: float = 0.8  # of white: errors at highlights exceed any shadow
+    min_brightness: float = 0.05  # of white, to which rendered colours are clamped
+    max_residual: float = 0.1  # of white, to which residuals are clamped
+    faint_opacity: float = 0.5  # of an instrument's Gaussian: up to here it may model the shadow
+    faded_opacity: float = 0.02  # to which faint Gaussians are reset
+    max_strength: float = 0.9  # initially: a lamp that gives all the light has no gradient
+    max_cosine: float = 0.5  # between directions from the lens: lamps closer than 60 degrees would share one shadow
+
+
+LAMPS = LampSearchSettings()
 
 
 @dataclass(frozen=True)
@@ -75,10 +84,10 @@ def find_shadow(session: GaussianSession) -> None:
     free = [lamp for lamp in range(MAX_LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
     if not scene.instruments or not free:
         return
-    offsets = _candidates(2 * session.extent, N_LAMP_DIRECTIONS).to(scene.center)
+    offsets = _candidates(2 * session.extent, LAMPS.n_lamp_directions).to(scene.center)
     equations = _normal_equations(session, offsets)
     known = [scene.shadow_offsets[lamp] for lamp in range(MAX_LAMPS) if lamp not in free]
-    fit = _choose(equations, offsets, known, MIN_EXPLAINED)
+    fit = _choose(equations, offsets, known, LAMPS.min_explained)
     agree = equations.agreement(fit)
     searches = scene.diagnostics.setdefault("shadow", [])
     searches.append(
@@ -89,11 +98,11 @@ def find_shadow(session: GaussianSession) -> None:
             "found_at_mm": [],
         }
     )
-    if not fit.chosen or agree < (MIN_FURTHER_AGREEMENT if known else MIN_AGREEMENT):
+    if not fit.chosen or agree < (LAMPS.min_further_agreement if known else LAMPS.min_agreement):
         return
     for lamp, candidate, strength in zip(free, fit.chosen, fit.strengths, strict=False):
         scene.shadow_offsets[lamp] = offsets[candidate]
-        scene.shadow_strengths[lamp] = min(float(strength), MAX_STRENGTH)
+        scene.shadow_strengths[lamp] = min(float(strength), LAMPS.max_strength)
         searches[-1]["found_at_mm"].append([round(float(v), 2) for v in offsets[candidate]])
     _fade_instruments(session)
 
@@ -102,8 +111,8 @@ def _fade_instruments(session: GaussianSession) -> None:
     """Reset faint Gaussians of the instruments to nearly transparent: they may have modelled the shadow."""
     canonical = session.scene.canonical
     logits = canonical.opacity_logits
-    faint = canonical.of_instruments & (torch.sigmoid(logits) <= FAINT_OPACITY)
-    logits[faint] = logits[faint].clamp_max(math.log(FADED_OPACITY / (1 - FADED_OPACITY)))
+    faint = canonical.of_instruments & (torch.sigmoid(logits) <= LAMPS.faint_opacity)
+    logits[faint] = logits[faint].clamp_max(math.log(LAMPS.faded_opacity / (1 - LAMPS.faded_opacity)))
     session.adam.forget("opacity_logits")
 
 
@@ -111,7 +120,7 @@ def _candidates(distance: float, directions: int) -> Tensor:
     """Return candidate lamps [C, 3] mm around the lens, camera frame, for tissue at `distance` mm."""
     angles = torch.arange(directions) * (2 * math.pi / directions)
     around = torch.stack([angles.cos(), angles.sin(), torch.zeros(directions)], 1)
-    return torch.cat([radius * distance * around for radius in CANDIDATE_RADII])
+    return torch.cat([radius * distance * around for radius in LAMPS.candidate_radii])
 
 
 def _choose(equations: _NormalEquations, offsets: Tensor, known: list[Tensor], min_explained: float) -> _Fit:
@@ -121,7 +130,9 @@ def _choose(equations: _NormalEquations, offsets: Tensor, known: list[Tensor], m
     best = _Fit((), np.zeros(0), 0.0)
     while len(known) + len(best.chosen) < MAX_LAMPS:
         taken = [*known, *(offsets[k] for k in best.chosen)]
-        apart = [k for k in range(len(offsets)) if all(_cosine(offsets[k], other) < MAX_COSINE for other in taken)]
+        apart = [
+            k for k in range(len(offsets)) if all(_cosine(offsets[k], other) < LAMPS.max_cosine for other in taken)
+        ]
         if not apart:
             break
         more = max((equations.fit((*best.chosen, k)) for k in apart), key=lambda fit: fit.explained)
@@ -138,17 +149,19 @@ def _cosine(a: Tensor, b: Tensor) -> float:
 def _normal_equations(session: GaussianSession, offsets: Tensor) -> _NormalEquations:
     """Return the normal equations of candidate lamps at `offsets` [C, 3] mm, from some of the training frames."""
     gram, moment, total = [], [], 0.0
-    margin = max(1, round(MARGIN_PX * session.scale / session.resolution.search_scale))
-    for index in session.frames_along_poses(N_LAMP_FRAMES):
+    margin = max(1, round(LAMPS.margin_px * session.scale / session.resolution.search_scale))
+    for index in session.frames_along_poses(LAMPS.n_lamp_frames):
         color, shade, instrument = _render_candidates(session, index, offsets)
         target, mask = session.views.target(index), session.views.mask(index)
-        counts = _clear_of_instruments(instrument, margin) & (torch.maximum(color, target).amax(-1) < MAX_BRIGHTNESS)
+        counts = _clear_of_instruments(instrument, margin) & (
+            torch.maximum(color, target).amax(-1) < LAMPS.max_brightness
+        )
         if mask is not None:
             counts &= mask
-        color, target = color[counts].clamp(MIN_BRIGHTNESS, 1), target[counts]  # [P, 3]
+        color, target = color[counts].clamp(LAMPS.min_brightness, 1), target[counts]  # [P, 3]
         # in linear light, where lamps add up, divided by the slope of the stored curve to weight errors as stored
         residual = (color - target**GAMMA * color ** (1 - GAMMA)) / GAMMA
-        residual = residual.clamp(-MAX_RESIDUAL, MAX_RESIDUAL)
+        residual = residual.clamp(-LAMPS.max_residual, LAMPS.max_residual)
         darkened = (color / GAMMA)[:, :, None] * shade[counts][:, None, :]  # [P, 3, C]
         total += float(residual.square().sum())
         flat = darkened.flatten(0, 1)  # [3 P, C]
@@ -164,7 +177,7 @@ def _render_candidates(session: GaussianSession, index: int, offsets: Tensor) ->
     scene = session.scene
     posed: Gaussians = scene.at(state)
     instrument = scene.canonical.bodies > 0
-    casting = ~instrument | (posed.opacities > FAINT_OPACITY)
+    casting = ~instrument | (posed.opacities > LAMPS.faint_opacity)
     posed, instrument = posed.select(casting), instrument[casting]
     among = Casting.of(posed, instrument, camera)
     missed = blocked(among, scene.shadow_width, offsets, depth_maps)  # [C, N]
@@ -177,4 +190,4 @@ def _render_candidates(session: GaussianSession, index: int, offsets: Tensor) ->
 def _clear_of_instruments(instrument: Tensor, margin: int) -> Tensor:
     """Return the pixels without instrument within `margin` px, [H, W] bool; `instrument` [H, W]: its share of each
     pixel."""
-    return max_pool2d(instrument[None, None], 2 * margin + 1, 1, margin)[0, 0] < MAX_COVERAGE
+    return max_pool2d(instrument[None, None], 2 * margin + 1, 1, margin)[0, 0] < LAMPS.max_coverage

@@ -21,26 +21,45 @@ from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector, skew
 from neeco.methods.kinematic.link_search import doubted_readings, note_doubt
-from neeco.methods.kinematic.stated_links import AXIS_SD, OFFSET_SD, PIVOT_SD, StatedLinks
+from neeco.methods.kinematic.stated_links import OFFSET_SD, STATED, StatedLinks
 from neeco.methods.space_carving import CarvedShape, Evidence, camera_from_instrument
-from neeco.states.outline_fit import BASE_SD_MM, BASE_SD_RAD
+from neeco.states.outline_fit import OUTLINES
 from neeco.training.session import GaussianSession
 
-MAX_FRAMES = 30
-WIDTHS, MAX_STEPS = (20, 40), (8, 4)  # cells across the images compared, coarse to fine, and steps at each
-CELLS_PER_OBSERVATION = 10.0  # of the finer images, whose errors are correlated
-EVIDENCE_SD = 0.3  # of a cell; beyond it, the cost is linear
-MIN_WEIGHT = 0.1  # of a residual; less where most frames have evidence, since the tissue's fit absorbed the instrument
-EDGE_CELLS = 0.6  # width over which a silhouette fades
-SHAFT_LENGTH_MM, NEAREST_MM = 150.0, 5.0  # of the shaft from its end; depth from which it is compared
-FRAME_SD = (0.035, 2.0)  # rad, mm: standard deviations of the frame's error about and along the shaft
-# of the shape: tilts (rad) and shifts (mm) of the carved shaft, log radii, heading (rad) and log length of end links
-SHAFT_SD, LOG_RADIUS_SD, END_SD = (0.1, 0.1, 2.0, 2.0), 0.4, (0.15, 0.4)
-LINK_RADIUS, END_RADIUS, END_LENGTH = 0.8, 0.4, 3.0  # in carved radii
-STEP = 0.05  # finite differences, in standard deviations
-MODEL_ERROR = 2.0  # of a standard deviation by the evidence: errors of the model are common to all frames
-MIN_GAIN = 10.0  # of -log likelihood, from which a correction is made
-MIN_ALONG_MM = 3.0  # by which links alone are moved along the shaft, at least: training finds smaller errors by itself
+
+@dataclass(frozen=True, kw_only=True)
+class LinkRegistrationSettings:
+    """Priors and settings of the registration."""
+
+    max_frames: int = 30
+    widths: tuple[int, int] = (20, 40)  # cells across the images compared, coarse to fine, and steps at each
+    max_steps: tuple[int, int] = (8, 4)
+    cells_per_observation: float = 10.0  # of the finer images, whose errors are correlated
+    evidence_sd: float = 0.3  # of a cell; beyond it, the cost is linear
+    # of a residual; less where most frames have evidence, since the tissue's fit absorbed the instrument
+    min_weight: float = 0.1
+    edge_cells: float = 0.6  # width over which a silhouette fades
+    shaft_length_mm: float = 150.0  # of the shaft from its end; depth from which it is compared
+    nearest_mm: float = 5.0
+    # rad, mm: standard deviations of the frame's error about and along the shaft
+    frame_sd: tuple[float, float] = (0.035, 2.0)
+    # of the shape: tilts (rad) and shifts (mm) of the carved shaft, log radii, heading (rad) and log length of end
+    # links
+    shaft_sd: tuple[float, float, float, float] = (0.1, 0.1, 2.0, 2.0)
+    log_radius_sd: float = 0.4
+    end_sd: tuple[float, float] = (0.15, 0.4)
+    link_radius: float = 0.8  # in carved radii
+    end_radius: float = 0.4
+    end_length: float = 3.0
+    step: float = 0.05  # finite differences, in standard deviations
+    model_error: float = 2.0  # of a standard deviation by the evidence: errors of the model are common to all frames
+    min_gain: float = 10.0  # of -log likelihood, from which a correction is made
+    # by which links alone are moved along the shaft, at least: training finds smaller errors by itself
+    min_along_mm: float = 3.0
+
+
+CAPSULES = LinkRegistrationSettings()
+
 # parameters of models, each with those of the one before: of the shape alone, the links as stated; of the links; of all
 MODELS = (("shaft", "radii", "ends"), ("turns", "shifts", "offsets"), ("base", "frame"))
 
@@ -96,16 +115,19 @@ def register_links(
         names += more
         problem.fit_only(names)
         found = np.zeros(problem.size)
-        for width, steps in zip(WIDTHS, MAX_STEPS, strict=True):
+        for width, steps in zip(CAPSULES.widths, CAPSULES.max_steps, strict=True):
             problem.compare_at(width)
             found = levenberg_marquardt(found, problem.linearise, np.add, max_steps=steps, damping=1e-3, tolerance=1e-3)
         fits.append((tuple(names), found, problem.linearise(found)))
     costs = [fitted.value for _, _, fitted in fits]
-    chosen = next(k for k in range(len(fits)) if costs[k] - min(costs[k:]) < MIN_GAIN)
+    chosen = next(k for k in range(len(fits)) if costs[k] - min(costs[k:]) < CAPSULES.min_gain)
     fitted_names, found, fitted = fits[chosen]
     problem.fit_only(fitted_names)
     parts, along = problem.parts(found), problem.along_shaft(found)
-    slope = np.array([problem.along_shaft(found + step) - along for step in STEP * np.eye(problem.size)]) / STEP
+    slope = (
+        np.array([problem.along_shaft(found + step) - along for step in CAPSULES.step * np.eye(problem.size)])
+        / CAPSULES.step
+    )
     pivots, axes = problem.corrected_axes(parts)
     return LinkRegistration(
         base=parts["base"],
@@ -113,10 +135,11 @@ def register_links(
         pivots=pivots,
         axes=axes,
         offsets=parts["offsets"],
-        needed=chosen == len(MODELS) - 1 or (chosen > 0 and abs(along) > MIN_ALONG_MM),
+        needed=chosen == len(MODELS) - 1 or (chosen > 0 and abs(along) > CAPSULES.min_along_mm),
         cost=costs[-1],
         along_mm=along,
-        along_sd_mm=MODEL_ERROR * float(np.sqrt(slope @ np.linalg.solve(np.asarray(fitted.information), slope))),
+        along_sd_mm=CAPSULES.model_error
+        * float(np.sqrt(slope @ np.linalg.solve(np.asarray(fitted.information), slope))),
     )
 
 
@@ -192,7 +215,7 @@ class _SilhouetteProblem:
         line: tuple[Tensor, Tensor],
         readings: list[dict[str, float]],
     ) -> None:
-        chosen = evenly_spaced(len(evidence.frames), MAX_FRAMES)
+        chosen = evenly_spaced(len(evidence.frames), CAPSULES.max_frames)
         self.links, self.shape = links, shape
         self.evidence = evidence.subset(torch.tensor(chosen))
         self.pivot, self.axis = line[0], nn.functional.normalize(line[1], dim=0)
@@ -208,14 +231,14 @@ class _SilhouetteProblem:
         slides = [any(links.slides[j] and bool(links.gains[j, :, r].any()) for j in joints)
                   for r in range(len(links.reading_names))]  # fmt: skip
         spreads = {
-            "base": [BASE_SD_RAD] * 3 + [BASE_SD_MM] * 3,
-            "frame": FRAME_SD,
-            "turns": [AXIS_SD] * 3 * len(joints),
-            "shifts": [PIVOT_SD] * 3 * len(joints),
+            "base": [OUTLINES.base_sd_rad] * 3 + [OUTLINES.base_sd_mm] * 3,
+            "frame": CAPSULES.frame_sd,
+            "turns": [STATED.axis_sd] * 3 * len(joints),
+            "shifts": [STATED.pivot_sd] * 3 * len(joints),
             "offsets": [OFFSET_SD[slide] * float(seen) for slide, seen in zip(slides, links.observable, strict=True)],
-            "shaft": SHAFT_SD,
-            "radii": [LOG_RADIUS_SD] * links.link_count,
-            "ends": [*END_SD] * sum(not carried for carried in self.carried),
+            "shaft": CAPSULES.shaft_sd,
+            "radii": [CAPSULES.log_radius_sd] * links.link_count,
+            "ends": [*CAPSULES.end_sd] * sum(not carried for carried in self.carried),
         }
         self.layout = {key: torch.tensor(spread).to(self.axis) for key, spread in spreads.items()}
 
@@ -246,14 +269,14 @@ class _SilhouetteProblem:
         rows, columns = (torch.arange(size, device=hits.device) + 0.5 for size in self.target.shape[1:])
         y, x = torch.meshgrid(rows, columns, indexing="ij")
         self.cells = torch.stack([x, y], -1).view(-1, 2) * self.cell_px  # [C, 2] px
-        correlated = CELLS_PER_OBSERVATION * (width / WIDTHS[-1]) ** 2
-        usual = (1 - self.target.mean(0)).clamp_min(MIN_WEIGHT)
-        self.weight = usual / (EVIDENCE_SD * correlated**0.5)
+        correlated = CAPSULES.cells_per_observation * (width / CAPSULES.widths[-1]) ** 2
+        usual = (1 - self.target.mean(0)).clamp_min(CAPSULES.min_weight)
+        self.weight = usual / (CAPSULES.evidence_sd * correlated**0.5)
 
     def linearise(self, at: np.ndarray) -> Linearisation[np.ndarray]:
         residual = self._residual(at)
-        steps = STEP * np.eye(self.size)
-        slopes = torch.stack([(self._residual(at + step) - residual) / STEP for step in steps], 1)
+        steps = CAPSULES.step * np.eye(self.size)
+        slopes = torch.stack([(self._residual(at + step) - residual) / CAPSULES.step for step in steps], 1)
         robust = self._limit / residual.abs().clamp_min(1e-9)
         weighed = slopes * robust.clamp_max(1.0)[:, None]
         return Linearisation(
@@ -271,12 +294,12 @@ class _SilhouetteProblem:
     @property
     def _limit(self) -> Tensor:
         """Residuals [F * C] from which on the cost is linear."""
-        return (EVIDENCE_SD * self.weight).flatten().repeat(len(self.target))
+        return (CAPSULES.evidence_sd * self.weight).flatten().repeat(len(self.target))
 
     def _residual(self, at: np.ndarray) -> Tensor:
         """Return weighed differences [F * C] of silhouette and evidence."""
         inside = self._inside_px(*self._capsules(self.parts(at)))
-        silhouette = torch.sigmoid(inside / (EDGE_CELLS * self.cell_px))
+        silhouette = torch.sigmoid(inside / (CAPSULES.edge_cells * self.cell_px))
         return ((silhouette - self.target.flatten(1)) * self.weight.flatten()).flatten()
 
     def corrected_axes(self, parts: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -311,17 +334,17 @@ class _SilhouetteProblem:
         shaft = nn.functional.normalize(base[:3, :3] @ torch.cat([tilts, tilts.new_ones(1)]), dim=0)
         origin = base[:3, :3] @ torch.cat([shifts, shifts.new_zeros(1)]) + base[:3, 3]
         front = origin + ((pivots[-1] - origin) @ shaft) * shaft
-        segments = [(0, torch.stack([front - SHAFT_LENGTH_MM * shaft, front]), 1.0)]
+        segments = [(0, torch.stack([front - CAPSULES.shaft_length_mm * shaft, front]), 1.0)]
         for link, (own, carried) in enumerate(zip(self.own, self.carried, strict=True), 1):
-            segments += [(link, pivots[[own, joint]], LINK_RADIUS) for joint in carried]
+            segments += [(link, pivots[[own, joint]], CAPSULES.link_radius) for joint in carried]
             if carried:
                 continue
             (heading, length), ends = ends[0], ends[1:]
             ahead = self.axis - (self.axis @ axes[own]) * axes[own]
             ahead = nn.functional.normalize(ahead, dim=0)
             ahead = heading.cos() * ahead + heading.sin() * torch.linalg.cross(axes[own], ahead)
-            tip = pivots[own] + END_LENGTH * shape.radius * length.exp() * ahead
-            segments.append((link, torch.stack([pivots[own], tip]), END_RADIUS))
+            tip = pivots[own] + CAPSULES.end_length * shape.radius * length.exp() * ahead
+            segments.append((link, torch.stack([pivots[own], tip]), CAPSULES.end_radius))
         to_camera = self.evidence.camera_from_world @ self._corrected(parts)
         values = links.constants + torch.einsum("jlr,fr->fjl", links.gains, self.readings - parts["offsets"])
         placed = []
@@ -342,8 +365,8 @@ class _SilhouetteProblem:
         """Return how far [F, C] px every cell's middle lies inside the nearest capsule's outline."""
         far, near = ends.unbind(2)  # [F, S, 3]
         depth = near[..., 2] - far[..., 2]
-        share = (NEAREST_MM - far[..., 2]) / torch.where(depth.abs() > 1e-6, depth, 1e-6)
-        share = torch.where(far[..., 2] < NEAREST_MM, share.clamp(0, 1), 0.0)
+        share = (CAPSULES.nearest_mm - far[..., 2]) / torch.where(depth.abs() > 1e-6, depth, 1e-6)
+        share = torch.where(far[..., 2] < CAPSULES.nearest_mm, share.clamp(0, 1), 0.0)
         far = far + share[..., None] * (near - far)
         fx, fy, cx, cy = (column[:, None] for column in self.evidence.intrinsics.unbind(1))
         (far_px, far_radius), (near_px, near_radius) = (

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.space_carving import (
-    MIN_LEVEL,
+    CARVING,
     CarvedShape,
     Evidence,
     PosedViews,
@@ -26,28 +26,49 @@ from neeco.methods.space_carving import (
 )
 from neeco.training.session import GaussianSession
 
-LINK_LOGIT = 2.0  # initial logit of a seed for the link that it was carved on
-SHAFT_SHARE = 0.4  # of the seeds
-REACH_RADII = 7.0  # shaft radii beyond its pivot within which an end link is searched
-MARGIN_RADII = 2.0  # shaft radii about the pivots beyond it within which another link is searched
-CANDIDATES_PER_SEED = 20
-EVIDENCE_TOLERANCE = 0.03  # by which the evidence of another link may be larger
-# tolerances within which a carved shaft agrees with the line of the links at rest
-MIN_COSINE = 0.85
-MAX_OFFSET_RADII, MAX_OFFSET_MM = 1.5, 4.0
-MIN_RELATIVE_LEVEL = 0.85  # of the best evidence of a link's points: stated axes may be off, and all points with them
-MIN_RADIUS_RATIO = 0.33  # of the shaft's radius to the distance between the first two pivots
-MAX_SHAFT_RADIUS_MM = 6.5  # of instruments that pass a trocar
-MIN_EVIDENT_RADII = 3.0  # shaft radii behind the first pivot: with less evidence, the shaft is seeded about its line
-SHAFT_LENGTH = 0.3  # of the distance to the tissue: the shaft that is seeded about its line
-SIDE_TOLERANCE_RADII = 0.3  # by which a link that is searched on one side of its pivot may lie on the other
-MIN_VISIBLE_SHARE = 0.05  # of the frames, that must observe a seed
+
+@dataclass(frozen=True, kw_only=True)
+class LinkSearchSettings:
+    """Settings of carving links and of the check of readings."""
+
+    link_logit: float = 2.0  # initial logit of a seed for the link that it was carved on
+    shaft_share: float = 0.4  # of the seeds
+    reach_radii: float = 7.0  # shaft radii beyond its pivot within which an end link is searched
+    margin_radii: float = 2.0  # shaft radii about the pivots beyond it within which another link is searched
+    candidates_per_seed: int = 20
+    evidence_tolerance: float = 0.03  # by which the evidence of another link may be larger
+    # tolerances within which a carved shaft agrees with the line of the links at rest
+    min_cosine: float = 0.85
+    max_offset_radii: float = 1.5
+    max_offset_mm: float = 4.0
+    # of the best evidence of a link's points: stated axes may be off, and all points with them
+    min_relative_level: float = 0.85
+    min_radius_ratio: float = 0.33  # of the shaft's radius to the distance between the first two pivots
+    max_shaft_radius_mm: float = 6.5  # of instruments that pass a trocar
+    # shaft radii behind the first pivot: with less evidence, the shaft is seeded about its line
+    min_evident_radii: float = 3.0
+    shaft_length: float = 0.3  # of the distance to the tissue: the shaft that is seeded about its line
+    side_tolerance_radii: float = 0.3  # by which a link that is searched on one side of its pivot may lie on the other
+    min_visible_share: float = 0.05  # of the frames, that must observe a seed
+    heading_sigma: float = 0.5  # rad; of evidence, by which a stated heading may be less likely
+    heading_weight: float = 0.02
+    # over half way open and straight on: where jaws move, any opening has some evidence
+    min_evidence_gain: float = 0.25
+    # check of the readings
+    check_points: int = 1500  # per link
+    check_reach_radii: float = 4.0  # shaft radii about the pivots within which they lie
+    check_margin_radii: float = 2.0
+    max_check_frames: int = 80
+    min_volume_ratio: float = 1.15  # of the volume on evidence with other readings, from which a warning is given
+    check_min_visible_share: float = 0.1  # of the frames, that must observe a point
+
+
+LINKS = LinkSearchSettings()
+
 # jaws whose opening was not recorded: openings (of the limits' range) and headings (rad) that are tried, and the points
 # that must be evident next to the plane between them, in radii from the pivot, along the axis and from the plane
 OPENINGS = torch.linspace(0, 1, 9)
 HEADINGS = torch.linspace(-1.2, 1.2, 13)
-HEADING_SIGMA, HEADING_WEIGHT = 0.5, 0.02  # rad; of evidence, by which a stated heading may be less likely
-MIN_EVIDENCE_GAIN = 0.25  # over half way open and straight on: where jaws move, any opening has some evidence
 PLANE_OFFSETS = torch.cartesian_prod(torch.linspace(1, 4, 7), torch.linspace(-0.3, 0.3, 3), torch.linspace(0.1, 0.3, 3))
 
 
@@ -69,20 +90,26 @@ def align_to_links(
         return shape
     pivot, step = line
     direction = nn.functional.normalize(step, dim=0)
-    thickness = min(MIN_RADIUS_RATIO * float(step.norm()), MAX_SHAFT_RADIUS_MM)
+    thickness = min(LINKS.min_radius_ratio * float(step.norm()), LINKS.max_shaft_radius_mm)
     origin, along = shape.instrument_from_shaft[:3, 3], shape.instrument_from_shaft[:3, 2]
     apart = pivot - origin
     off = float((apart - (apart @ along) * along).norm())
-    if float(along @ direction) > MIN_COSINE and off < max(MAX_OFFSET_RADII * shape.radius, MAX_OFFSET_MM):
+    if float(along @ direction) > LINKS.min_cosine and off < max(
+        LINKS.max_offset_radii * shape.radius, LINKS.max_offset_mm
+    ):
         return replace(shape, radius=max(shape.radius, thickness))
     session.report(f"{name}: the shaft is searched along the stated links: carving found another line")
     base = frame_along(pivot, direction)
     carved = carve_along(evidence, name, base, shape.level, generator, session.config.deformation.carving)
     found = shape if carved is None else carved
     found = replace(found, radius=max(found.radius, thickness))
-    if carved is not None and carved.near < -MIN_EVIDENT_RADII * found.radius and found.radius < MAX_SHAFT_RADIUS_MM:
+    if (
+        carved is not None
+        and carved.near < -LINKS.min_evident_radii * found.radius
+        and found.radius < LINKS.max_shaft_radius_mm
+    ):
         return found
-    return _shaft_about_line(found, base, thickness, SHAFT_LENGTH * evidence.distance, generator)
+    return _shaft_about_line(found, base, thickness, LINKS.shaft_length * evidence.distance, generator)
 
 
 def _shaft_about_line(
@@ -98,7 +125,7 @@ def _shaft_about_line(
         shape,
         instrument_from_shaft=base,
         near=-length,
-        tip=REACH_RADII * radius,
+        tip=LINKS.reach_radii * radius,
         radius=radius,
         seeds=points @ base[:3, :3].T + base[:3, 3],
     )
@@ -127,7 +154,7 @@ def start_links(
     views = [posed_views(evidence, name, settings, moved[:, k]) for k in range(links.link_count)]
     behind = links.along_shaft(shape.seeds) < links.first_joint()
     of_shaft = shape.seeds[behind] if bool(behind.any()) else shape.seeds
-    count = round(SHAFT_SHARE * settings.seeds)
+    count = round(LINKS.shaft_share * settings.seeds)
     chosen = torch.randint(len(of_shaft), (count,), generator=generator, device=generator.device).to(of_shaft.device)
     seeds, owners = [of_shaft[chosen]], [torch.zeros(count, dtype=torch.long)]
     each = (settings.seeds - count) // max(links.link_count - 1, 1)
@@ -137,7 +164,7 @@ def start_links(
         owners.append(torch.full((len(found),), link))
     points, owner = torch.cat(seeds), torch.cat(owners).to(shape.seeds.device)
     logits = 0.3 * torch.randn(len(points), columns, generator=generator).to(points)
-    return points, logits + LINK_LOGIT * nn.functional.one_hot(owner, columns)
+    return points, logits + LINKS.link_logit * nn.functional.one_hot(owner, columns)
 
 
 def _open_links(
@@ -167,9 +194,9 @@ def _open_links(
                 for value in values.tolist()
             ]
         )  # [openings, headings]
-        likely = scores - HEADING_WEIGHT * (HEADINGS / HEADING_SIGMA).square()
+        likely = scores - LINKS.heading_weight * (HEADINGS / LINKS.heading_sigma).square()
         best, heading = divmod(int(likely.argmax()), len(HEADINGS))
-        if float(scores[best, heading] - scores[len(OPENINGS) // 2, len(HEADINGS) // 2]) > MIN_EVIDENCE_GAIN:
+        if float(scores[best, heading] - scores[len(OPENINGS) // 2, len(HEADINGS) // 2]) > LINKS.min_evidence_gain:
             turned, found = float(HEADINGS[heading]), True
             column = session.refinement.readings.index((name, reading))
             session.refinement.joints[:, column] = values[best] - instrument.halfway(reading)
@@ -238,35 +265,30 @@ def _on_link(
     """Sample points [count, 3] mm at rest that stay on evidence when moved with a link, and better than with any other;
     in the half spaces `side` (point mm, unit directions) where given."""
     device = links.points.device
-    centers, reaches = (part.to(device) for part in links.extent_of(link, REACH_RADII * radius, MARGIN_RADII * radius))
-    total = CANDIDATES_PER_SEED * count
+    centers, reaches = (
+        part.to(device) for part in links.extent_of(link, LINKS.reach_radii * radius, LINKS.margin_radii * radius)
+    )
+    total = LINKS.candidates_per_seed * count
     random = torch.rand(total, 4, generator=generator, device=generator.device).to(device)
     which = (random[:, 3] * len(centers)).long().clamp_max(len(centers) - 1)
     points = centers[which] + (2 * random[:, :3] - 1) * reaches[which, None]
     if side is not None:
         place, directions = (part.to(device) for part in side)
-        outside = ((points - place) @ directions.T + SIDE_TOLERANCE_RADII * radius).clamp_max(0)  # [Q, K]
+        outside = ((points - place) @ directions.T + LINKS.side_tolerance_radii * radius).clamp_max(0)  # [Q, K]
         points = points - 2 * outside @ directions  # mirrored into the half spaces
     own, visible = views[link].scores(points)
-    likely = torch.nonzero((own > 0.5 * MIN_LEVEL) & (visible > MIN_VISIBLE_SHARE))[:, 0]
+    likely = torch.nonzero((own > 0.5 * CARVING.min_level) & (visible > LINKS.min_visible_share))[:, 0]
     others = torch.stack([view.scores(points[likely])[0] for k, view in enumerate(views) if k != link]).amax(0)
-    fits = own[likely] >= others - EVIDENCE_TOLERANCE
+    fits = own[likely] >= others - LINKS.evidence_tolerance
     likely, score = likely[fits], own[likely][fits]
     if not len(likely):  # no evidence: about its pivot; training moves them
         return points[:count] * 0 + centers[:1] + 0.5 * (points[:count] - centers[which[:count]])
-    best = likely[score >= MIN_RELATIVE_LEVEL * float(score.max())]
+    best = likely[score >= LINKS.min_relative_level * float(score.max())]
     again = torch.randint(len(best), (max(0, count - len(best)),), generator=generator, device=generator.device)
     jitter = 0.1 * radius * torch.randn(len(again), 3, generator=generator, device=generator.device).to(points)
     order = torch.randperm(len(best), generator=generator, device=generator.device).to(device)[:count]
     return torch.cat([points[best[order]], points[best[again.to(device)]] + jitter])
 
-
-# check of the readings
-CHECK_POINTS = 1500  # per link
-CHECK_REACH_RADII, CHECK_MARGIN_RADII = 4.0, 2.0  # shaft radii about the pivots within which they lie
-MAX_CHECK_FRAMES = 80
-MIN_VOLUME_RATIO = 1.15  # of the volume on evidence with other readings, from which a warning is given
-CHECK_MIN_VISIBLE_SHARE = 0.1  # of the frames, that must observe a point
 
 Readings = dict[str, float]
 
@@ -302,7 +324,7 @@ def doubted_readings(
         changes.append(((name,), words, partial(_reversed, name)))
     found = [(volumes.with_readings(change), index) for index, (_, _, change) in enumerate(changes)]
     most, index = max(found, default=(0.0, 0))
-    if most <= MIN_VOLUME_RATIO * named:
+    if most <= LINKS.min_volume_ratio * named:
         return None
     names, words, change = changes[index]
     return DoubtedReadings(names, most / max(named, 1), words, change)
@@ -327,7 +349,7 @@ class _Volumes:
     """Volume that stays on evidence, counted in sample points of all links together."""
 
     def __init__(self, links: StatedLinks, evidence: Evidence, name: str, readings: list[Readings], seed: int) -> None:
-        step = max(1, len(readings) // MAX_CHECK_FRAMES)
+        step = max(1, len(readings) // LINKS.max_check_frames)
         self.links, self.readings = links, readings[::step]
         self.evidence = evidence.subset(torch.arange(0, len(readings), step))
         self.camera_from_instrument = camera_from_instrument(self.evidence, name)  # [F, 4, 4]
@@ -335,13 +357,14 @@ class _Volumes:
         self.points = [self._about(link, generator) for link in range(1, links.link_count)]
 
     def _about(self, link: int, generator: torch.Generator) -> Tensor:
-        """Sample points [CHECK_POINTS, 3] mm about a link at rest."""
+        """Sample points [`check_points`, 3] mm about a link at rest."""
         radius = float(self.links.radius)
         centers, half = (
-            part.cpu() for part in self.links.extent_of(link, CHECK_REACH_RADII * radius, CHECK_MARGIN_RADII * radius)
+            part.cpu()
+            for part in self.links.extent_of(link, LINKS.check_reach_radii * radius, LINKS.check_margin_radii * radius)
         )
-        which = torch.randint(len(centers), (CHECK_POINTS,), generator=generator)
-        away = 2 * torch.rand(CHECK_POINTS, 3, generator=generator) - 1
+        which = torch.randint(len(centers), (LINKS.check_points,), generator=generator)
+        away = 2 * torch.rand(LINKS.check_points, 3, generator=generator) - 1
         return (centers[which] + away * half[which, None]).to(self.evidence.device)
 
     def with_readings(self, change: Callable[[Readings], Readings]) -> float:
@@ -351,6 +374,9 @@ class _Volumes:
         for link, points in enumerate(self.points, 1):
             score, visible = score_points(self.evidence, self.camera_from_instrument @ moved[:, link], points)
             total += float(
-                (((score - MIN_LEVEL) / (1 - MIN_LEVEL)).clamp(0, 1) * (visible > CHECK_MIN_VISIBLE_SHARE)).sum()
+                (
+                    ((score - CARVING.min_level) / (1 - CARVING.min_level)).clamp(0, 1)
+                    * (visible > LINKS.check_min_visible_share)
+                ).sum()
             )
         return total

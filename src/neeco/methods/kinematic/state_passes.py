@@ -15,7 +15,7 @@ from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.methods.kinematic.discovery import carve_again
 from neeco.states.contradictions import Misfits, fitted_anew, judge_again, leave_out_unexplained, refit_outliers
 from neeco.states.refinement import Verdict
-from neeco.states.search import LARGE, SCALE, StateSearch
+from neeco.states.search import SEARCH, StateSearch
 from neeco.training.session import GaussianSession
 
 
@@ -38,7 +38,7 @@ def judge_states(session: GaussianSession, articulated: ArticulatedInstruments) 
         search = _search(session, articulated)
         misfits = Misfits.of(search)
         large = _size_errors(session, search, misfits.outliers)
-        refit_outliers(search, SCALE if large else LARGE, misfits)
+        refit_outliers(search, SEARCH.scale if large else SEARCH.large, misfits)
 
 
 @torch.no_grad()
@@ -68,10 +68,10 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *,
             continue
         wrong = refinement.verdict(index) is Verdict.REFITTED
         about = search.state(index) if wrong else None
-        fit = fitted_anew(search, index) if wrong and last else search.fitted(index, SCALE, about)
+        fit = fitted_anew(search, index) if wrong and last else search.fitted(index, SEARCH.scale, about)
         if fit is not None:
             # until the last fit, gradients go on with the uncertainty of recorded states
-            deviations = fit.deviations if last else search.deviations(index, SCALE)
+            deviations = fit.deviations if last else search.deviations(index, SEARCH.scale)
             refinement.set_state(index, session.recorded.states[index], fit.fit.state, deviations)
             explained[index] = fit.fit.misfit
     if last:

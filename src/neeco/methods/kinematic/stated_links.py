@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import takewhile
 from typing import Any, ClassVar
 
@@ -13,23 +14,36 @@ from torch import Tensor, nn
 from neeco.capture.kinematics import PRISMATIC, KinematicTree, Link
 from neeco.geometry.rotations import rotate_about
 from neeco.methods.kinematic.articulation import Articulation
-from neeco.methods.kinematic.hinges import MIN_PART_SHARE, farthest
+from neeco.methods.kinematic.hinges import HINGES, farthest
 from neeco.scene.drawable import JointMotion
 
-# standard deviations of the stated kinematics
-AXIS_SD = 0.09  # rad
-PIVOT_SD = 2.0  # mm
+
+@dataclass(frozen=True, kw_only=True)
+class StatedLinksSettings:
+    """Priors on stated kinematics, and places of links about a joint."""
+
+    # standard deviations of the stated kinematics
+    axis_sd: float = 0.09  # rad
+    pivot_sd: float = 2.0  # mm
+    gain_sd: float = 0.03
+    side_logits: float = 2.0  # per shaft radius by which a Gaussian lies on the wrong side of a joint
+    # shaft radii beyond the pivot where sides change, and how much farther at the ends of its axis, since a link
+    # holds the next one between its prongs
+    side_start: float = 0.4  # the ends: radii along the axis
+    prongs: float = 0.7
+    prongs_from: float = 0.3
+    prongs_to: float = 0.7
+    max_side_logits: float = 4.0  # that count in the penalty
+    min_step_mm: float = 1.0  # between two pivots that define a direction
+    shaft_reach: float = 3.0  # shaft radii from the axis behind the first pivot; from any pivot before it
+    end_reach: float = 8.0
+    max_wrist_radii: float = 1.5  # behind the first joint within which a found shaft end is accepted
+
+
+STATED = StatedLinksSettings()
+
 # wide: an offset is observed only by how it moves the axes beyond it, and those are stated no better
 OFFSET_SD = {False: 0.1, True: 2.0}  # rad of a revolute joint, mm of a prismatic one
-GAIN_SD = 0.03
-SIDE_LOGITS = 2.0  # per shaft radius by which a Gaussian lies on the wrong side of a joint
-# shaft radii beyond the pivot where sides change, and how much farther at the ends of its axis, since a link holds the
-# next one between its prongs
-SIDE_START, PRONGS, PRONGS_FROM, PRONGS_TO = 0.4, 0.7, 0.3, 0.7  # the ends: radii along the axis
-MAX_SIDE_LOGITS = 4.0  # that count in the penalty
-MIN_STEP_MM = 1.0  # between two pivots that define a direction
-SHAFT_REACH, END_REACH = 3.0, 8.0  # shaft radii from the axis behind the first pivot; from any pivot before it
-MAX_WRIST_RADII = 1.5  # behind the first joint within which a found shaft end is accepted
 
 
 class StatedLinks(Articulation):
@@ -111,7 +125,7 @@ class StatedLinks(Articulation):
         return nn.functional.pad(self._sides(points), (0, logits.shape[1] - self.link_count)) + logits
 
     def misplaced(self, points: Tensor, weights: Tensor) -> Tensor:
-        return -(weights * self._sides(points).clamp_min(-MAX_SIDE_LOGITS)).sum(1)
+        return -(weights * self._sides(points).clamp_min(-STATED.max_side_logits)).sum(1)
 
     def shaft_like(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """The link after the shaft turns about a ball or pin that looks like the shaft's end, or slides out of it."""
@@ -133,8 +147,8 @@ class StatedLinks(Articulation):
         directions = self._link_directions(pivots)
         along = (points @ directions.T - (pivots * directions).sum(1)) / self.radius  # [M, J]
         aside = (points @ axes.T - (pivots * axes).sum(1)).abs() / self.radius  # [M, J]
-        prongs = PRONGS * ((aside - PRONGS_FROM) / (PRONGS_TO - PRONGS_FROM)).clamp(0, 1)
-        beyond = SIDE_LOGITS * (along - SIDE_START - prongs)
+        prongs = STATED.prongs * ((aside - STATED.prongs_from) / (STATED.prongs_to - STATED.prongs_from)).clamp(0, 1)
+        beyond = STATED.side_logits * (along - STATED.side_start - prongs)
         return beyond.clamp_max(0) @ self.outer - beyond.clamp_min(0) @ self.inner
 
     def _link_directions(self, pivots: Tensor) -> Tensor:
@@ -145,7 +159,7 @@ class StatedLinks(Articulation):
             inner = self.inner_joints[joint]
             if inner >= 0 and not self.slides[joint]:
                 step = pivots[joint] - pivots[inner]
-                far = float(step.norm()) > MIN_STEP_MM
+                far = float(step.norm()) > STATED.min_step_mm
                 directions[joint] = nn.functional.normalize(step, dim=0) if far else directions[inner]
         return torch.stack(directions)
 
@@ -240,7 +254,9 @@ class StatedLinks(Articulation):
         """A ball or pin looks the same on either side, and so does a sliding rod: everything that moves with the shaft
         but lies beyond its end (where its colour or symmetry ends) is labelled as the next link."""
         first = self.first_joint()
-        found = (self.wrist_start > first - MAX_WRIST_RADII * self.radius) & (self.wrist_start <= self._latest_end())
+        found = (self.wrist_start > first - STATED.max_wrist_radii * self.radius) & (
+            self.wrist_start <= self._latest_end()
+        )
         end = torch.where(found, self.wrist_start, torch.full_like(first, torch.inf))
         beyond = weights[:, 0] * (self.along_shaft(points) > end)
         moved = nn.functional.one_hot(torch.tensor([0, self._following]), self.link_count).to(weights)
@@ -255,7 +271,7 @@ class StatedLinks(Articulation):
             if inner < 0 or self.slides[joint] or self.slides[inner]:
                 continue
             step = pivots[joint] - pivots[inner]
-            if float(step.norm()) > MIN_STEP_MM:
+            if float(step.norm()) > STATED.min_step_mm:
                 return pivots[inner], step
         return None
 
@@ -269,7 +285,7 @@ class StatedLinks(Articulation):
         aside = (points - origin - along[:, None] * direction).norm(dim=1)
         ahead = torch.cdist(points, self.axes()[0]).amin(1)
         behind = along < self.first_joint()
-        return torch.where(behind, aside > SHAFT_REACH * self.radius, ahead > END_REACH * self.radius)
+        return torch.where(behind, aside > STATED.shaft_reach * self.radius, ahead > STATED.end_reach * self.radius)
 
     def moved_by(self, reading: str, weights: Tensor) -> Tensor:
         moves = self.gains[:, :, self.reading_names.index(reading)].abs().amax(0) > 0  # [L - 1]
@@ -295,7 +311,7 @@ class StatedLinks(Articulation):
         pivots, _ = self.axes()
         for link in self._ends:
             joint = next(j for j in range(len(pivots)) if bool(self.moves(j)[link - 1]))
-            tip = farthest(points[weights[:, link] > MIN_PART_SHARE], pivots[joint])
+            tip = farthest(points[weights[:, link] > HINGES.min_part_share], pivots[joint])
             if tip is not None:
                 self.tips[link] = tip
 
@@ -323,10 +339,10 @@ class StatedLinks(Articulation):
                  for r in range(len(self.reading_names))]  # fmt: skip
         sigma = self.reading_offsets.new_tensor([OFFSET_SD[s] for s in slide])
         return (
-            (self.axis_turns / AXIS_SD).square().sum()
-            + (self.axis_shifts / PIVOT_SD).square().sum()
+            (self.axis_turns / STATED.axis_sd).square().sum()
+            + (self.axis_shifts / STATED.pivot_sd).square().sum()
             + (self.reading_offsets / sigma).square().sum()
-            + (self.reading_gains / GAIN_SD).square().sum()
+            + (self.reading_gains / STATED.gain_sd).square().sum()
         )
 
     def moves(self, joint: int) -> Tensor:

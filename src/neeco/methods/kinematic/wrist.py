@@ -4,6 +4,7 @@ being a surface of revolution."""
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,22 +17,30 @@ from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformation import UNPERTURBED, Perturbation
 from neeco.training.session import GaussianSession
 
-N_PROFILE_FRAMES = 40  # whose colours along the shaft are used
-N_SPIN_FRAMES = 16  # in which shafts are spun to test their symmetry
-SPIN_ANGLE = 0.5  # rad: small, so that visible sides stay in view
-N_WRIST_POSITIONS = 14  # whose symmetry is tested
-MAX_COST_RATIO = 1.01  # of the error with a new wrist position to that before
-SYMMETRY_TOLERANCE = 0.25  # of the range of losses that spinning causes
-BINS_PER_RADIUS = 6  # of the colour profile along the shaft
-MIN_BODY_SHARE = 0.95  # of a pixel whose colour counts
-MIN_FACING = 0.6  # cosine between a ray and the shaft's normal, across the shaft: silhouettes are left out
-MIN_COLOR = 0.02  # added to colours before the logarithm
-MIN_PIXELS = 6  # on either side of a step, in one frame
-MIN_FRAME_SHARE = 0.2  # of the frames that show both sides of a step
-MIN_STEP_RATIO = 8.0  # of a step to the median of steps along the shaft
-SOLID_OPACITY = 0.3  # from which a Gaussian counts as part of the instrument
-RADIUS_SHARE = 0.9  # of the solid Gaussians lie within the shaft's radius
-MIN_SOLID_GAUSSIANS = 10  # with fewer nothing is measured
+
+@dataclass(frozen=True, kw_only=True)
+class WristSettings:
+    """Settings of the search for the wrist."""
+
+    n_profile_frames: int = 40  # whose colours along the shaft are used
+    n_spin_frames: int = 16  # in which shafts are spun to test their symmetry
+    spin_angle: float = 0.5  # rad: small, so that visible sides stay in view
+    n_wrist_positions: int = 14  # whose symmetry is tested
+    max_cost_ratio: float = 1.01  # of the error with a new wrist position to that before
+    symmetry_tolerance: float = 0.25  # of the range of losses that spinning causes
+    bins_per_radius: int = 6  # of the colour profile along the shaft
+    min_body_share: float = 0.95  # of a pixel whose colour counts
+    min_facing: float = 0.6  # cosine between a ray and the shaft's normal, across the shaft: silhouettes are left out
+    min_color: float = 0.02  # added to colours before the logarithm
+    min_pixels: int = 6  # on either side of a step, in one frame
+    min_frame_share: float = 0.2  # of the frames that show both sides of a step
+    min_step_ratio: float = 8.0  # of a step to the median of steps along the shaft
+    solid_opacity: float = 0.3  # from which a Gaussian counts as part of the instrument
+    radius_share: float = 0.9  # of the solid Gaussians lie within the shaft's radius
+    min_solid_gaussians: int = 10  # with fewer nothing is measured
+
+
+WRIST = WristSettings()
 
 
 @torch.no_grad()
@@ -52,9 +61,9 @@ def refine_wrists(session: GaussianSession, articulated: ArticulatedInstruments)
         if not articulation.jointed:
             continue
         before, found = float(articulation.wrist_start), _boundary(session, articulated, index)
-        frames = session.frames_along_poses(N_SPIN_FRAMES)
+        frames = session.frames_along_poses(WRIST.n_spin_frames)
         costs = {place: _spun_error(session, articulated, index, place, frames) for place in (before, found)}
-        articulation.wrist_start.fill_(found if costs[found] <= MAX_COST_RATIO * costs[before] else before)
+        articulation.wrist_start.fill_(found if costs[found] <= WRIST.max_cost_ratio * costs[before] else before)
 
 
 def _boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float:
@@ -68,12 +77,12 @@ def _symmetry_boundary(session: GaussianSession, articulated: ArticulatedInstrum
     articulation = articulated.articulations[index]
     before = float(articulation.wrist_start)
     joint, rear = float(articulation.first_joint()), float(solid_extent(scene.canonical, index, articulation)[0])
-    starts = torch.linspace(rear + 0.3 * (joint - rear), joint, N_WRIST_POSITIONS)
-    frames = session.frames_along_poses(N_SPIN_FRAMES)
+    starts = torch.linspace(rear + 0.3 * (joint - rear), joint, WRIST.n_wrist_positions)
+    frames = session.frames_along_poses(WRIST.n_spin_frames)
     base = sum(_image_error(session, frame, UNPERTURBED) for frame in frames)
     costs = [_spun_error(session, articulated, index, float(start), frames) - base for start in starts]
     articulation.wrist_start.fill_(before)
-    limit = min(costs) + SYMMETRY_TOLERANCE * (max(costs) - min(costs))
+    limit = min(costs) + WRIST.symmetry_tolerance * (max(costs) - min(costs))
     return max(float(start) for start, cost in zip(starts, costs, strict=True) if cost <= limit)
 
 
@@ -84,7 +93,7 @@ def _spun_error(
     direction. Sets the wrist to `start`."""
     articulated.articulations[index].wrist_start.fill_(start)
     return sum(
-        _image_error(session, frame, articulated.spin_perturbation(-SPIN_ANGLE if k % 2 else SPIN_ANGLE))
+        _image_error(session, frame, articulated.spin_perturbation(-WRIST.spin_angle if k % 2 else WRIST.spin_angle))
         for k, frame in enumerate(frames)
     )
 
@@ -103,28 +112,28 @@ def color_boundary(session: GaussianSession, articulated: ArticulatedInstruments
     radius = float(articulation.radius)
     rear = float(solid_extent(session.scene.canonical, index, articulation)[0])
     like, end = articulation.shaft_like(articulated.link_weights(session.scene.canonical, index))
-    count = int((float(end) - rear) / (radius / BINS_PER_RADIUS))
-    if not count > 2 * BINS_PER_RADIUS:
+    count = int((float(end) - rear) / (radius / WRIST.bins_per_radius))
+    if not count > 2 * WRIST.bins_per_radius:
         return None
-    edges = rear + torch.arange(count + 1, device=session.views.device) * (radius / BINS_PER_RADIUS)
-    frames = session.frames_along_poses(N_PROFILE_FRAMES)
+    edges = rear + torch.arange(count + 1, device=session.views.device) * (radius / WRIST.bins_per_radius)
+    frames = session.frames_along_poses(WRIST.n_profile_frames)
     steps = torch.stack([_steps(*_profile(session, articulated, index, frame, edges, like)) for frame in frames])
     observed = steps.isfinite().all(2).sum(0)  # [count + 1] frames
-    enough = observed >= MIN_FRAME_SHARE * len(steps)
-    if int(enough.sum()) < BINS_PER_RADIUS:
+    enough = observed >= WRIST.min_frame_share * len(steps)
+    if int(enough.sum()) < WRIST.bins_per_radius:
         return None
     mean = torch.nanmean(steps[:, enough], 0).abs()  # [candidates, 3]
     ratio = (mean / mean.median(0).values.clamp_min(1e-4)).norm(dim=1)
     inner = ratio[1:-1]  # a maximum at the last edge is the start of the jaws, not a border
     inner = torch.where((inner >= ratio[:-2]) & (inner >= ratio[2:]), inner, 0.0)
     best = int(inner.argmax())
-    return float(edges[enough][best + 1]) if inner[best] > MIN_STEP_RATIO else None
+    return float(edges[enough][best + 1]) if inner[best] > WRIST.min_step_ratio else None
 
 
 def _steps(profile: Tensor, pixels: Tensor) -> Tensor:
     """Return the step [B + 1, 3] at every edge between bins: the mean over one radius after it minus that before it;
     nan where either has too few pixels. profile [B, 3] sums of colour over pixels [B]."""
-    window = BINS_PER_RADIUS
+    window = WRIST.bins_per_radius
     total = torch.cat([profile.new_zeros(1, 3), profile.cumsum(0)])  # [B + 1, 3]
     number = torch.cat([pixels.new_zeros(1), pixels.cumsum(0)])[:, None]
     steps = torch.full_like(total, math.nan)
@@ -132,7 +141,7 @@ def _steps(profile: Tensor, pixels: Tensor) -> Tensor:
     after, before = slice(2 * window, None), slice(0, len(total) - 2 * window)
     counts = number[after] - number[middle], number[middle] - number[before]
     means = (total[after] - total[middle]) / counts[0], (total[middle] - total[before]) / counts[1]
-    steps[middle] = torch.where(torch.minimum(*counts) >= MIN_PIXELS, means[0] - means[1], math.nan)
+    steps[middle] = torch.where(torch.minimum(*counts) >= WRIST.min_pixels, means[0] - means[1], math.nan)
     return steps
 
 
@@ -155,11 +164,11 @@ def _profile(
     assert channels is not None
     pose = scene.registered(state).instruments[scene.instruments[index].name].pose
     along = _along_shaft(camera, pose.to(body), articulated.articulations[index])  # [H, W]
-    chosen = (channels[..., 0] > MIN_BODY_SHARE) & along.isfinite()
+    chosen = (channels[..., 0] > WRIST.min_body_share) & along.isfinite()
     mask = session.views.mask(frame_index)
     if mask is not None:
         chosen &= mask
-    logs = (session.views.target(frame_index)[chosen] + MIN_COLOR).log()  # [P, 3]
+    logs = (session.views.target(frame_index)[chosen] + WRIST.min_color).log()  # [P, 3]
     colors = torch.stack([logs.mean(1), logs[:, 0] - logs[:, 1], logs[:, 2] - logs[:, 1]], 1)
     bins = torch.bucketize(along[chosen], edges) - 1
     binned = (bins >= 0) & (bins < len(edges) - 1)
@@ -187,29 +196,29 @@ def _along_shaft(camera: Camera, pose: Tensor, articulation: Articulation) -> Te
     half = across @ aside
     discriminant = half.square() - square * (aside.square().sum() - radius.square())
     depth = (-half - discriminant.clamp_min(0).sqrt()) / square
-    meets = (discriminant > (MIN_FACING * radius).square() * square) & (depth > 0)
+    meets = (discriminant > (WRIST.min_facing * radius).square() * square) & (depth > 0)
     return torch.where(meets, start_along + depth * ray_along, math.nan)
 
 
 def solid_gaussians(canonical: CanonicalGaussians, index: int) -> Tensor:
     """Return which Gaussians of instrument `index` are solid, [M] bool."""
-    return torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]) > SOLID_OPACITY
+    return torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]) > WRIST.solid_opacity
 
 
 def measure_radius(canonical: CanonicalGaussians, index: int, articulation: Articulation) -> None:
-    """Set the shaft's radius to the quantile RADIUS_SHARE of the solid Gaussians' distances from its axis, well behind
-    the first joint; leave it where there are too few."""
+    """Set the shaft's radius to the quantile `radius_share` of the solid Gaussians' distances from its axis, well
+    behind the first joint; leave it where there are too few."""
     points = canonical.means[canonical.body(index + 1)][solid_gaussians(canonical, index)]
     origin, direction = articulation.shaft()
     along = articulation.along_shaft(points)
     away = (points - origin - along[:, None] * direction)[along < articulation.first_joint() - 2 * articulation.radius]
-    if len(away) >= MIN_SOLID_GAUSSIANS:
-        articulation.radius.copy_(away.norm(dim=1).quantile(RADIUS_SHARE))
+    if len(away) >= WRIST.min_solid_gaussians:
+        articulation.radius.copy_(away.norm(dim=1).quantile(WRIST.radius_share))
 
 
 def solid_extent(canonical: CanonicalGaussians, index: int, articulation: Articulation) -> Tensor:
     """Return the interval [2] mm along the shaft that contains the solid Gaussians."""
     along = articulation.along_shaft(canonical.means[canonical.body(index + 1)][solid_gaussians(canonical, index)])
-    if len(along) < MIN_SOLID_GAUSSIANS:
+    if len(along) < WRIST.min_solid_gaussians:
         return articulation.extent.clone()
     return torch.quantile(along, along.new_tensor([0.02, 0.985]))
