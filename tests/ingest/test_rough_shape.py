@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neeco.geometry.lens import Lens
-from neeco.ingest.foreground.residual_flow import STEP_PX, ResidualFlow
+from neeco.ingest.foreground.residual_flow import FLOW, ResidualFlow
 from neeco.ingest.foreground.rough_shape import best_lag, carve_shape, lag_of, observations_on, project_mask
 from neeco.ingest.frames.views import SfmResult
 
@@ -24,9 +24,9 @@ def poses() -> np.ndarray:
 
 def moving_at(places: np.ndarray) -> np.ndarray:
     """[R, h, w] evidence of motion about one point [R, 3] mm of the camera's frame."""
-    evidence = np.zeros((len(places), 48 // STEP_PX, 64 // STEP_PX))
+    evidence = np.zeros((len(places), 48 // FLOW.step_px, 64 // FLOW.step_px))
     for pixels, (x, y, z) in zip(evidence, places, strict=True):
-        column, row = int((60 * x / z + 32) / STEP_PX), int((60 * y / z + 24) / STEP_PX)
+        column, row = int((60 * x / z + 32) / FLOW.step_px), int((60 * y / z + 24) / FLOW.step_px)
         pixels[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = 1.0
     return evidence
 
@@ -59,7 +59,7 @@ def test_agreement_with_a_flat_top_contradicts_no_clock() -> None:
 
 
 def test_motion_that_follows_no_pose_gives_no_shape() -> None:
-    evidence = np.random.default_rng(0).uniform(0, 0.2, (len(ROWS), 48 // STEP_PX, 64 // STEP_PX))
+    evidence = np.random.default_rng(0).uniform(0, 0.2, (len(ROWS), 48 // FLOW.step_px, 64 // FLOW.step_px))
     assert carve_shape(evidence, poses(), PINHOLE) is None
 
 
@@ -106,10 +106,10 @@ def test_what_moves_is_told_alike_in_small_and_large_images(times: int) -> None:
         300.0 * times, 300.0 * times, width * times / 2, height * times / 2, (), (times * width, times * height)
     )
     evidence = ResidualFlow(load, sfm, np.arange(4) / 25, lens, visible).moving_pixels(np.array([0]), 1.5)[0]
-    assert evidence.shape == (height // STEP_PX, width // STEP_PX)
-    assert np.isnan(evidence[:, : 40 // STEP_PX]).all()
-    assert not np.isnan(evidence[:, 60 // STEP_PX :]).any()
+    assert evidence.shape == (height // FLOW.step_px, width // FLOW.step_px)
+    assert np.isnan(evidence[:, : 40 // FLOW.step_px]).all()
+    assert not np.isnan(evidence[:, 60 // FLOW.step_px :]).any()
     inside = np.zeros(evidence.shape, bool)
-    inside[110 // STEP_PX : 150 // STEP_PX, 115 // STEP_PX : 165 // STEP_PX] = True
+    inside[110 // FLOW.step_px : 150 // FLOW.step_px, 115 // FLOW.step_px : 165 // FLOW.step_px] = True
     assert evidence[inside].mean() > 0.8
     assert np.nanmean(evidence[:20]) < 0.05

@@ -19,7 +19,7 @@ from neeco.base.errors import NeecoError
 from neeco.cli import main
 from neeco.viewer import server
 from neeco.viewer.server import ViewerServer
-from neeco.viewer.session import MOVING_PX, SHARP_PX, AdaptiveResolution, RenderThread
+from neeco.viewer.session import VIEWER, AdaptiveResolution, RenderThread
 
 viser = pytest.importorskip("viser")
 from viser import _messages as messages  # noqa: E402
@@ -272,12 +272,12 @@ def test_a_slow_scene_is_drawn_smaller_and_a_fast_one_as_large_as_the_window() -
     for _ in range(3):
         fast.record(1e-3, 256 * 400)
         slow.record(5.0, 256 * 400)
-    assert fast.height(False, 900, 1.6) == MOVING_PX
-    assert fast.height(True, 900, 1.6) == SHARP_PX
+    assert fast.height(False, 900, 1.6) == VIEWER.moving_px
+    assert fast.height(True, 900, 1.6) == VIEWER.sharp_px
     assert fast.height(True, 300, 1.6) == 300
     assert slow.height(False, 900, 1.6) < slow.height(True, 900, 1.6) < 100
     fast.record(60.0, 256 * 400)  # had to find something out first
-    assert fast.height(False, 900, 1.6) == MOVING_PX
+    assert fast.height(False, 900, 1.6) == VIEWER.moving_px
 
 
 def test_a_size_asked_for_is_rendered_whatever_it_takes() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -11,11 +11,19 @@ import numpy as np
 
 from neeco.geometry.camera import Camera
 
-MAX_SLOPE = 3.0  # (72 degrees) of a ray that a lens may bend into the image
-MAX_MISS_PX = 0.05  # distance of a distorted ray from the pixel that it was found for
-N_NEWTON_STEPS = 6
-NODE_SPACING_PX = 4  # between pixels whose rays are computed; the others are interpolated, to 0.01 px
-DERIVATIVE_STEP = 1e-6  # slope, over which the derivative of a distortion is taken
+
+@dataclass(frozen=True, kw_only=True)
+class DistortionSettings:
+    """Tolerances and steps of undistortion."""
+
+    max_slope: float = 3.0  # (72 degrees) of a ray that a lens may bend into the image
+    max_miss_px: float = 0.05  # distance of a distorted ray from the pixel that it was found for
+    n_newton_steps: int = 6
+    node_spacing_px: int = 4  # between pixels whose rays are computed; the others are interpolated, to 0.01 px
+    derivative_step: float = 1e-6  # slope, over which the derivative of a distortion is taken
+
+
+DISTORTION = DistortionSettings()
 
 
 class LensField(NamedTuple):
@@ -44,15 +52,18 @@ def undistorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray
         return slopes
     found = slopes.astype(np.float64)
     with np.errstate(all="ignore"):
-        for _ in range(N_NEWTON_STEPS):
+        for _ in range(DISTORTION.n_newton_steps):
             here = distorted(found, distortion)
             (a, c), (b, d) = (
-                ((distorted(found + DERIVATIVE_STEP * axis, distortion) - here) / DERIVATIVE_STEP).T
+                (
+                    (distorted(found + DISTORTION.derivative_step * axis, distortion) - here)
+                    / DISTORTION.derivative_step
+                ).T
                 for axis in np.eye(2)
             )  # columns of the Jacobian
             x, y = (slopes - here).T
             found = found + (np.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)).T
-            found = np.clip(np.nan_to_num(found), -2 * MAX_SLOPE, 2 * MAX_SLOPE)
+            found = np.clip(np.nan_to_num(found), -2 * DISTORTION.max_slope, 2 * DISTORTION.max_slope)
     return found
 
 
@@ -113,10 +124,14 @@ def _lens_field(
     border: tuple[float, float, float] | None,
 ) -> LensField:
     focal, center = np.array(intrinsics[:2]), np.array(intrinsics[2:])
-    nodes = _centers(width // NODE_SPACING_PX + 2, height // NODE_SPACING_PX + 2, NODE_SPACING_PX)
+    nodes = _centers(
+        width // DISTORTION.node_spacing_px + 2, height // DISTORTION.node_spacing_px + 2, DISTORTION.node_spacing_px
+    )
     slopes = undistorted((nodes.reshape(-1, 2) - center) / focal, distortion)
     again = distorted(slopes, distortion) * focal + center
-    shown = (np.abs(slopes) <= MAX_SLOPE).all(1) & (np.abs(again - nodes.reshape(-1, 2)) < MAX_MISS_PX).all(1)
+    shown = (np.abs(slopes) <= DISTORTION.max_slope).all(1) & (
+        np.abs(again - nodes.reshape(-1, 2)) < DISTORTION.max_miss_px
+    ).all(1)
     slopes = np.where(shown[:, None], slopes, np.nan).reshape(nodes.shape).astype(np.float32)
     slopes = _between(_between(slopes, height).transpose(1, 0, 2), width).transpose(1, 0, 2)
     if border is not None:
@@ -133,7 +148,7 @@ def _centers(width: int, height: int, step: int = 1) -> np.ndarray:
 
 
 def _between(nodes: np.ndarray, count: int) -> np.ndarray:
-    """Interpolate [count, ...] linearly between nodes [N, ...] NODE_SPACING_PX apart; NaN next to NaN nodes."""
-    place, rest = np.divmod(np.arange(count), NODE_SPACING_PX)
-    share = (rest / np.float32(NODE_SPACING_PX)).astype(np.float32)[:, None, None]
+    """Interpolate [count, ...] linearly between nodes [N, ...] `node_spacing_px` apart; NaN next to NaN nodes."""
+    place, rest = np.divmod(np.arange(count), DISTORTION.node_spacing_px)
+    share = (rest / np.float32(DISTORTION.node_spacing_px)).astype(np.float32)[:, None, None]
     return (1 - share) * nodes[place] + share * nodes[place + 1]

@@ -11,9 +11,19 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 State = TypeVar("State")
-MAX_TRIALS = 6  # steps, each shorter, before a state counts as the minimum
-DAMPING_FACTOR = 4.0  # by which damping grows after a trial that fails, and falls after a step
-MIN_DAMPING, FREE_DAMPING = 1e-6, 1e-5  # the least; and that at which a step counts as undamped
+
+
+@dataclass(frozen=True, kw_only=True)
+class DampingSettings:
+    """Settings of the damping."""
+
+    max_trials: int = 6  # steps, each shorter, before a state counts as the minimum
+    damping_factor: float = 4.0  # by which damping grows after a trial that fails, and falls after a step
+    min_damping: float = 1e-6  # the least; and that at which a step counts as undamped
+    free_damping: float = 1e-5
+
+
+DAMPING = DampingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +61,15 @@ def levenberg_marquardt(
     """
     for _ in range(max_steps):
         at = linearise(state)
-        for _ in range(MAX_TRIALS):
+        for _ in range(DAMPING.max_trials):
             trial = move(state, at.step(damping))
             value = at.cost(trial)
             if value < at.value:
                 break
-            damping *= DAMPING_FACTOR
+            damping *= DAMPING.damping_factor
         else:
             return state
-        state, damping = trial, max(damping / DAMPING_FACTOR, MIN_DAMPING)
-        if at.value - value < tolerance * at.value and damping <= FREE_DAMPING:
+        state, damping = trial, max(damping / DAMPING.damping_factor, DAMPING.min_damping)
+        if at.value - value < tolerance * at.value and damping <= DAMPING.free_damping:
             return state
     return state

@@ -6,9 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MIN_LEVER_MM = 40.0  # from the instrument to its trocar
-MAX_BEND_MM = 0.3  # root mean square distance of a trocar from the line: beyond, a wrist bends the tracked frame
-MIN_TRAVEL_MM = 2.0  # in and out, from which a line has a direction
+
+@dataclass(frozen=True, kw_only=True)
+class TrocarSettings:
+    """Thresholds of motion about a trocar."""
+
+    min_lever_mm: float = 40.0  # from the instrument to its trocar
+    # root mean square distance of a trocar from the line: beyond, a wrist bends the tracked frame
+    max_bend_mm: float = 0.3
+    min_travel_mm: float = 2.0  # in and out, from which a line has a direction
+
+
+TROCAR = TrocarSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +29,7 @@ class ShaftLine:
     axis: np.ndarray  # [3] unit
 
 
-def line_through_trocar(poses: np.ndarray, max_bend_mm: float = MAX_BEND_MM) -> ShaftLine | None:
+def line_through_trocar(poses: np.ndarray, max_bend_mm: float = TROCAR.max_bend_mm) -> ShaftLine | None:
     """The line, fixed to poses [F, 4, 4], that goes through one fixed point in all of them, within max_bend_mm (rms);
     None where there is none, or none is determined."""
     from scipy.optimize import least_squares  # slow to import
@@ -39,7 +48,7 @@ def line_through_trocar(poses: np.ndarray, max_bend_mm: float = MAX_BEND_MM) -> 
     axis = np.linalg.svd(local - middle, full_matrices=False)[2][0]
     travel = float(np.ptp(local @ axis))
     rms = float(np.sqrt(np.square(found.fun).sum() / len(poses)))
-    if np.linalg.norm(local, axis=1).min() < MIN_LEVER_MM or rms > max_bend_mm or travel < MIN_TRAVEL_MM:
+    if np.linalg.norm(local, axis=1).min() < TROCAR.min_lever_mm or rms > max_bend_mm or travel < TROCAR.min_travel_mm:
         return None
     axis = -axis if axis @ middle > 0 else axis
     return ShaftLine(middle - (middle @ axis) * axis, axis)

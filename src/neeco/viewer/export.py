@@ -12,6 +12,7 @@ import hashlib
 import json
 import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -40,10 +41,22 @@ SCHEMA = "neeco-page/1"
 SCRIPTS = ("scene.js", "states.js", "drawing.js", "camera.js", "panel.js", "main.js")  # in this order, as one module
 WORKER, STYLE, WASM = "worker.js", "page.css", "viewer.wasm"
 MAX_DEGREE = 3
-EMBEDDED_DEGREE = 1  # in a report: half the size, and for a first look
-MAX_INSTRUMENTS, MAX_AXES, MAX_LABELS = 8, 8, 32  # that the page's rasteriser has room for; axes of one instrument
-THINNEST_MM = 0.01  # thinner than any pixel
-POSITION_STEPS = 2**20 - 1  # of a body's box: 2**16 change the order in depth of neighbours, which costs 5 dB
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportSettings:
+    """Limits of what an exported page holds."""
+
+    embedded_degree: int = 1  # in a report: half the size, and for a first look
+    max_instruments: int = 8  # that the page's rasteriser has room for; axes of one instrument
+    max_axes: int = 8
+    max_labels: int = 32
+    thinnest_mm: float = 0.01  # thinner than any pixel
+    position_steps: int = 2**20 - 1  # of a body's box: 2**16 change the order in depth of neighbours, which costs 5 dB
+
+
+EXPORT = ExportSettings()
+
 NOT_FINITE = "--export: the scene holds numbers that are not finite; train again"
 BYTES = {"uint8": 1, "int8": 1, "uint16": 2, "uint24": 3}
 
@@ -64,7 +77,7 @@ def export_page(run: Path, output: Path, sh_degree: int, device: torch.device) -
 
 def embedded_page(run: TrainedRun) -> str | None:
     """The page of a run for a frame in its report; None where a page cannot hold it."""
-    return None if why_not(run.scene) else page_of_run(run, EMBEDDED_DEGREE)
+    return None if why_not(run.scene) else page_of_run(run, EXPORT.embedded_degree)
 
 
 def page_of_run(run: TrainedRun, sh_degree: int) -> str:
@@ -141,9 +154,9 @@ def why_not(scene: DrawableScene) -> str | None:
         )
     most_axes = max((len(axes) for axes in motion.axes), default=0)
     for name, found, most in (
-        ("instruments", len(scene.instruments), MAX_INSTRUMENTS),
-        ("axes of an instrument", most_axes, MAX_AXES),
-        ("labels", len(scene.label_names), MAX_LABELS),
+        ("instruments", len(scene.instruments), EXPORT.max_instruments),
+        ("axes of an instrument", most_axes, EXPORT.max_axes),
+        ("labels", len(scene.label_names), EXPORT.max_labels),
     ):
         if found > most:
             return f"{found} {name}: a page has room for {most}; look at it with `neeco view RUN`"
@@ -159,7 +172,7 @@ def pack(scene: GaussianScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
         raise NeecoError(f"--export: {refusal}")
     degree = min(sh_degree, scene.sh_degree)
     means, boxes = _in_boxes(canonical.means, canonical.counts)
-    scales, scale_range = _quantized(motion.log_scales.clamp_min(float(np.log(THINNEST_MM))), 255)
+    scales, scale_range = _quantized(motion.log_scales.clamp_min(float(np.log(EXPORT.thinnest_mm))), 255)
     base, base_range = _quantized(canonical.sh_dc[:, 0] * SH_C0 + 0.5, 65535)
     turns = [_quantized(column[:, None], 65535) for column in motion.amounts.flatten(1).unbind(1)]
     harmonics, bands = _harmonics(canonical.sh_rest, degree)
@@ -217,7 +230,7 @@ def _in_boxes(means: Tensor, counts: Sequence[int]) -> tuple[np.ndarray, list[li
     rows, boxes = [], []
     for body in torch.split(means, list(counts)):
         low, high = (body.amin(0), body.amax(0)) if len(body) else (means.new_zeros(3), means.new_ones(3))
-        rows.append(_rounded((body - low) / (high - low).clamp_min(1e-9) * POSITION_STEPS))
+        rows.append(_rounded((body - low) / (high - low).clamp_min(1e-9) * EXPORT.position_steps))
         boxes.append([low.tolist(), high.tolist()])
     return np.concatenate(rows), boxes
 

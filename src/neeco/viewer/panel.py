@@ -23,12 +23,22 @@ if TYPE_CHECKING:
 
     from neeco.viewer.viser_scene import Overlays
 
-SLIDE_MM, YAW_DEG = 30.0, 45.0
+
+@dataclass(frozen=True, kw_only=True)
+class PanelSettings:
+    """Settings of the panel's sliders and plots."""
+
+    slide_mm: float = 30.0
+    yaw_deg: float = 45.0
+    plots_every_s: float = 0.5  # while more becomes known
+    plot_height: int = 140  # px
+    line: int = 80  # characters of a name or message that are shown
+
+
+PANEL = PanelSettings()
+
 NONE_CHOSEN = "—"
-PLOTS_EVERY_S = 0.5  # while more becomes known
-PLOT_HEIGHT = 140  # px
 PLOT_COLOR = "#228be6"
-LINE = 80  # characters of a name or message that are shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +84,7 @@ class Panel:
         """Draw what is known of the frames' PSNR, and list the worst."""
         so_far = timeline, timeline.count
         now = time.perf_counter()
-        if so_far == self._plotted or (not timeline.done and now - self._plotted_at < PLOTS_EVERY_S):
+        if so_far == self._plotted or (not timeline.done and now - self._plotted_at < PANEL.plots_every_s):
             return
         self._plotted, self._plotted_at = so_far, now
         names, splits = self._loaded.recorded.names, self._loaded.recorded.splits
@@ -156,7 +166,7 @@ class Panel:
         if self._plot is not None:
             self._plot.data = data
             return
-        label = f"{self._loaded.name} (dB)"[:LINE]
+        label = f"{self._loaded.name} (dB)"[: PANEL.line]
         with self._timeline_folder:
             self._plot = self._gui.add_uplot(
                 data,
@@ -164,7 +174,7 @@ class Panel:
                 scales={"x": {"time": False}, "y": {"auto": True}},
                 axes=({"size": 32}, {"size": 34}),
                 legend={"show": False},
-                height=PLOT_HEIGHT,
+                height=PANEL.plot_height,
                 padding=(6, 8, 0, 0),
             )
 
@@ -207,10 +217,14 @@ class InstrumentPanel:
                 joint: _joint_slider(gui, joint, span, self._per_unit[joint]) for joint, span in self._ranges.items()
             }
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
-            self.slide = gui.add_slider("along shaft (mm)", -SLIDE_MM, SLIDE_MM, 0.5, 0.0, hint=f"Along {about}.")
+            self.slide = gui.add_slider(
+                "along shaft (mm)", -PANEL.slide_mm, PANEL.slide_mm, 0.5, 0.0, hint=f"Along {about}."
+            )
             self.roll = gui.add_slider("roll (°)", -180.0, 180.0, 1.0, 0.0, hint=f"About {about}.")
-            self.yaw = gui.add_slider("yaw (°)", -YAW_DEG, YAW_DEG, 0.5, 0.0, hint="About the shaft's end.")
-            self.pitch = gui.add_slider("pitch (°)", -YAW_DEG, YAW_DEG, 0.5, 0.0, hint="About the shaft's end.")
+            self.yaw = gui.add_slider("yaw (°)", -PANEL.yaw_deg, PANEL.yaw_deg, 0.5, 0.0, hint="About the shaft's end.")
+            self.pitch = gui.add_slider(
+                "pitch (°)", -PANEL.yaw_deg, PANEL.yaw_deg, 0.5, 0.0, hint="About the shaft's end."
+            )
             self.gizmo = gui.add_checkbox(
                 "drag it in the scene",
                 False,
@@ -311,18 +325,18 @@ def status_html(shown: RunPicture, seconds: float, note: str) -> str:
     if loaded.recorded.still:
         lines.append("still scope: views far from the recorded one show what no frame saw")
     if shown.trouble:
-        lines.append(_text(shown.trouble, 3 * LINE))
+        lines.append(_text(shown.trouble, 3 * PANEL.line))
     height, width = shown.picture.depth.shape
     lines.append(f"{seconds * 1e3:.0f} ms at {width} × {height}")
-    return _block([*lines, _text(note, 3 * LINE)] if note else lines)
+    return _block([*lines, _text(note, 3 * PANEL.line)] if note else lines)
 
 
 def message_html(text: str) -> str:
     """HTML of one message."""
-    return _block([_text(text, 4 * LINE)]) if text else ""
+    return _block([_text(text, 4 * PANEL.line)]) if text else ""
 
 
-def _text(text: str, most: int = LINE) -> str:
+def _text(text: str, most: int = PANEL.line) -> str:
     """Text on one line, at most `most` characters, escaped."""
     line = " ".join(str(text).split())
     return html.escape(line if len(line) <= most else line[: most - 1] + "…")

@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import math
 import threading
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,22 @@ from neeco.training.run import load_run
 
 # of the working length, that a picture shows: before and beyond the origin, to its sides
 ALONG, ACROSS = (-0.6, 1.4), 0.65
-PICTURE_PX, THUMB_PX, GHOST_PX = 1000, 160, 500  # wide
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosingSettings:
+    """Sizes of pictures of the posing page."""
+
+    picture_px: int = 1000  # wide
+    thumb_px: int = 160
+    ghost_px: int = 500
+    quality: int = 90
+    joint_range_deg: tuple[float, float] = (0.0, 120.0)  # of a slider, where the capture states no limits
+
+
+POSING = PosingSettings()
+
 RUN_FILE = "config.yaml"  # tells a run from a capture
-QUALITY = 90
-JOINT_RANGE_DEG = (0.0, 120.0)  # of a slider, where the capture states no limits
 
 
 class PosingSession:
@@ -96,13 +108,13 @@ class PosingSession:
             raise NeecoError("ghost: the run's scene does not tell instruments from tissue; train method kinematic")
         color = (drawing.image.numpy() * 255).round().astype(np.uint8)
         clear = np.dstack([color, (drawing.parts.numpy() > 0).astype(np.uint8) * 255])
-        return _encoded(self._along(posing, index, clear, GHOST_PX), ".png")
+        return _encoded(self._along(posing, index, clear, POSING.ghost_px), ".png")
 
     def picture(self, instrument: str, index: int, small: bool) -> bytes:
         """A frame along the shaft, which points to the right, as JPEG. Raises NeecoError."""
         posing = self._posing(instrument, index)
         image = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
-        return _encoded(self._along(posing, index, image, THUMB_PX if small else PICTURE_PX), ".jpg")
+        return _encoded(self._along(posing, index, image, POSING.thumb_px if small else POSING.picture_px), ".jpg")
 
     def _along(self, posing: SolvedPosing, index: int, image: np.ndarray, width: int) -> np.ndarray:
         """An image [H, W, C] of a frame along the shaft, `width` px wide."""
@@ -196,7 +208,7 @@ class PosingSession:
             "joints": {
                 name: [math.degrees(value) for value in limits]
                 if (limits := posing.instrument.joints[name]) is not None
-                else list(JOINT_RANGE_DEG)
+                else list(POSING.joint_range_deg)
                 for name in posing.joints
             },
         }
@@ -210,7 +222,7 @@ def _possible(posing: SolvedPosing, roll_deg: float, joints_deg: dict[str, float
 def _encoded(pixels: np.ndarray, kind: str) -> bytes:
     """Encode RGB or RGBA [H, W, C] as a file of that kind."""
     order = cv2.COLOR_RGB2BGR if pixels.shape[-1] == 3 else cv2.COLOR_RGBA2BGRA
-    options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if kind == ".jpg" else []
+    options = [cv2.IMWRITE_JPEG_QUALITY, POSING.quality] if kind == ".jpg" else []
     done, encoded = cv2.imencode(kind, cv2.cvtColor(pixels, order), options)
     if not done:
         raise NeecoError(f"a picture of {pixels.shape} could not be encoded")

@@ -16,7 +16,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.labels.drawing import to_numpy
 from neeco.viewer.access import HOST, PORT
 from neeco.viewer.panel import message_html
-from neeco.viewer.runs import ASSUMED_MM, DISTANCE_UNITS
+from neeco.viewer.runs import VIEW
 from neeco.viewer.server import ViserPage
 from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, stands_at, wxyz_of
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import viser
 
 IMAGE_PX = 720  # high at most, of the image behind the scene
-AXIS_UNITS = 0.1 * DISTANCE_UNITS
+AXIS_UNITS = 0.1 * VIEW.distance_units
 UNREGISTERED = "instruments are not shown: their poses are not in the cameras' frame"
 TRACK_COLORS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167))
 
@@ -36,7 +36,7 @@ class RecordingServer(ViserPage):
         """Raises NeecoError."""
         self.capture = read_capture(root)
         self.distance = _distance(self.capture)
-        self.unit = DISTANCE_UNITS / self.distance
+        self.unit = VIEW.distance_units / self.distance
         super().__init__(host, port, [frame.camera for frame in self.capture.frames], self.distance, self.unit)
         self.sessions: dict[int, RecordingSession] = {}
         self._server.on_client_connect(self._connect)
@@ -150,4 +150,4 @@ def _distance(capture: Capture) -> float:
         origins = [to_numpy(item.pose)[:3, 3] for item in frame.state.instruments.values()]
         depths += [float((place - pose[:3, 3]) @ pose[:3, 2]) for place in (origins if middle is None else [middle])]
     ahead = [depth for depth in depths if depth > 0]
-    return float(np.median(ahead)) if ahead else ASSUMED_MM
+    return float(np.median(ahead)) if ahead else VIEW.assumed_mm

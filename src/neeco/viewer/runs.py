@@ -33,12 +33,21 @@ if TYPE_CHECKING:
     from neeco.scene import DrawableScene
 
 SCENE_FILE = "scene.safetensors"
-ASSUMED_MM = 100.0  # from a camera to what it looks at, where no camera looks at the scene's centre
-DISTANCE_UNITS = 10.0  # viser's units of length, from a recorded camera to what it looks at
-WATCH_S = 2.0  # between two checks of the run folder
-TIMELINE_WIDTH = 320  # px at most of the images that a timeline compares
-FIELD_WIDTH = 48  # px, of a radiance field's, which take a hundred times as long
-WORST = 8  # frames that a timeline lists
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunViewSettings:
+    """Settings of the view of a run."""
+
+    assumed_mm: float = 100.0  # from a camera to what it looks at, where no camera looks at the scene's centre
+    distance_units: float = 10.0  # viser's units of length, from a recorded camera to what it looks at
+    watch_s: float = 2.0  # between two checks of the run folder
+    timeline_width: int = 320  # px at most of the images that a timeline compares
+    field_width: int = 48  # px, of a radiance field's, which take a hundred times as long
+    worst: int = 8  # frames that a timeline lists
+
+
+VIEW = RunViewSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,7 +81,7 @@ class LoadedRun:
         poses = [camera.world_from_camera.detach().cpu().double() for camera in self.recorded.cameras]
         depths = [float((centre - pose[:3, 3]) @ pose[:3, 2]) for pose in poses]
         ahead = [depth for depth in depths if depth > 0]
-        return float(np.median(ahead)) if ahead else ASSUMED_MM
+        return float(np.median(ahead)) if ahead else VIEW.assumed_mm
 
     @property
     def signature(self) -> tuple[Any, ...]:
@@ -93,7 +102,7 @@ class ViewedRun:
         self.loaded = self._load()  # replaced as a whole: a reader never sees half of a change
         self.trouble = ""
         self.distance = self.loaded.distance  # mm
-        self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
+        self.unit = VIEW.distance_units / self.distance  # viser's units per mm
         self.timeline = Timeline(self.loaded)
         self._ended = threading.Event()
 
@@ -121,7 +130,7 @@ class ViewedRun:
         no longer be read; until `end_watch`."""
 
         def look() -> None:
-            while not self._ended.wait(WATCH_S):
+            while not self._ended.wait(VIEW.watch_s):
                 trouble = self.trouble
                 if self.refresh() or trouble != self.trouble:
                     changed()
@@ -226,8 +235,8 @@ def score_frame(loaded: LoadedRun, index: int) -> FrameScore:
 
 
 class Timeline:
-    """The PSNR of every frame of a recording, at no more than TIMELINE_WIDTH px, computed a frame at a time. One thread
-    computes; any may read."""
+    """The PSNR of every frame of a recording, at no more than `timeline_width` px, computed a frame at a time. One
+    thread computes; any may read."""
 
     def __init__(self, loaded: LoadedRun) -> None:
         self.loaded = loaded
@@ -251,19 +260,19 @@ class Timeline:
 
     def worst(self) -> list[int]:
         """The worst known frames, worst first; of similar neighbours only the worst."""
-        known, apart = self.known, max(1, len(self.psnr) // (4 * WORST))
+        known, apart = self.known, max(1, len(self.psnr) // (4 * VIEW.worst))
         chosen: list[int] = []
         for frame in known[np.argsort(self.psnr[known], kind="stable")].tolist():
             if all(abs(frame - other) >= apart for other in chosen):
                 chosen.append(frame)
-        return chosen[:WORST]
+        return chosen[: VIEW.worst]
 
 
 @torch.no_grad()
 def coarse_psnr(loaded: LoadedRun, index: int) -> float:
-    """PSNR in dB of one frame, rendered and recorded at no more than TIMELINE_WIDTH px. Raises NeecoError."""
+    """PSNR in dB of one frame, rendered and recorded at no more than `timeline_width` px. Raises NeecoError."""
     frame = loaded.frames[index]
-    camera = narrowed(frame.camera, TIMELINE_WIDTH if loaded.scene.has_gaussians else FIELD_WIDTH)
+    camera = narrowed(frame.camera, VIEW.timeline_width if loaded.scene.has_gaussians else VIEW.field_width)
     size = camera.width, camera.height
     image = cv2.resize(frame.load_image().numpy(), size, interpolation=cv2.INTER_AREA)
     mask = frame.load_mask()

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,15 +27,27 @@ from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fittin
 if TYPE_CHECKING:
     import viser
 
-SETTLED_S = 0.15  # without a request: what is shown stands still and is rendered sharp
-IDLE_S = 0.5
-MOVING_PX, SHARP_PX = 256, 720  # high, at most
-MIN_PX = 32
-MOVING_S, SHARP_S = 0.15, 0.4  # that rendering may take
-REMEMBERED = 3  # renderings; a single one that had to compute something first does not count
-JPEG_MOVING, JPEG_SHARP = 80, 92
-PLAYED_PER_S = 10.0  # frames of `play`
-STATUS_EVERY_S = 0.25  # while things move
+
+@dataclass(frozen=True, kw_only=True)
+class ViewerSettings:
+    """Settings of what a viewer renders, and when."""
+
+    settled_s: float = 0.15  # without a request: what is shown stands still and is rendered sharp
+    idle_s: float = 0.5
+    moving_px: int = 256  # high, at most
+    sharp_px: int = 720
+    min_px: int = 32
+    moving_s: float = 0.15  # that rendering may take
+    sharp_s: float = 0.4
+    remembered: int = 3  # renderings; a single one that had to compute something first does not count
+    jpeg_moving: int = 80
+    jpeg_sharp: int = 92
+    played_per_s: float = 10.0  # frames of `play`
+    status_every_s: float = 0.25  # while things move
+
+
+VIEWER = ViewerSettings()
+
 
 log = logging.getLogger(__name__)
 
@@ -45,19 +58,19 @@ class AdaptiveResolution:
 
     def __init__(self, sharp_px: int | None = None) -> None:
         self._sharp_px = sharp_px
-        self._per_pixel: deque[float] = deque(maxlen=REMEMBERED)  # s
+        self._per_pixel: deque[float] = deque(maxlen=VIEWER.remembered)  # s
 
     def height(self, sharp: bool, window: int, aspect: float) -> int:
         """Height in px to render: at most the constants' and the window's, less where that would take too long.
         aspect: width of all that is rendered by its height."""
         if sharp and self._sharp_px is not None:
-            return max(MIN_PX, min(self._sharp_px, window))
-        most, seconds = (SHARP_PX, SHARP_S) if sharp else (MOVING_PX, MOVING_S)
-        most = max(MIN_PX, min(most, window))
+            return max(VIEWER.min_px, min(self._sharp_px, window))
+        most, seconds = (VIEWER.sharp_px, VIEWER.sharp_s) if sharp else (VIEWER.moving_px, VIEWER.moving_s)
+        most = max(VIEWER.min_px, min(most, window))
         if not self._per_pixel:
-            return min(most, MOVING_PX)
+            return min(most, VIEWER.moving_px)
         in_time = math.sqrt(seconds / statistics.median_low(self._per_pixel) / aspect)
-        return max(MIN_PX, min(most, int(in_time)))
+        return max(VIEWER.min_px, min(most, int(in_time)))
 
     def record(self, seconds: float, pixels: int) -> None:
         """Record how long a rendering of that many pixels took."""
@@ -138,8 +151,8 @@ class RenderThread:
                 log.exception("work while idle failed")
             now = time.perf_counter()
             with self._lock:
-                moments += [since + SETTLED_S for since in self._unsharp.values()]
-            self._wake.wait(max(0.0, min([IDLE_S, *(moment - now for moment in moments)])))
+                moments += [since + VIEWER.settled_s for since in self._unsharp.values()]
+            self._wake.wait(max(0.0, min([VIEWER.idle_s, *(moment - now for moment in moments)])))
 
     def _tick(self) -> list[float]:
         """Advance every session; return when each is to be called again."""
@@ -161,7 +174,7 @@ class RenderThread:
             key, sharp = next(iter(self._requested), None), False
             if key is None:
                 now = time.perf_counter()
-                key = next((key for key, since in self._unsharp.items() if now - since >= SETTLED_S), None)
+                key = next((key for key, since in self._unsharp.items() if now - since >= VIEWER.settled_s), None)
                 sharp = True
             session = None if job is not None or key is None else self._sessions[key]
             if session is not None:
@@ -245,12 +258,12 @@ class ClientSession:
         frames = len(self._loaded.recorded.states)
         if self._played_at is None:
             self._played_at = now
-        ahead = int((now - self._played_at) * PLAYED_PER_S)
+        ahead = int((now - self._played_at) * VIEWER.played_per_s)
         if ahead:
-            self._played_at += ahead / PLAYED_PER_S
+            self._played_at += ahead / VIEWER.played_per_s
             self._panel.frame.value = float((int(self._panel.place) + ahead) % frames)
             self._request()
-        return self._played_at + 1 / PLAYED_PER_S
+        return self._played_at + 1 / VIEWER.played_per_s
 
     def _build(self, loaded: LoadedRun) -> tuple[LoadedRun, Overlays, Panel]:
         """Return the run, and create overlays and panel for it."""
@@ -284,7 +297,7 @@ class ClientSession:
         if shape == self._shape:
             return
         self._shape = shape
-        if stands_at(browser_camera(window, self._run.unit, MIN_PX), recorded, self._run.distance):
+        if stands_at(browser_camera(window, self._run.unit, VIEWER.min_px), recorded, self._run.distance):
             window.fov = fitting_view(recorded, shape)
 
     def _follow_recording(self) -> Controls:
@@ -351,13 +364,13 @@ class ClientSession:
         if self.overlays.shown:
             # 0 is nothing there: far away, not at the eye
             depth = np.where(picture.depth > 0, picture.depth * self._run.unit, np.inf)
-        quality = JPEG_SHARP if sharp else JPEG_MOVING
+        quality = VIEWER.jpeg_sharp if sharp else VIEWER.jpeg_moving
         self._client.scene.set_background_image(picture.pixels, format="jpeg", jpeg_quality=quality, depth=depth)
         self._client.flush()
 
     def _show_status(self, shown: RunPicture, seconds: float, sharp: bool) -> None:
         now = time.perf_counter()
-        if not sharp and now - self.status_at < STATUS_EVERY_S:
+        if not sharp and now - self.status_at < VIEWER.status_every_s:
             return
         self.status_at = now
         notes = [shown.note] if shown.note else []

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,23 +19,36 @@ from neeco.capture.model import PointCloud, evenly_spaced
 from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
-from neeco.viewer.runs import DISTANCE_UNITS
+from neeco.viewer.runs import VIEW
 
 if TYPE_CHECKING:
     import viser
 
-MAX_ASPECT = 8.0
-NARROWEST, WIDEST = 0.01, 3.0  # rad
-SAME_PLACE = 2e-4  # of the distance to what is looked at
-SAME_TURN = 1e-3  # rad
-MAX_FRUSTA, MAX_POINTS = 24, 20_000
-FRUSTUM_UNITS, GIZMO_UNITS, POINT_UNITS = 0.06 * DISTANCE_UNITS, 0.2 * DISTANCE_UNITS, 0.005 * DISTANCE_UNITS
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSettings:
+    """Sizes and limits of what the viewer places in a scene."""
+
+    max_aspect: float = 8.0
+    narrowest: float = 0.01  # rad
+    widest: float = 3.0
+    same_place: float = 2e-4  # of the distance to what is looked at
+    same_turn: float = 1e-3  # rad
+    max_frusta: int = 24
+    max_points: int = 20_000
+    frustum_units: float = 0.06 * VIEW.distance_units
+    gizmo_units: float = 0.2 * VIEW.distance_units
+    point_units: float = 0.005 * VIEW.distance_units
+
+
+SCENE = SceneSettings()
+
 FRUSTUM_COLOR = (255, 200, 0)
 
 
 def aspect_of(window: viser.CameraHandle) -> float:
     """Width of the window by its height, within reason: a browser may say anything."""
-    return min(max(float(window.aspect), 1 / MAX_ASPECT), MAX_ASPECT) if window.aspect > 0 else 1.0
+    return min(max(float(window.aspect), 1 / SCENE.max_aspect), SCENE.max_aspect) if window.aspect > 0 else 1.0
 
 
 def upward(cameras: Sequence[Camera]) -> np.ndarray:
@@ -62,7 +76,7 @@ def field_of_view(camera: Camera) -> float:
 def browser_camera(window: viser.CameraHandle, unit: float, height: int) -> Camera:
     """The camera of the browser's window, rendered `height` px high."""
     width = max(1, round(height * aspect_of(window)))
-    focal = height / 2 / math.tan(min(max(window.fov, NARROWEST), WIDEST) / 2)
+    focal = height / 2 / math.tan(min(max(window.fov, SCENE.narrowest), SCENE.widest) / 2)
     pose = torch.from_numpy(pose_of(window.wxyz, window.position, unit))
     return Camera(pose, focal, focal, width / 2, height / 2, width=width, height=height)
 
@@ -73,7 +87,7 @@ def stands_at(window: Camera, recorded: Camera, distance: float) -> bool:
     one, two = to_numpy(window.world_from_camera), to_numpy(recorded.world_from_camera)
     apart = float(np.linalg.norm(one[:3, 3] - two[:3, 3]))
     turned = Rotation.from_matrix(one[:3, :3].T @ two[:3, :3]).magnitude()
-    return apart <= SAME_PLACE * distance and turned <= SAME_TURN
+    return apart <= SCENE.same_place * distance and turned <= SCENE.same_turn
 
 
 def fitting_view(camera: Camera, aspect: float) -> float:
@@ -115,7 +129,7 @@ class Overlays:
                 f"/cameras/{frame}",
                 fov=field_of_view(camera),
                 aspect=camera.width / camera.height,
-                scale=FRUSTUM_UNITS,
+                scale=SCENE.frustum_units,
                 thickness=1.5,
                 thickness_units="screen",
                 color=FRUSTUM_COLOR,
@@ -141,7 +155,7 @@ class Overlays:
         """Show the gizmo of an instrument that stands at `pose` [4, 4] mm."""
         gizmo = self._scene.add_transform_controls(
             f"/gizmos/{number}",
-            scale=GIZMO_UNITS,
+            scale=SCENE.gizmo_units,
             wxyz=wxyz_of(pose),
             position=pose[:3, 3] * self._unit,
             depth_test=False,
@@ -163,12 +177,12 @@ class Overlays:
     def _add_points(self, points: PointCloud | None) -> Any:
         if points is None or not len(points.positions):
             return None
-        chosen = evenly_spaced(len(points.positions), MAX_POINTS)
+        chosen = evenly_spaced(len(points.positions), SCENE.max_points)
         return self._scene.add_point_cloud(
             "/points",
             (points.positions[chosen] * self._unit).astype(np.float32),
             points.colors[chosen].astype(np.float32),
-            point_size=POINT_UNITS,
+            point_size=SCENE.point_units,
             point_shape="circle",
             precision="float32",
             visible=False,
@@ -182,7 +196,7 @@ def _click(clicked: Callable[[int], None], frame: int, _: object) -> None:
 def _frustum_frames(cameras: Sequence[Camera]) -> list[int]:
     """Frames whose cameras are shown: some from everywhere, none twice in one place."""
     chosen: dict[bytes, int] = {}
-    for frame in evenly_spaced(len(cameras), MAX_FRUSTA):
+    for frame in evenly_spaced(len(cameras), SCENE.max_frusta):
         pose = to_numpy(cameras[frame].world_from_camera)
         chosen.setdefault(pose.round(3).tobytes(), frame)
     return list(chosen.values())

@@ -24,7 +24,7 @@ from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visibl
 from neeco.ingest.cameras.tissue_surface import TissueSurface, epipolar_error, surface_behind, surface_from_stereo
 from neeco.ingest.foreground.background import Background, find_background
 from neeco.ingest.foreground.masks import moving_masks
-from neeco.ingest.foreground.residual_flow import STEP_PX
+from neeco.ingest.foreground.residual_flow import FLOW
 from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shape, project_mask
 from neeco.ingest.frames.views import SfmResult, StageProgress, Views, reduced
 from neeco.ingest.readers import VideoSource
@@ -282,7 +282,7 @@ def _rough_shapes(
     count, small = len(views.times), views.reduced_pinhole
     rows = np.unique(np.linspace(0, count - 1, n_frames).astype(int))
     masks = moving_masks(views.load, count, rows, views.visible).astype(np.float32)  # [R, h, w]
-    size = -(-masks.shape[2] // STEP_PX), -(-masks.shape[1] // STEP_PX)
+    size = -(-masks.shape[2] // FLOW.step_px), -(-masks.shape[1] // FLOW.step_px)
     evidence = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in masks])
     if views.visible is not None:
         shown = cv2.resize(reduced(views.visible.astype(np.uint8) * 255), size, interpolation=cv2.INTER_AREA) == 255

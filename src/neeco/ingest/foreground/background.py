@@ -10,14 +10,26 @@ import numpy as np
 
 from neeco.capture.model import evenly_spaced
 
-N_FRAMES, MAX_BYTES = 64, 2**28  # for one background
-N_CANDIDATES = 7  # samples of a pixel, about which half of the others may lie
-NORMAL_QUARTILE = 0.6745  # standard deviations of a normal distribution, within which its half lies
+
+@dataclass(frozen=True, kw_only=True)
+class BackgroundSettings:
+    """Settings of the background of a still scope."""
+
+    n_frames: int = 64  # for one background
+    max_bytes: int = 2**28
+    n_candidates: int = 7  # samples of a pixel, about which half of the others may lie
+    normal_quartile: float = 0.6745  # standard deviations of a normal distribution, within which its half lies
+    noise_floor: float = 11.0  # of 255, of sensor and compression
+    max_deviations: float = 4.0  # of a pixel's own spread, within which it shows the background
+    # of the light in a shadow; by which that may differ between colours
+    shadow_share: tuple[float, float] = (0.35, 0.97)
+    shadow_tint: float = 0.08
+    min_saturation: float = 0.2  # of a background on which a shadow differs from a dark instrument
+
+
+BACKGROUND = BackgroundSettings()
+
 NEIGHBOURS = np.ones((3, 3), np.uint8)  # edges move by a pixel
-NOISE_FLOOR = 11.0  # of 255, of sensor and compression
-MAX_DEVIATIONS = 4.0  # of a pixel's own spread, within which it shows the background
-SHADOW_SHARE, SHADOW_TINT = (0.35, 0.97), 0.08  # of the light in a shadow; by which that may differ between colours
-MIN_SATURATION = 0.2  # of a background on which a shadow differs from a dark instrument
 
 
 @dataclass(frozen=True)
@@ -41,15 +53,17 @@ class Background:
         even = (image / exposure(image, self.colors)).astype(np.float32)
         low, high = cv2.erode(self.colors, NEIGHBOURS), cv2.dilate(self.colors, NEIGHBOURS)
         off = np.maximum(even - high, low - even).max(-1)
-        return (off > np.maximum(NOISE_FLOOR, MAX_DEVIATIONS * self.spread)) & ~self._shadows(even)
+        return (off > np.maximum(BACKGROUND.noise_floor, BACKGROUND.max_deviations * self.spread)) & ~self._shadows(
+            even
+        )
 
     def _shadows(self, even: np.ndarray) -> np.ndarray:
         """Pixels bool [H, W] at which all colours are darker by one share, where the background has colour."""
         shares = even / np.maximum(self.colors, 1)
         share = even.sum(-1) / np.maximum(self.colors.sum(-1), 1)
         saturation = 1 - self.colors.min(-1) / np.maximum(self.colors.max(-1), 1)
-        similar = (np.ptp(shares, axis=-1) < 2 * SHADOW_TINT) & (saturation > MIN_SATURATION)
-        return np.asarray(similar & (share > SHADOW_SHARE[0]) & (share < SHADOW_SHARE[1]))
+        similar = (np.ptp(shares, axis=-1) < 2 * BACKGROUND.shadow_tint) & (saturation > BACKGROUND.min_saturation)
+        return np.asarray(similar & (share > BACKGROUND.shadow_share[0]) & (share < BACKGROUND.shadow_share[1]))
 
 
 def find_background(
@@ -61,7 +75,7 @@ def find_background(
     in all frames has the colours of all of them, and is visible in none.
     """
     first = load(0)
-    rows = evenly_spaced(count, max(8, min(N_FRAMES, MAX_BYTES // first.nbytes)))
+    rows = evenly_spaced(count, max(8, min(BACKGROUND.n_frames, BACKGROUND.max_bytes // first.nbytes)))
     frames = np.stack([load(row) for row in rows])  # [N, H, W, 3]
     covered = np.zeros(frames.shape[:3], bool) if hidden is None else np.stack([hidden(row) for row in rows])
     seen = 1 - covered.mean(0)
@@ -94,7 +108,7 @@ def _modes(frames: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndar
             return distances, np.take_along_axis(np.sort(distances, axis=0), half[None] - 1, 0)[0]
 
         best, found = np.full(len(count), np.inf, np.float32), samples[0]
-        for place in np.linspace(0, 1, N_CANDIDATES):
+        for place in np.linspace(0, 1, BACKGROUND.n_candidates):
             center = np.take_along_axis(samples, np.rint(place * (count - 1)).astype(int)[None, :, None], 0)[0]
             reach = half_about(center)[1]
             found = np.where((reach < best)[:, None], center, found)
@@ -103,7 +117,7 @@ def _modes(frames: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndar
             distances, reach = half_about(found)
             near = distances <= reach
             found = (samples * near[..., None]).sum(0) / near.sum(0)[:, None]
-        colors[row], spread[row] = found, reach / NORMAL_QUARTILE
+        colors[row], spread[row] = found, reach / BACKGROUND.normal_quartile
     return colors, spread
 
 

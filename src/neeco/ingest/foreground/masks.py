@@ -18,31 +18,46 @@ from neeco.ingest.foreground.background import find_background
 from neeco.ingest.foreground.residual_flow import ResidualFlow
 from neeco.ingest.frames.views import reduced
 
-LEVELS = 20  # of each colour
-BLUR_LEVELS = 0.7  # of the histogram
-MIN_SHARE = 1e-7  # of a colour that never occurs
 
-# before a still scope
-MIN_AREA = 0.001  # share of the image
-MARGIN_PX, HIDDEN_PX = 4, 3  # about what moves: neither colour counts; the background does not
-MIN_ODDS, CERTAIN_ODDS, TISSUE_ODDS = 0.5, 1.0, -2.0  # logarithms
-SMOOTH_PX, OUTLINE_PX = 1.5, 0.7  # over which odds are averaged, at first and for outlines
-MOVING_SHARE = 0.2  # of a piece with the instrument's colours
-MIN_SEEN = 0.02  # share of images that show the background, without which it is unknown
+@dataclass(frozen=True, kw_only=True)
+class MaskSettings:
+    """Thresholds of what moves."""
 
-# before a scope that moves
-MAY_MOVE, MOVES, STILL = 0.3, 0.7, 0.2  # shares of neighbours in time against which a pixel moves
+    levels: int = 20  # of each colour
+    blur_levels: float = 0.7  # of the histogram
+    min_share: float = 1e-7  # of a colour that never occurs
+    # before a still scope
+    min_area: float = 0.001  # share of the image
+    margin_px: int = 4  # about what moves: neither colour counts; the background does not
+    hidden_px: int = 3
+    min_odds: float = 0.5  # logarithms
+    certain_odds: float = 1.0
+    tissue_odds: float = -2.0
+    smooth_px: float = 1.5  # over which odds are averaged, at first and for outlines
+    outline_px: float = 0.7
+    moving_share: float = 0.2  # of a piece with the instrument's colours
+    min_seen: float = 0.02  # share of images that show the background, without which it is unknown
+    # before a scope that moves
+    may_move: float = 0.3  # shares of neighbours in time against which a pixel moves
+    moves: float = 0.7
+    still: float = 0.2
+    flow_min_odds: float = 1.0
+    flow_outline_odds: float = 0.5
+    n_rounds: int = 4  # each with the colours of the masks before
+    flow_min_area: float = 0.004  # share of the image
+    flow_outline_px: float = 1.0
+    flow_moving_share: float = 0.3  # of a piece with the instrument's colours
+
+
+MASKS = MaskSettings()
+
+
 REACH = np.ones((9, 9), np.uint8)  # px about what may move, in which the instrument is
-FLOW_MIN_ODDS, FLOW_OUTLINE_ODDS = 1.0, 0.5
-N_ROUNDS = 4  # each with the colours of the masks before
-FLOW_MIN_AREA = 0.004  # share of the image
-FLOW_OUTLINE_PX = 1.0
-FLOW_MOVING_SHARE = 0.3  # of a piece with the instrument's colours
 
 
 @dataclass(frozen=True, eq=False)
 class ColorOdds:
-    """Log odds of every colour inside against outside: float32 [LEVELS**3]."""
+    """Log odds of every colour inside against outside: float32 [`levels`**3]."""
 
     of_color: np.ndarray
 
@@ -52,9 +67,9 @@ class ColorOdds:
 
 
 def color_levels(images: np.ndarray) -> np.ndarray:
-    """Number the colours [...] of images uint8 [..., 3], below LEVELS**3."""
-    level = images.astype(np.int64) * LEVELS // 256
-    return np.asarray((level[..., 0] * LEVELS + level[..., 1]) * LEVELS + level[..., 2])
+    """Number the colours [...] of images uint8 [..., 3], below `levels`**3."""
+    level = images.astype(np.int64) * MASKS.levels // 256
+    return np.asarray((level[..., 0] * MASKS.levels + level[..., 1]) * MASKS.levels + level[..., 2])
 
 
 def color_odds(colors: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> ColorOdds:
@@ -64,8 +79,8 @@ def color_odds(colors: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> C
 
 def _shares(colors: np.ndarray) -> np.ndarray:
     """Share of each colour, and of similar ones, in colours [P]."""
-    counts = np.bincount(colors, minlength=LEVELS**3).reshape((LEVELS,) * 3).astype(np.float64)
-    return np.asarray(gaussian_filter(counts, BLUR_LEVELS) / max(len(colors), 1) + MIN_SHARE).reshape(-1)
+    counts = np.bincount(colors, minlength=MASKS.levels**3).reshape((MASKS.levels,) * 3).astype(np.float64)
+    return np.asarray(gaussian_filter(counts, MASKS.blur_levels) / max(len(colors), 1) + MASKS.min_share).reshape(-1)
 
 
 def whole_pieces(mask: np.ndarray, smallest: float, moves: np.ndarray | None = None, share: float = 0.0) -> np.ndarray:
@@ -93,22 +108,24 @@ def moving_masks(
     background = find_background(lambda row: reduced(load(row)), count)
     images = np.stack([reduced(load(int(row))) for row in rows])
     shown = _shown(images, visible)
-    moves = np.stack([whole_pieces(background.differs(image), MIN_AREA) for image in images]) & shown
+    moves = np.stack([whole_pieces(background.differs(image), MASKS.min_area) for image in images]) & shown
     colors = color_levels(images)
-    around = np.stack([_grown(mask, MARGIN_PX) for mask in moves])
+    around = np.stack([_grown(mask, MASKS.margin_px) for mask in moves])
     odds = color_odds(colors, moves, ~around & shown)
-    hidden = np.stack([
-        _grown(mask | whole_pieces(odds.smoothed(found, SMOOTH_PX) > MIN_ODDS, MIN_AREA, mask, MOVING_SHARE), HIDDEN_PX)
-        for mask, found in zip(moves, colors, strict=True)
-    ])  # fmt: skip
+    covering = []
+    for mask, found in zip(moves, colors, strict=True):
+        likely = odds.smoothed(found, MASKS.smooth_px) > MASKS.min_odds
+        piece = whole_pieces(likely, MASKS.min_area, mask, MASKS.moving_share)
+        covering.append(_grown(mask | piece, MASKS.hidden_px))
+    hidden = np.stack(covering)
     background = find_background(lambda place: images[place], len(rows), lambda place: hidden[place])
-    unknown = background.seen < MIN_SEEN
+    unknown = background.seen < MASKS.min_seen
     masks = []
     for image, found, covered in zip(images, colors, hidden, strict=True):
-        mask = whole_pieces(background.differs(image), MIN_AREA) | (covered & unknown)
-        likely = odds.smoothed(found, OUTLINE_PX)
-        mask_or_color = (mask & (likely > TISSUE_ODDS)) | (likely > CERTAIN_ODDS)
-        masks.append(whole_pieces(mask_or_color, MIN_AREA, mask, MOVING_SHARE))
+        mask = whole_pieces(background.differs(image), MASKS.min_area) | (covered & unknown)
+        likely = odds.smoothed(found, MASKS.outline_px)
+        mask_or_color = (mask & (likely > MASKS.tissue_odds)) | (likely > MASKS.certain_odds)
+        masks.append(whole_pieces(mask_or_color, MASKS.min_area, mask, MASKS.moving_share))
     return shown & np.stack(masks)
 
 
@@ -128,13 +145,13 @@ def passing_masks(
     shown = _shown(images, visible)
     evidence = np.nan_to_num(flow.moving_pixels(rows, moving_px)).astype(np.float32)
     moves = np.stack([cv2.resize(share, images.shape[2:0:-1]) for share in evidence])  # [R, h, w]
-    candidates = np.stack([cv2.dilate((share > MAY_MOVE).astype(np.uint8), REACH) > 0 for share in moves]) & shown
+    candidates = np.stack([cv2.dilate((share > MASKS.may_move).astype(np.uint8), REACH) > 0 for share in moves]) & shown
     colors = color_levels(images)
-    inside, outside = moves > MOVES, moves <= STILL
-    for _ in range(N_ROUNDS):
+    inside, outside = moves > MASKS.moves, moves <= MASKS.still
+    for _ in range(MASKS.n_rounds):
         odds = color_odds(colors, inside & shown, outside & shown)
         inside = np.stack([
-            whole_pieces((odds.smoothed(found, SMOOTH_PX) > FLOW_MIN_ODDS) & may, FLOW_MIN_AREA)
+            whole_pieces((odds.smoothed(found, MASKS.smooth_px) > MASKS.flow_min_odds) & may, MASKS.flow_min_area)
             for found, may in zip(colors, candidates, strict=True)
         ])  # fmt: skip
         outside = ~inside
@@ -142,7 +159,10 @@ def passing_masks(
     odds = color_odds(colors, inside & shown, outside & shown)
     return np.stack([
         whole_pieces(
-            (odds.smoothed(found, FLOW_OUTLINE_PX) > FLOW_OUTLINE_ODDS) & shown, FLOW_MIN_AREA, mask, FLOW_MOVING_SHARE
+            (odds.smoothed(found, MASKS.flow_outline_px) > MASKS.flow_outline_odds) & shown,
+            MASKS.flow_min_area,
+            mask,
+            MASKS.flow_moving_share,
         )
         for found, mask in zip(colors, inside, strict=True)
     ])  # fmt: skip

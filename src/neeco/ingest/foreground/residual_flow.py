@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -17,15 +18,23 @@ from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project, project_world
 from neeco.ingest.frames.views import SfmResult
 
-STEP_PX = 4  # between the places where flow is compared
-INTERVAL_S = 0.12  # between frames that are compared: one and two intervals before and after
-BLEEDING = 2  # places by which flow bleeds over the border of the field of view
-PATCH_SHARE = 0.04  # of the image: about the area of an instrument's front
-MIN_DEPTH = 1e-9  # in SfM's unit, that may be divided by
+
+@dataclass(frozen=True, kw_only=True)
+class FlowSettings:
+    """Settings of the flow that the scope's motion leaves."""
+
+    step_px: int = 4  # between the places where flow is compared
+    interval_s: float = 0.12  # between frames that are compared: one and two intervals before and after
+    bleeding: int = 2  # places by which flow bleeds over the border of the field of view
+    patch_share: float = 0.04  # of the image: about the area of an instrument's front
+    min_depth: float = 1e-9  # in SfM's unit, that may be divided by
+
+
+FLOW = FlowSettings()
 
 
 class ResidualFlow:
-    """Optical flow between frames at every STEP_PX-th pixel, less what a still scene explains.
+    """Optical flow between frames at every `step_px`-th pixel, less what a still scene explains.
 
     Frames are reduced to REFERENCE_PIXELS: one pixel is as much of the scene in every recording.
 
@@ -55,13 +64,13 @@ class ResidualFlow:
             return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
         self.grey = grey
-        self.v, self.u = np.mgrid[STEP_PX // 2 : height : STEP_PX, STEP_PX // 2 : width : STEP_PX]
-        self.step = max(1, round(INTERVAL_S / float(np.median(np.diff(times))))) if len(times) > 1 else 1  # rows
+        self.v, self.u = np.mgrid[FLOW.step_px // 2 : height : FLOW.step_px, FLOW.step_px // 2 : width : FLOW.step_px]
+        self.step = max(1, round(FLOW.interval_s / float(np.median(np.diff(times))))) if len(times) > 1 else 1  # rows
         self.hidden = np.zeros(self.u.shape, dtype=bool)
         if visible is not None:
             size = self.u.shape[::-1]
             shown = cv2.resize(visible.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-            self.hidden = binary_dilation(shown < 1, iterations=BLEEDING)
+            self.hidden = binary_dilation(shown < 1, iterations=FLOW.bleeding)
 
     def moving_pixels(self, rows: np.ndarray, moving_px: float) -> np.ndarray:
         """Shares [R, h, w] of the neighbours of rows [R] to which a pixel's residual flow exceeds `moving_px`; NaN
@@ -78,7 +87,7 @@ class ResidualFlow:
     def fastest_motion(self) -> np.ndarray:
         """Residual flow [M-1] px of the fastest patch of each frame to the next."""
         shown = ~self.hidden
-        patch = max(1, round(PATCH_SHARE * shown.sum()))
+        patch = max(1, round(FLOW.patch_share * shown.sum()))
         motion = np.zeros(len(self.sfm.indices) - 1)
         for row in np.flatnonzero(self.episodes[1:] == self.episodes[:-1]).tolist():
             (residual,) = self._residuals(row, [row + 1])
@@ -99,14 +108,16 @@ class ResidualFlow:
                 continue
             relative = np.linalg.inv(cameras[other]) @ cameras[row]
             moved = points @ relative[:3, :3].T + relative[:3, 3]
-            x, y = project(moved, *lens.intrinsics, nearest=MIN_DEPTH)
+            x, y = project(moved, *lens.intrinsics, nearest=FLOW.min_depth)
             yield np.linalg.norm(flow - np.stack([x - self.u - 0.5, y - self.v - 0.5], -1), axis=-1)
 
     def _still_depth(self, row: int) -> np.ndarray:
         """Depth [h, w] of the still scene: between the points that this frame observes, and of the nearest beyond."""
         seen = self.sfm.observations[:, 0] == row
         points = self.sfm.points[self.sfm.observations[seen, 1].astype(int)]
-        pixels, depth = project_world(points, self.pinhole.camera(self.sfm.world_from_camera[row]), nearest=MIN_DEPTH)
+        pixels, depth = project_world(
+            points, self.pinhole.camera(self.sfm.world_from_camera[row]), nearest=FLOW.min_depth
+        )
         near = np.median(depth[depth > 0]) if (depth > 0).any() else np.nan
         keep = (depth > 0.3 * near) & (depth < 3 * near)
         pixels, inverse = pixels[keep], 1 / depth[keep]

@@ -15,20 +15,33 @@ from scipy.ndimage import binary_dilation
 from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project, project_world
-from neeco.ingest.foreground.residual_flow import STEP_PX
+from neeco.ingest.foreground.residual_flow import FLOW
 from neeco.ingest.frames.views import SfmResult
 
-N_CELLS = 48  # of the carving grid, per side
-REACH = 0.4  # of the distance to the camera: half a side of that grid
-MIN_VISIBLE = 0.3  # share of the frames that must have a point in view
-MIN_AGREEMENT = 0.3  # share of the frames in which a point of the instrument lies on moving pixels
-MIN_RELATIVE = 0.85  # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
-LAG_CELLS, LAG_STEP_S, MAX_LAG_S = 16, 0.1, 60.0  # of the grid for lags, per side; lags that are tried
-MIN_KNOWN = 0.5  # share of the frames that need a pose at a lag
-LAG_GAIN = 1.1  # ratio of agreement to that at 0 and at all other lags
-LAG_PEAK, LAG_LOBE_S = 0.8, 0.5  # share of the best agreement, and s about its lag, of the weighted mean
-MARGIN_PX = 6  # about its projection
-NEAREST_MM = 1e-3  # in front of the camera
+
+@dataclass(frozen=True, kw_only=True)
+class RoughShapeSettings:
+    """Settings of the search for a rough shape."""
+
+    n_cells: int = 48  # of the carving grid, per side
+    reach: float = 0.4  # of the distance to the camera: half a side of that grid
+    min_visible: float = 0.3  # share of the frames that must have a point in view
+    min_agreement: float = 0.3  # share of the frames in which a point of the instrument lies on moving pixels
+    # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
+    min_relative: float = 0.85
+    lag_cells: int = 16  # of the grid for lags, per side; lags that are tried
+    lag_step_s: float = 0.1
+    max_lag_s: float = 60.0
+    min_known: float = 0.5  # share of the frames that need a pose at a lag
+    lag_gain: float = 1.1  # ratio of agreement to that at 0 and at all other lags
+    lag_peak: float = 0.8  # share of the best agreement, and s about its lag, of the weighted mean
+    lag_lobe_s: float = 0.5
+    margin_px: int = 6  # about its projection
+    nearest_mm: float = 1e-3  # in front of the camera
+
+
+ROUGH_SHAPE = RoughShapeSettings()
+
 
 PosesAt = Callable[[float], tuple[np.ndarray, np.ndarray]]  # lag s -> poses [N, 4, 4] mm, bool [N] where known
 
@@ -48,45 +61,45 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
     evidence [R, h, w] from `ResidualFlow.moving_pixels` (NaN: hidden), camera_from_instrument [R, 4, 4] mm. None when
     no point stands out: the instrument hardly moves, or its poses do not fit the cameras.
     """
-    grid, spacing, share, enough = _agreement(evidence, camera_from_instrument, pinhole, N_CELLS)
+    grid, spacing, share, enough = _agreement(evidence, camera_from_instrument, pinhole, ROUGH_SHAPE.n_cells)
     best = float(np.quantile(share[enough], 0.999)) if enough.any() else 0.0
     background = float(np.nanmean(evidence)) if not np.isnan(evidence).all() else 0.0
-    if best < 2 * background or best < MIN_AGREEMENT:
+    if best < 2 * background or best < ROUGH_SHAPE.min_agreement:
         return None
-    belongs = share > max(MIN_RELATIVE * best, 2 * background)
+    belongs = share > max(ROUGH_SHAPE.min_relative * best, 2 * background)
     return RoughShape(grid[belongs], spacing, best) if belongs.any() else None
 
 
 def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: float) -> float:
-    """Lag s within +-longest (at most MAX_LAG_S) at which poses explain motion clearly better than at 0 and at all
+    """Lag s within +-longest (at most `max_lag_s`) at which poses explain motion clearly better than at 0 and at all
     others, else 0.
 
     evidence [R, h, w] as for `carve_shape`; poses_at(lag): camera_from_instrument [R, 4, 4] mm that the log has `lag` s
     later than its clock says, and bool [R] where it has one.
     """
-    count = int(min(longest, MAX_LAG_S) / LAG_STEP_S)
-    lags = LAG_STEP_S * np.arange(-count, count + 1)
+    count = int(min(longest, ROUGH_SHAPE.max_lag_s) / ROUGH_SHAPE.lag_step_s)
+    lags = ROUGH_SHAPE.lag_step_s * np.arange(-count, count + 1)
     scores = np.zeros(len(lags))
     for index, lag in enumerate(lags):
         poses, known = poses_at(float(lag))
-        if known.sum() >= MIN_KNOWN * len(evidence):
-            _, _, share, enough = _agreement(evidence[known], poses[known], pinhole, LAG_CELLS)
+        if known.sum() >= ROUGH_SHAPE.min_known * len(evidence):
+            _, _, share, enough = _agreement(evidence[known], poses[known], pinhole, ROUGH_SHAPE.lag_cells)
             scores[index] = np.quantile(share[enough], 0.99) if enough.any() else 0.0
     return lag_of(scores)
 
 
 def lag_of(scores: np.ndarray) -> float:
-    """Return the lag s that agreements at 2 N + 1 lags, LAG_STEP_S apart about 0, show. Those up to LAG_STEP_S are not
-    resolved, as agreement has a flat top: they are 0."""
+    """Return the lag s that agreements at 2 N + 1 lags, `lag_step_s` apart about 0, show. Those up to `lag_step_s` are
+    not resolved, as agreement has a flat top: they are 0."""
     count = len(scores) // 2
-    lags, best = LAG_STEP_S * np.arange(-count, count + 1), float(scores.max())
-    lobe = np.abs(lags - lags[scores.argmax()]) < LAG_LOBE_S
+    lags, best = ROUGH_SHAPE.lag_step_s * np.arange(-count, count + 1), float(scores.max())
+    lobe = np.abs(lags - lags[scores.argmax()]) < ROUGH_SHAPE.lag_lobe_s
     rival = float(scores[~lobe].max(initial=0.0))  # motion that repeats fits at several lags
-    if best < MIN_AGREEMENT or best < LAG_GAIN * max(float(scores[count]), rival):
+    if best < ROUGH_SHAPE.min_agreement or best < ROUGH_SHAPE.lag_gain * max(float(scores[count]), rival):
         return 0.0
-    weights = np.clip(scores - LAG_PEAK * best, 0, None) * lobe
+    weights = np.clip(scores - ROUGH_SHAPE.lag_peak * best, 0, None) * lobe
     lag = float((weights * lags).sum() / weights.sum())
-    return lag if abs(lag) > LAG_STEP_S else 0.0
+    return lag if abs(lag) > ROUGH_SHAPE.lag_step_s else 0.0
 
 
 def _agreement(
@@ -97,7 +110,7 @@ def _agreement(
     distance = float(np.median(camera_from_instrument[:, 2, 3])) if len(evidence) else 0.0
     if distance <= 0:
         return np.zeros((0, 3)), 0.0, np.zeros(0), np.zeros(0, dtype=bool)
-    axis = np.linspace(-REACH, REACH, cells) * distance
+    axis = np.linspace(-ROUGH_SHAPE.reach, ROUGH_SHAPE.reach, cells) * distance
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)  # [G, 3]
     total, visible = np.zeros(len(grid)), np.zeros(len(grid))
     for pixels, pose in zip(evidence, camera_from_instrument, strict=True):
@@ -105,22 +118,22 @@ def _agreement(
         inside &= ~np.isnan(pixels[y, x])
         total[inside] += pixels[y[inside], x[inside]]
         visible += inside
-    enough = visible > MIN_VISIBLE * len(evidence)
+    enough = visible > ROUGH_SHAPE.min_visible * len(evidence)
     share = np.where(enough, total / np.maximum(visible, 1), 0.0)
     return grid, float(axis[1] - axis[0]), share, enough
 
 
 def project_mask(shape: RoughShape, camera_from_instrument: np.ndarray, camera: Camera) -> np.ndarray:
     """Pixels bool [H, W] that the shape may cover in the camera's image, with a margin."""
-    small = (camera.height // STEP_PX + 1, camera.width // STEP_PX + 1)
+    small = (camera.height // FLOW.step_px + 1, camera.width // FLOW.step_px + 1)
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     x, y, inside = _raster_cells(shape.points, camera_from_instrument, intrinsics, small)
     mask = np.zeros(small, dtype=bool)
     mask[y[inside], x[inside]] = True
     depth = float(camera_from_instrument[2, 3])
     cell = shape.spacing * camera.fx / max(depth, 1.0)  # px between neighbouring points
-    mask = binary_dilation(mask, iterations=max(1, round((MARGIN_PX + cell / 2) / STEP_PX)))
-    return mask.repeat(STEP_PX, axis=0).repeat(STEP_PX, axis=1)[: camera.height, : camera.width]
+    mask = binary_dilation(mask, iterations=max(1, round((ROUGH_SHAPE.margin_px + cell / 2) / FLOW.step_px)))
+    return mask.repeat(FLOW.step_px, axis=0).repeat(FLOW.step_px, axis=1)[: camera.height, : camera.width]
 
 
 def observations_on(
@@ -143,8 +156,8 @@ def _raster_cells(
     intrinsics: tuple[float, float, float, float],
     shape: tuple[int, ...],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Column, row and visibility [K] of points on the STEP_PX-spaced raster of `shape` (rows, columns)."""
+    """Column, row and visibility [K] of points on the `step_px`-spaced raster of `shape` (rows, columns)."""
     camera = points @ camera_from_instrument[:3, :3].T + camera_from_instrument[:3, 3]
-    x, y = (np.floor(place / STEP_PX) for place in project(camera, *intrinsics, nearest=NEAREST_MM))
-    inside = (camera[:, 2] > NEAREST_MM) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    x, y = (np.floor(place / FLOW.step_px) for place in project(camera, *intrinsics, nearest=ROUGH_SHAPE.nearest_mm))
+    inside = (camera[:, 2] > ROUGH_SHAPE.nearest_mm) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
     return np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int), inside

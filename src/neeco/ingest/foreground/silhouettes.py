@@ -8,11 +8,21 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-MIN_ELONGATION = 2.0  # length over width of a shaft
-MIN_AREA = 0.002  # share of the image: smaller pieces of a mask are noise
-EDGE_PX = 2  # from the image's border, within which a piece continues beyond it
-ENTERING, MIN_SLICES, LINE_ROUNDS = 0.5, 6, 4  # share of a piece that its line is fitted to; px long at least
-SMOOTH_PX = 1.5  # of distances: the steps of a mask's outline would be taken for its shape
+
+@dataclass(frozen=True, kw_only=True)
+class ShaftLineSettings:
+    """Settings of lines of shafts in masks."""
+
+    min_elongation: float = 2.0  # length over width of a shaft
+    min_area: float = 0.002  # share of the image: smaller pieces of a mask are noise
+    edge_px: int = 2  # from the image's border, within which a piece continues beyond it
+    entering: float = 0.5  # share of a piece that its line is fitted to; px long at least
+    min_slices: int = 6
+    line_rounds: int = 4
+    smooth_px: float = 1.5  # of distances: the steps of a mask's outline would be taken for its shape
+
+
+SHAFT_LINES = ShaftLineSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +77,7 @@ def silhouettes_of(
         outside = distance_transform_edt(outer) if not outer.all() else np.full(mask.shape, np.inf)
         signed = np.where(mask, inside - 0.5, 0.5 - outside)
         limit = float(np.hypot(*mask.shape))
-        found[row] = gaussian_filter(np.clip(signed, -limit, limit), SMOOTH_PX, mode="nearest")
+        found[row] = gaussian_filter(np.clip(signed, -limit, limit), SHAFT_LINES.smooth_px, mode="nearest")
     return Silhouettes(masks & ~unknown, found, intrinsics, shaft_lines(masks & ~unknown, hidden))
 
 
@@ -103,21 +113,28 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
     points, directions, tips, entries, courses = (np.full((count, 2), np.nan) for _ in range(5))
     hulls: list[np.ndarray] = [np.full((1, 2), np.nan)] * count
     border = np.zeros((height, width), dtype=bool)
-    border[:EDGE_PX], border[-EDGE_PX:], border[:, :EDGE_PX], border[:, -EDGE_PX:] = True, True, True, True
+    (
+        border[: SHAFT_LINES.edge_px],
+        border[-SHAFT_LINES.edge_px :],
+        border[:, : SHAFT_LINES.edge_px],
+        border[:, -SHAFT_LINES.edge_px :],
+    ) = True, True, True, True
     if hidden is not None:
-        border |= cv2.dilate(hidden.astype(np.uint8), np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)).astype(bool)
+        border |= cv2.dilate(hidden.astype(np.uint8), np.ones((2 * SHAFT_LINES.edge_px + 1,) * 2, np.uint8)).astype(
+            bool
+        )
     for row, mask in enumerate(masks):
         pieces, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
         if pieces < 2:
             continue
         largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-        if stats[largest, cv2.CC_STAT_AREA] < MIN_AREA * mask.size:
+        if stats[largest, cv2.CC_STAT_AREA] < SHAFT_LINES.min_area * mask.size:
             continue
         v, u = np.nonzero(labels == largest)
         places = np.stack([u, v], -1) + 0.5
         center = places.mean(0)
         values, vectors = np.linalg.eigh(np.cov((places - center).T))
-        if values[1] < MIN_ELONGATION**2 * max(values[0], 1e-9):
+        if values[1] < SHAFT_LINES.min_elongation**2 * max(values[0], 1e-9):
             continue
         along = (places - center) @ vectors[:, 1]
         touching = border[v, u]
@@ -144,17 +161,19 @@ def _entering_line(
     """Return a point [2] on the middle line of a piece's pixels [N, 2], and its unit direction, by the share of it
     where it enters: what lies beyond may be a wrist that bends, or jaws. touching: bool [N], at the border; point and
     direction: of the whole piece, from there."""
-    for _ in range(LINE_ROUNDS):
+    for _ in range(SHAFT_LINES.line_rounds):
         along = (places - point) @ direction
         bins = (along - along.min()).astype(int)
         count = np.bincount(bins)
         inside = np.flatnonzero((count > 0) & (np.bincount(bins, touching) == 0))  # the border cuts slices off
-        inside = inside[inside <= inside[0] + ENTERING * (inside[-1] - inside[0])] if len(inside) else inside
-        if len(inside) < MIN_SLICES:
+        inside = (
+            inside[inside <= inside[0] + SHAFT_LINES.entering * (inside[-1] - inside[0])] if len(inside) else inside
+        )
+        if len(inside) < SHAFT_LINES.min_slices:
             break
         middles = np.stack([np.bincount(bins, places[:, k])[inside] for k in (0, 1)], -1) / count[inside, None]
         weights = np.ones(len(middles))
-        for _ in range(LINE_ROUNDS):
+        for _ in range(SHAFT_LINES.line_rounds):
             point = np.average(middles, 0, weights)
             off = middles - point
             vector = np.linalg.eigh((off * weights[:, None]).T @ off)[1][:, 1]

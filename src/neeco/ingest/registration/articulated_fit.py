@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
-from neeco.ingest.foreground.silhouettes import EDGE_PX
+from neeco.ingest.foreground.silhouettes import SHAFT_LINES
 from neeco.ingest.registration.silhouette_fit import POSE_SDS, BasePrior
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSilhouettes, moved_base, poses_at_clock
 from neeco.states.outline_model import ArticulatedModel, Outlines
@@ -88,9 +88,9 @@ def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
     Those at the image's border, or beside what is hidden (bool [h, w]), do not count."""
     height, width = masks.shape[1:]
     open_ = np.zeros((height, width), bool)
-    open_[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX] = True
+    open_[SHAFT_LINES.edge_px : -SHAFT_LINES.edge_px, SHAFT_LINES.edge_px : -SHAFT_LINES.edge_px] = True
     if hidden is not None:
-        grown = cv2.dilate(hidden.astype(np.uint8), np.ones((2 * EDGE_PX + 1,) * 2, np.uint8))
+        grown = cv2.dilate(hidden.astype(np.uint8), np.ones((2 * SHAFT_LINES.edge_px + 1,) * 2, np.uint8))
         open_ &= ~grown.astype(bool)
     found = np.full((len(masks), LINKED_FIT.max_points, 2), np.nan)
     for row, mask in enumerate(masks):
@@ -133,7 +133,7 @@ def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
     others[:, owner, np.arange(len(owner))] = -1e3
     others[:, 1, owner == 0] = others[:, 0, owner == 1] = -1e3  # the tube continues in its end
     valid = found.valid[:, owner] & (others.max(1) < LINKED_FIT.inside_px)
-    valid &= problem.silhouettes.inside(points, margin=1.0 + EDGE_PX)
+    valid &= problem.silhouettes.inside(points, margin=1.0 + SHAFT_LINES.edge_px)
     given = np.isfinite(problem.contours[..., 0])
     return _Points(valid, given, np.nan_to_num(problem.contours))
 

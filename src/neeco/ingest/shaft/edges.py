@@ -14,7 +14,7 @@ import numpy as np
 
 from neeco.capture.model import evenly_spaced
 from neeco.geometry.lines import places_nearest_to_rays, unit
-from neeco.ingest.foreground.masks import LEVELS, color_odds
+from neeco.ingest.foreground.masks import MASKS, color_odds
 from neeco.ingest.shaft.axis import Intrinsics, ShaftAxes, ShaftEdges, axis_between, contour_normals, image_lines
 
 # from masks
@@ -384,7 +384,7 @@ def _tints(pixels: np.ndarray) -> np.ndarray:
     red, green, blue = np.log(pixels.astype(np.float64) + DARK).T
     light = (red + green + blue) / 3
     level = [
-        np.clip((value - low) / (high - low) * LEVELS, 0, LEVELS - 1).astype(np.int64)
+        np.clip((value - low) / (high - low) * MASKS.levels, 0, MASKS.levels - 1).astype(np.int64)
         for value, (low, high) in zip((red - green, green - blue, light), TINT_RANGES, strict=True)
     ]
-    return np.asarray((level[0] * LEVELS + level[1]) * LEVELS + level[2])
+    return np.asarray((level[0] * MASKS.levels + level[1]) * MASKS.levels + level[2])
