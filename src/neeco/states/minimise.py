@@ -1,8 +1,7 @@
 """Levenberg-Marquardt on the difference between a rendering and an image.
 
 Residuals have Huber weights. Columns of the Jacobian are finite differences of renderings, so that no scene needs to
-be differentiable. `alignment` fits poses to recorded frames with it, `state_fitter` the
-instruments of footage.
+be differentiable. `alignment` fits poses to recorded frames with it, `fitter` the instruments of footage.
 """
 
 from __future__ import annotations

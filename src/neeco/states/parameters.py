@@ -1,6 +1,6 @@
 """The parameters by which states and cameras are corrected, and priors on them.
 
-Every fit uses them: Levenberg-Marquardt on one image (`alignment`, `state_fitter`) and Adam during training
+Every fit uses them: Levenberg-Marquardt on one image (`alignment`, `fitter`) and Adam during training
 (`refinement`).
 """
 
