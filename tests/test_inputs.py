@@ -58,7 +58,7 @@ ALLOWED = {
     "neeco.ingest.cameras.sfm": "reads what its own worker wrote into a temporary folder",
     "neeco.studies.study": "reads /proc, and nothing else",
     "neeco.viewer.export": "reads the package's own files",
-    "neeco.viewer.posing_server": "reads the package's own files",
+    "neeco.viewer.posing": "reads the package's own files",
     "neeco.cli": "opens the null device in place of a closed stream",
     "neeco.synthesis.card": "asks a README.md in a folder of its own whether it is the user's",
     "neeco.synthesis.writers.bop": "reads back what it wrote",

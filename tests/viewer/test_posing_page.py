@@ -15,7 +15,7 @@ from PIL import Image
 from posing_world import JOINT, NAME, PosingWorld, measured_world
 
 from neeco.ingest.posing.hand_posed import read_answers
-from neeco.viewer.posing_server import PosingServer
+from neeco.viewer.posing import PosingServer
 
 pytestmark = pytest.mark.browser
 BLUE, ORANGE = (53, 182, 255), (255, 154, 31)  # lines of the pin and the jaws
@@ -87,7 +87,7 @@ def test_lines_follow_the_sliders(page: Any) -> None:
 
 def test_true_angles_lay_the_lines_over_the_jaws(page: Any, server: PosingServer, made: PosingWorld) -> None:
     """Where the page draws jaws, the picture shows them."""
-    frame = server.session.overview(NAME)["suggested"][0]["frame"]
+    frame = server.overview(NAME)["suggested"][0]["frame"]
     page.keyboard.press("h")
     plain = np.asarray(Image.open(io.BytesIO(page.locator("#canvas").screenshot())).convert("L")).astype(int)
     page.keyboard.press("h")
@@ -105,16 +105,16 @@ def test_true_angles_lay_the_lines_over_the_jaws(page: Any, server: PosingServer
 
 
 def test_frames_are_posed_one_after_another_by_the_keyboard(page: Any, server: PosingServer, made: PosingWorld) -> None:
-    root = server.session.posed.root
+    root = server.posed.root
     assert "0 of 10 suggested frames posed" in page.inner_text("aside")
     assert "not known yet" in page.inner_text("#sure")
     asked = []
     for count in range(1, 4):
-        asked.append(server.session.overview(NAME)["suggested"][0]["frame"])
+        asked.append(server.overview(NAME)["suggested"][0]["frame"])
         pose(page, made, asked[-1])
         page.keyboard.press("Enter")
         saved(page, count)
-        page.locator(f'figure[data-index="{server.session.overview(NAME)["suggested"][0]["frame"]}"]').wait_for()
+        page.locator(f'figure[data-index="{server.overview(NAME)["suggested"][0]["frame"]}"]').wait_for()
     kept = read_answers(root)
     assert [answer.frame for answer in kept] == [made.capture.frames[frame].name for frame in asked]
     assert kept[1].roll_deg == pytest.approx(np.degrees(made.rolls[asked[1]]), abs=0.6)
@@ -126,7 +126,7 @@ def test_frames_are_posed_one_after_another_by_the_keyboard(page: Any, server: P
 
 
 def test_keys_turn_skip_and_look_about(page: Any, server: PosingServer) -> None:
-    first, second = (item["frame"] for item in server.session.overview(NAME)["suggested"][:2])
+    first, second = (item["frame"] for item in server.overview(NAME)["suggested"][:2])
     before = float(page.locator("#sliders input").first.input_value())
     page.keyboard.press("Shift+ArrowRight")
     page.keyboard.press("ArrowRight")
@@ -138,17 +138,15 @@ def test_keys_turn_skip_and_look_about(page: Any, server: PosingServer) -> None:
     page.keyboard.press("s")
     page.locator(f'figure[data-index="{second}"][aria-current]').wait_for()
     assert first != second
-    assert read_answers(server.session.posed.root) == []
+    assert read_answers(server.posed.root) == []
 
 
 def test_an_answer_that_does_not_fit_is_spoken_of(page: Any, server: PosingServer, made: PosingWorld) -> None:
     for frame in (0, 10, 20, 30, 39):
-        server.session.save(
-            NAME, frame, float(np.degrees(made.rolls[frame])), {JOINT: float(np.degrees(made.jaws[frame]))}
-        )
+        server.save(NAME, frame, float(np.degrees(made.rolls[frame])), {JOINT: float(np.degrees(made.jaws[frame]))})
     page.reload()
     page.locator("#strip figure").first.wait_for()
-    frame = server.session.overview(NAME)["suggested"][0]["frame"]
+    frame = server.overview(NAME)["suggested"][0]["frame"]
     slide(page, 0, np.degrees(made.rolls[frame]) + 60)
     slide(page, 1, np.degrees(made.jaws[frame]))
     page.keyboard.press("Enter")

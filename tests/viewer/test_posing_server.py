@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import io
 import json
@@ -16,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import numpy as np
 import pytest
@@ -29,7 +28,7 @@ from neeco.capture.readers import read_capture
 from neeco.cli import main
 from neeco.ingest.posing.hand_posed import read_answers
 from neeco.viewer.access import Access
-from neeco.viewer.posing_server import PosingServer
+from neeco.viewer.posing import PosingServer
 
 pytest.importorskip("viser")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -59,8 +58,14 @@ def ask(server: PosingServer, what: str, **fields: Any) -> dict[str, Any]:
     return converse(server, json.dumps({"ask": what, "instrument": NAME} | fields))[0]
 
 
-def shown(answer: dict[str, Any]) -> Image.Image:
-    return Image.open(io.BytesIO(base64.b64decode(answer["picture"].partition(",")[2])))
+def image(server: PosingServer, what: str, **fields: Any) -> Image.Image:
+    with urllib.request.urlopen(address_of(server, what, fields), timeout=30) as answer:
+        return Image.open(io.BytesIO(answer.read()))
+
+
+def address_of(server: PosingServer, what: str, fields: Any) -> str:
+    named = {"instrument": NAME} | fields if isinstance(fields, dict) else fields
+    return f"{server.address}{what}/{quote(json.dumps(named), safe='')}"
 
 
 def answer_for(made: PosingWorld, frame: int, turned: float = 0.0) -> dict[str, Any]:
@@ -75,7 +80,7 @@ def test_the_page_is_whole_and_may_load_nothing_from_elsewhere(server: PosingSer
 
 
 def test_an_answer_is_kept_and_changes_the_states(server: PosingServer, made: PosingWorld) -> None:
-    root = server.session.posed.root
+    root = server.posed.root
     before = ask(server, "overview")
     assert (before["done"], before["of"], before["sure"]["roll"]) == (0, 10, [180.0, 180.0])
     asked = before["suggested"][0]["frame"]
@@ -101,11 +106,11 @@ def test_it_says_at_once_what_contradicts_an_answer(server: PosingServer, made: 
 
 
 def test_a_frame_is_shown_along_the_shaft(server: PosingServer) -> None:
-    pixels = np.asarray(shown(ask(server, "picture", index=5, small=False)).convert("L")).astype(float)
+    pixels = np.asarray(image(server, "picture", index=5, small=False).convert("L")).astype(float)
     rod = pixels[:, : pixels.shape[1] // 4]
     # texture in the middle, the even wall above and below
     assert rod[rod.shape[0] // 2 - 20 : rod.shape[0] // 2 + 20].std() > 5 * rod[:20].std()
-    assert shown(ask(server, "picture", index=5, small=True)).width < pixels.shape[1] / 4
+    assert image(server, "picture", index=5, small=True).width < pixels.shape[1] / 4
 
 
 def test_a_run_shows_its_scene_as_a_ghost_that_follows_the_sliders(made: PosingWorld, tmp_path: Path) -> None:
@@ -113,7 +118,7 @@ def test_a_run_shows_its_scene_as_a_ghost_that_follows_the_sliders(made: PosingW
     run = write_run(grasper_scene(NAME, JOINT), tmp_path / "run", capture)
 
     def ghost(jaw: float) -> np.ndarray:
-        return np.asarray(shown(ask(started, "ghost", index=5, roll=0.0, joints={JOINT: jaw})))[..., 3] > 0
+        return np.asarray(image(started, "ghost", index=5, roll=0.0, joints={JOINT: jaw}))[..., 3] > 0
 
     with PosingServer(run, port=18320) as started:
         assert ask(started, "overview")["ghost"]
@@ -124,7 +129,8 @@ def test_a_run_shows_its_scene_as_a_ghost_that_follows_the_sliders(made: PosingW
         assert shaft[height // 2 - 3 : height // 2 + 3].mean() > 0.9
         beyond = slice(width // 2, None)
         assert np.flatnonzero(opened[:, beyond].any(1)).size > 1.5 * np.flatnonzero(closed[:, beyond].any(1)).size
-        assert "error" in ask(started, "ghost", index=5, roll=1.0, joints={})
+        with pytest.raises(urllib.error.HTTPError, match="400"):
+            image(started, "ghost", index=5, roll=1.0, joints={})
 
 
 @pytest.mark.parametrize(
@@ -147,7 +153,23 @@ def test_what_cannot_be_is_answered_in_a_line_and_nothing_is_written(server: Pos
     refused, overview = converse(server, message, json.dumps({"ask": "overview", "instrument": NAME}))
     assert "\n" not in refused["error"]
     assert overview["done"] == 0
-    assert read_answers(server.session.posed.root) == []
+    assert read_answers(server.posed.root) == []
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"index": 999, "small": True}, {"index": "1", "small": True}, {"index": 1}, {"instrument": "rope"}, [], 3],
+)
+def test_a_picture_that_cannot_be_is_refused_in_a_line(server: PosingServer, fields: Any) -> None:
+    with pytest.raises(urllib.error.HTTPError, match="400") as refused:
+        urllib.request.urlopen(address_of(server, "picture", fields), timeout=20)
+    assert b"\n" not in refused.value.read().strip()
+
+
+def test_pictures_come_side_by_side(server: PosingServer) -> None:
+    with ThreadPoolExecutor(6) as pool:
+        widths = list(pool.map(lambda k: image(server, "picture", index=k, small=True).width, range(12)))
+    assert widths == [server.settings.thumbnail_width] * 12
 
 
 def test_without_the_token_nobody_may_ask(server: PosingServer) -> None:
@@ -186,7 +208,7 @@ def test_it_listens_on_ipv6_loopback(made: PosingWorld) -> None:
 SERVE = """\
 import sys, time
 from pathlib import Path
-from neeco.viewer.posing_server import PosingServer
+from neeco.viewer.posing import PosingServer
 with PosingServer(Path(sys.argv[1]), port=18360) as server:
     print(server.address, flush=True)
     time.sleep(120)

@@ -108,7 +108,7 @@ def _opened(address: str) -> Iterator[None]:
 
 
 def _annotate(arguments: Arguments) -> int:
-    from neeco.viewer.posing_server import PosingServer
+    from neeco.viewer.posing import PosingServer
 
     if arguments.export is not None:
         raise NeecoError("--annotate, --export: give one of the two")

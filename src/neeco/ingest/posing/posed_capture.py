@@ -62,13 +62,18 @@ class SolvedPosing:
     joints: dict[str, AnglePosterior]
 
     @property
+    def angles(self) -> dict[str, AnglePosterior]:
+        """Roll and joints by name."""
+        return {"roll": self.rolls, **self.joints}
+
+    @property
     def breaks(self) -> list[int]:
         """Frames before which texture alone does not determine the roll."""
         return chain_breaks(self.measured.pairs, self.rolls)
 
     def suggestions(self, count: int = N_SUGGESTED) -> list[Suggestion]:
         """The frames whose answers would help most, each as if those before it were answered already."""
-        solved = [self.rolls, *self.joints.values()]
+        solved = list(self.angles.values())
         usable = self.measured.seen.copy()
         usable[[frame for frame, _ in self.answers]] = False
         chosen: list[Suggestion] = []
@@ -93,7 +98,7 @@ class SolvedPosing:
             return "the chain of rolls breaks here"
         if self.joints and widths[frame] <= np.quantile(widths, EXTREME):
             return "jaws at their narrowest"
-        names = ["roll", *self.joints]
+        names = list(self.angles)
         least = int(np.argmax(deviations))
         return f"largest deviation: {names[least]} ± {deviations[least]:.0f}°"
 
@@ -101,7 +106,7 @@ class SolvedPosing:
         """Answers that differ from an earlier one of the same frame; and of roll and of each joint the one that differs
         most from the others' prediction, as a wrong one makes others look wrong, too."""
         found = []
-        for what, solved in {"roll": self.rolls, **self.joints}.items():
+        for what, solved in self.angles.items():
             worst, least = None, OUTLIER_SD
             for position, (frame, answer) in enumerate(self.answers):
                 angle = _angle(answer, what)
@@ -121,7 +126,7 @@ class SolvedPosing:
         """Median and 95 % quantile of the standard deviations, degrees, of roll and each joint; 180 where nothing is
         known."""
         found = {}
-        for name, solved in {"roll": self.rolls, **self.joints}.items():
+        for name, solved in self.angles.items():
             deviations = solved.deviations_deg
             if name == "roll" and not self.answers:
                 deviations = np.full(len(deviations), UNKNOWN_DEG)

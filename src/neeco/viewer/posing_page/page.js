@@ -6,10 +6,10 @@ const HINGE = 0.36, SHARE = 50;  // of the working length; percent: where lines 
 const GONE = "neeco does not answer: is it still running?";
 const PIN = "#35b6ff", JAW = "#ff9a1f";
 
-let overview, frame, pose, shown, picture = null, hidden = false, ghost = null, ghosted = false, busy = false, skipped = new Set(), timer = null;
+let overview, frame, pose, shown, displayed = null, hidden = false, ghost = null, ghosted = false, busy = false, skipped = new Set(), timer = null;
 const lines = { hinge: null, share: SHARE };
 
-// one question after another over the web socket; answers come in their order
+// questions over the web socket are answered in their order; pictures come by GET, side by side
 const socket = new WebSocket(location.href.split("#")[0].replace("http", "ws")), waiting = [];
 const opened = new Promise(done => { socket.onopen = socket.onerror = done; });
 socket.onmessage = event => waiting.shift()(JSON.parse(event.data));
@@ -29,23 +29,24 @@ function fail(error) {
   $("failed").hidden = false;
 }
 
-async function loadedImage(uri) {
-  const loaded = new Image();
-  loaded.src = uri;
-  await loaded.decode();
-  return loaded;
+const address = (what, fields) => `${location.pathname.replace(/\/?$/, "/")}${what}/${encodeURIComponent(JSON.stringify({ instrument: overview.instrument, ...fields }))}`;
+
+async function image(what, fields) {
+  const answer = await fetch(address(what, fields)).catch(() => { throw new Error(GONE); });
+  if (!answer.ok) throw new Error(await answer.text());
+  return createImageBitmap(await answer.blob());
 }
 
-async function image(index, small = false) {
-  return loadedImage((await ask("picture", { index, small })).picture);
-}
+const picture = index => image("picture", { index, small: false });
 
 async function go(index, reason) {
   stop();
+  const picturing = picture(index);  // side by side
+  picturing.catch(() => {});  // reported below
   frame = await ask("frame", { index });
   pose = { roll: frame.roll.value, joints: {} };
   for (const [name, known] of Object.entries(frame.joints)) pose.joints[name] = known.value;
-  picture = await image(index);
+  displayed = await picturing;
   shown = index;
   $("why").textContent = `frame ${frame.name}` + (reason ? `: ${reason}` : "");
   $("failed").hidden = true;
@@ -63,7 +64,7 @@ async function haunt() {
   haunting = true;
   while (wished) {
     wished = false;
-    ghost = await ask("ghost", { index: frame.index, ...pose }).then(answer => loadedImage(answer.picture)).catch(() => null);
+    ghost = await image("ghost", { index: frame.index, ...pose }).catch(() => null);
     draw();
   }
   haunting = false;
@@ -104,7 +105,7 @@ function stroke(context, points, color, width, dash = []) {
 
 function draw() {
   const canvas = $("canvas"), box = $("stage").getBoundingClientRect();
-  const ratio = picture.naturalHeight / picture.naturalWidth;
+  const ratio = displayed.height / displayed.width;
   const width = Math.max(200, Math.min(box.width, box.height / ratio));
   canvas.style.width = `${width}px`;
   canvas.style.height = `${width * ratio}px`;
@@ -114,7 +115,7 @@ function draw() {
   $("why").style.top = `${(box.height - width * ratio) / 2 + 8}px`;
   const context = canvas.getContext("2d");
   context.imageSmoothingQuality = "high";
-  context.drawImage(picture, 0, 0, canvas.width, canvas.height);
+  context.drawImage(displayed, 0, 0, canvas.width, canvas.height);
   if (shown !== frame.index) return;
   if (ghosted && ghost) {
     context.globalAlpha = 0.6;
@@ -182,7 +183,7 @@ function strip() {
   const indices = STRIP.map(step => frame.index + step).filter(index => index >= 0 && index < overview.frames);
   $("strip").replaceChildren(...indices.map(index => {
     const figure = document.createElement("figure"), caption = document.createElement("figcaption");
-    image(index, true).then(small => figure.prepend(Object.assign(small, { alt: `frame ${index}` }))).catch(fail);
+    figure.append(Object.assign(new Image(), { src: address("picture", { index, small: true }), alt: `frame ${index}` }));
     const apart = index - frame.index;
     caption.textContent = apart ? (apart > 0 ? `+${apart}` : `${apart}`) : "this frame";
     figure.dataset.index = index;
@@ -201,7 +202,7 @@ function mark() {
 // another frame in the large picture, to look at
 async function show(index) {
   stop();
-  picture = await image(index);
+  displayed = await picture(index);
   shown = index;
   mark();
   draw();
@@ -215,11 +216,11 @@ function stop() {
 async function play() {
   if (timer) return show(frame.index);
   const first = Math.max(0, frame.index - 12), last = Math.min(overview.frames - 1, frame.index + 12);
-  const film = await Promise.all(Array.from({ length: last - first + 1 }, (_, k) => image(first + k)));
+  const film = await Promise.all(Array.from({ length: last - first + 1 }, (_, k) => picture(first + k)));
   let at = 0;
   timer = setInterval(() => {
     if (at >= film.length) return show(frame.index).catch(fail);
-    picture = film[at];
+    displayed = film[at];
     shown = first + at++;
     mark();
     draw();
@@ -330,7 +331,7 @@ $("hide").onclick = hide;
 $("ghost").onclick = toggleGhost;
 $("hinge").oninput = $("share").oninput = keep;
 $("canvas").addEventListener("wheel", event => { event.preventDefault(); turn("roll", event.deltaY > 0 ? STEP : -STEP); }, { passive: false });
-new ResizeObserver(() => frame && picture && draw()).observe($("stage"));
+new ResizeObserver(() => frame && displayed && draw()).observe($("stage"));
 addEventListener("keydown", event => {
   if (!frame || event.ctrlKey || event.metaKey || event.altKey) return;
   if (event.target.type === "range" && event.key.startsWith("Arrow")) return;  // the slider's own

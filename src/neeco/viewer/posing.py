@@ -1,0 +1,319 @@
+"""`neeco view CAPTURE --annotate`: a small web server with the page on which a person poses frames by hand.
+
+A question is a JSON object {"ask": what, ...}. Over the web socket, objects answer in order. Pictures, which change
+nothing, are requested by GET /picture/{...} and /ghost/{...}, side by side.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+import math
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from http import HTTPStatus
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import cv2
+import numpy as np
+import torch
+
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import LOCK_WAIT_S, own_folder, require_like
+from neeco.capture.images import open_image
+from neeco.ingest.posing.along_shaft import crop
+from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
+from neeco.ingest.posing.posed_capture import N_SUGGESTED, PosedCapture, SolvedPosing, half_turn
+from neeco.labels.drawing import draw
+from neeco.training.run import load_run
+from neeco.viewer.access import HOST, MAX_MESSAGE, PORT, Access, family_of, quiet
+
+RUN_FILE = "config.yaml"  # tells a run from a capture
+STATE = {"index": int, "roll": float, "joints": {str: float}}  # degrees
+IMAGES: dict[str, dict[str, Any]] = {"picture": {"index": int, "small": bool}, "ghost": STATE}
+FIELDS = IMAGES | {"overview": {}, "frame": {"index": int}, "save": STATE, "undo": {}}  # of what a page may ask
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureSettings:
+    """Pictures of a frame along the shaft."""
+
+    before: float = 0.6  # of the working length, shown before the shaft's end
+    beyond: float = 1.4  # and beyond it
+    aside: float = 0.65  # and to either side
+    width: int = 1000  # px
+    thumbnail_width: int = 160  # px
+    ghost_width: int = 500  # px
+    jpeg_quality: int = 90
+    joint_range_deg: tuple[float, float] = (0.0, 120.0)  # of a slider, where the capture states no limits
+
+
+class PosingServer:
+    """A running server on one capture; `address` is what to open. Use as a context manager, or call `stop`.
+
+    Any thread may call it: one or more browsers pose the capture.
+    """
+
+    def __init__(self, root: Path, host: str = HOST, port: int = PORT) -> None:
+        """root: a capture, or a run of one, whose scene then appears as a ghost. port: or the next that is free. Raises
+        NeecoError, too for a capture that cannot be posed or whose answers cannot be read."""
+        try:
+            from websockets.sync.server import serve
+        except ImportError:
+            raise NeecoError(f"view: needs viser; {install_hint('view')}") from None
+        # posing changes the capture's states, so that a run of it is always of an earlier one
+        run = load_run(root, force=True) if (root / RUN_FILE).exists() else None
+        self.scene = None if run is None else run.scene
+        self.posed = PosedCapture(root if run is None else run.capture().root)
+        self.settings = PictureSettings()
+        self._lock, self._drawing = threading.Lock(), threading.Lock()
+        self._answers = read_answers(self.posed.root)
+        self._posings = self.posed.solve(self._answers)
+        access = Access.at(host, port)
+        self.address = access.address
+        self._server = serve(
+            self._converse,
+            access.host,
+            access.port,
+            family=family_of(access.host),
+            process_request=access.controlled(self._respond),
+            max_size=MAX_MESSAGE,
+            logger=quiet,
+        )
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> PosingServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """End the server."""
+        self._server.shutdown()
+        self._thread.join()
+
+    def _converse(self, connection: Any) -> None:
+        """Answer all that one page asks over its web socket."""
+        for message in connection:
+            try:
+                answer = self._answer(json.loads(message))
+            except (NeecoError, ValueError, RecursionError) as error:
+                answer = {"error": str(error)}
+            connection.send(json.dumps(answer, allow_nan=False))
+
+    def _answer(self, message: Any) -> dict[str, Any]:
+        ask, instrument, question = self._question(message)
+        if ask == "overview":
+            return self.overview(instrument)
+        if ask == "frame":
+            return self._frame(instrument, question["index"])
+        if ask == "undo":
+            return self._undo(instrument)
+        if ask == "save":
+            return self.save(instrument, question["index"], question["roll"], question["joints"])
+        raise NeecoError(f"page: ask: {ask!r} is a picture; reload the page")
+
+    def _respond(self, connection: Any, request: Any) -> Any:
+        """The page or a picture; None for the web socket."""
+        if "Upgrade" in request.headers:
+            return None
+        ask, _, fields = request.path.removeprefix("/").partition("/")
+        status, kind = HTTPStatus.OK, "text/html; charset=utf-8"
+        try:
+            if not ask:
+                body = page()
+            elif ask in IMAGES:
+                body, kind = self._image(self._question(json.loads(unquote(fields)) | {"ask": ask}))
+            else:
+                status, body = HTTPStatus.NOT_FOUND, b"neeco view: no such page\n"
+        except (NeecoError, ValueError, TypeError, RecursionError) as error:
+            status, body = HTTPStatus.BAD_REQUEST, str(error).encode(errors="replace")
+        response = connection.respond(status, "")
+        response.body = body
+        for name, value in (("Content-Length", str(len(body))), ("Content-Type", kind)):
+            del response.headers[name]
+            response.headers[name] = value
+        return response
+
+    def _question(self, message: Any) -> tuple[str, str, dict[str, Any]]:
+        """Return what is asked, of which instrument, and its fields. Raises NeecoError."""
+        remedy = "reload the page"
+        ask = require_like(message, {"ask": str}, "page", remedy)["ask"]
+        if ask not in FIELDS:
+            raise NeecoError(f"page: ask: {ask!r} is unknown; {remedy}")
+        question = require_like(message, {"ask": str, "instrument": str, **FIELDS[ask]}, "page", remedy)
+        instrument = question["instrument"] or next(iter(self._posings))
+        self._posing(instrument, question.get("index", 0))
+        return ask, instrument, question
+
+    def overview(self, instrument: str) -> dict[str, Any]:
+        """Requests, answers and estimates of an instrument, as JSON for the page. Raises NeecoError."""
+        with self._lock:
+            if (answers := read_answers(self.posed.root)) != self._answers:  # another server's, or an editor's
+                self._answers, self._posings = answers, self.posed.solve(answers)
+            return self._overview(instrument)
+
+    def _frame(self, instrument: str, index: int) -> dict[str, Any]:
+        """Estimates in one frame, and the geometry of the page's lines."""
+        with self._lock:
+            posing = self._posings[instrument]
+            origin = posing.shafts.origins[index]
+            towards, _ = posing.shafts.view_axes
+            angles = {
+                name: {"value": math.degrees(solved.values[index]), "deviation": float(solved.deviations_deg[index])}
+                for name, solved in posing.angles.items()
+            }
+            roll = angles.pop("roll")
+            return {
+                "index": index,
+                "name": self.posed.frames[index],
+                "roll": roll | {"value": half_turn(roll["value"])},
+                "joints": angles,
+                # a point a mm along the shaft, b across, c towards the camera is observed at (a, b) of another depth
+                "origin_towards": float(towards[index] @ origin),
+                "origin_along": float(posing.shafts.directions[index] @ origin),
+            }
+
+    def save(self, instrument: str, index: int, roll_deg: float, joints_deg: Mapping[str, float]) -> dict[str, Any]:
+        """Add an answer, solve again and write both; the overview, and under `said` what contradicts the answer. Raises
+        NeecoError."""
+        with self._lock, self._own_capture():
+            _require_state(self._posings[instrument], roll_deg, joints_deg)
+            now = datetime.datetime.now().strftime("%Y-%m-%d %H:%M")
+            answer = HandPose(self.posed.frames[index], instrument, roll_deg, dict(joints_deg), now)
+            self._keep([*read_answers(self.posed.root), answer])
+            outliers = [outlier for outlier in self._posings[instrument].outliers() if outlier.frame == index]
+            return self._overview(instrument) | {"said": [str(outlier) for outlier in outliers]}
+
+    def _undo(self, instrument: str) -> dict[str, Any]:
+        """Take the last answer for an instrument out again; the overview, and under `frame` what it was of."""
+        with self._lock, self._own_capture():
+            answers = read_answers(self.posed.root)
+            own = [position for position, answer in enumerate(answers) if answer.instrument == instrument]
+            if not own:
+                return self._overview(instrument) | {"frame": None}
+            removed = answers.pop(own[-1])
+            self._keep(answers)
+            return self._overview(instrument) | {"frame": self.posed.frames.index(removed.frame)}
+
+    def _own_capture(self) -> contextlib.AbstractContextManager[None]:
+        """The capture for this process alone, from reading its answers to writing them and its states."""
+        return own_folder(self.posed.root, wait_s=LOCK_WAIT_S)
+
+    def _keep(self, answers: list[HandPose]) -> None:
+        posings = self.posed.solve(answers)  # raises before anything is written
+        write_answers(self.posed.root, answers)
+        self.posed.write_states(posings)
+        self._answers, self._posings = answers, posings
+
+    def _posing(self, instrument: str, index: int) -> SolvedPosing:
+        if instrument not in self._posings:
+            raise NeecoError(f"no instrument {instrument!r}; known: {', '.join(self._posings)}")
+        if not 0 <= index < len(self.posed.frames):
+            raise NeecoError(f"no frame {index}; there are {len(self.posed.frames)}")
+        return self._posings[instrument]
+
+    def _image(self, asked: tuple[str, str, dict[str, Any]]) -> tuple[bytes, str]:
+        """A frame along the shaft, which points to the right, or the run's instruments there; and its media type."""
+        ask, instrument, question = asked
+        posing, index, settings = self._posing(instrument, question["index"]), question["index"], self.settings
+        if ask == "ghost":
+            pixels = self._ghost(posing, index, question["roll"], question["joints"])
+            width, order, kind = settings.ghost_width, cv2.COLOR_RGBA2BGRA, "png"
+        else:
+            pixels = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
+            width = settings.thumbnail_width if question["small"] else settings.width
+            order, kind = cv2.COLOR_RGB2BGR, "jpeg"
+        left, right, top, bottom = self._window(posing)
+        scale = (right - left) / width
+        along = left + (np.arange(width) + 0.5) * scale
+        across = top + (np.arange(round((bottom - top) / scale)) + 0.5) * scale
+        pixels = crop(posing.shafts, index, pixels, along, across).transpose(1, 0, 2)
+        quality = [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality] if kind == "jpeg" else []
+        return cv2.imencode(f".{kind}", cv2.cvtColor(pixels, order), quality)[1].tobytes(), f"image/{kind}"
+
+    def _ghost(self, posing: SolvedPosing, index: int, roll_deg: float, joints_deg: Mapping[str, float]) -> np.ndarray:
+        """The run's instruments in such a state of a frame, RGBA uint8 [H, W, 4], clear elsewhere."""
+        if self.scene is None:
+            raise NeecoError("ghost: no run is given")
+        _require_state(posing, roll_deg, joints_deg)
+        frame, name = self.posed.capture.frames[index], posing.instrument.name
+        recorded = frame.state.instruments[name]
+        pose = recorded.pose.clone()
+        pose[:3, :3] = torch.from_numpy(posing.shafts.rotation(index, math.radians(roll_deg)))
+        joints = {**recorded.joints, **{joint: math.radians(value) for joint, value in joints_deg.items()}}
+        instruments = {**frame.state.instruments, name: replace(recorded, pose=pose, joints=joints)}
+        with self._drawing, self.scene.torch_threads():
+            drawing = draw(self.scene, replace(frame.state, instruments=instruments), frame.camera)
+        if drawing.parts is None:
+            raise NeecoError("ghost: the run's scene does not tell instruments from tissue; train method kinematic")
+        color = (drawing.image.numpy() * 255).round().astype(np.uint8)
+        return np.dstack([color, (drawing.parts.numpy() > 0).astype(np.uint8) * 255])
+
+    def _window(self, posing: SolvedPosing) -> tuple[float, float, float, float]:
+        """Left, right (mm along the shaft), top and bottom (across) of a picture."""
+        length, settings = posing.shafts.working_length_mm, self.settings
+        aside = settings.aside * length
+        return -settings.before * length, settings.beyond * length, -aside, aside
+
+    def _overview(self, instrument: str) -> dict[str, Any]:
+        posing = self._posing(instrument, 0)
+        answered = {frame for frame, _ in posing.answers}
+        outliers: dict[int, list[str]] = {}
+        for outlier in posing.outliers():
+            outliers.setdefault(outlier.frame, []).append(str(outlier))
+        limits = {name: posing.instrument.joints[name] for name in posing.joints}
+        return {
+            "ghost": self.scene is not None,
+            "capture": self.posed.root.resolve().name,
+            "instrument": instrument,
+            "frames": len(self.posed.frames),
+            "suggested": [
+                {"frame": item.frame, "reason": item.reason}
+                for item in posing.suggestions(max(1, N_SUGGESTED - len(answered)))
+            ],
+            "of": max(N_SUGGESTED, len(answered)),
+            "answered": [
+                {
+                    "frame": frame,
+                    "name": answer.frame,
+                    "roll": answer.roll_deg,
+                    "joints": answer.joints_deg,
+                    "doubts": outliers.get(frame, []),
+                }
+                for frame, answer in posing.answers
+            ],
+            "done": len(answered),
+            "sure": {name: [round(value, 1) for value in pair] for name, pair in posing.deviations().items()},
+            "window": self._window(posing),
+            "length": posing.shafts.working_length_mm,
+            "radius": posing.shafts.diameter_mm / 2,
+            "joints": {
+                name: self.settings.joint_range_deg if span is None else [math.degrees(end) for end in span]
+                for name, span in limits.items()
+            },
+        }
+
+
+@cache
+def page() -> bytes:
+    """The page, one file of HTML."""
+    folder = files("neeco.viewer") / "posing_page"
+    html, style, script = (folder.joinpath(f"page.{kind}").read_text("utf-8") for kind in ("html", "css", "js"))
+    return html.replace("{{ style }}", style).replace("{{ script }}", script).encode()
+
+
+def _require_state(posing: SolvedPosing, roll_deg: float, joints_deg: Mapping[str, float]) -> None:
+    """Raise NeecoError where these are no roll and joints of the instrument."""
+    if set(joints_deg) != set(posing.joints) or not all(
+        abs(value) <= 360 for value in (roll_deg, *joints_deg.values())
+    ):
+        raise NeecoError(f"answer: expected {', '.join(posing.angles)} in degrees between -360 and 360")
