@@ -18,8 +18,15 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import LOCK_WAIT_S, own_folder
 from neeco.capture.images import open_image
 from neeco.ingest.posing.along_shaft import crop
-from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
-from neeco.ingest.posing.posed_capture import N_SUGGESTED, PosedCapture, SolvedPosing, half_turn
+from neeco.ingest.posing.posed_capture import (
+    N_SUGGESTED,
+    HandPose,
+    PosedCapture,
+    SolvedPosing,
+    half_turn,
+    read_answers,
+    write_answers,
+)
 from neeco.labels.drawing import draw
 from neeco.training.run import load_run
 
