@@ -133,15 +133,14 @@ class ImageVerdicts:
     def _poses(self) -> dict[str, tuple[np.ndarray, np.ndarray] | None]:
         """Recorded poses [N, 4, 4] of each instrument, and what makes them those of the root [N, 4, 4], which shows
         most; None where a frame has no state."""
-        return {instrument.name: self._poses_of(instrument) for instrument in self.parsed.instruments}
-
-    def _poses_of(self, instrument: Instrument) -> tuple[np.ndarray, np.ndarray] | None:
-        name, tree = instrument.name, instrument.kinematics
-        if not all(name in frame.state.instruments for frame in self.parsed.frames):
-            return None
-        states = [frame.state.instruments[name] for frame in self.parsed.frames]
-        back = [np.eye(4) if tree is None else tree.world_from_root(np.eye(4), state.joints) for state in states]
-        return np.stack([state.pose.numpy() for state in states]), np.stack(back)
+        poses: dict[str, tuple[np.ndarray, np.ndarray] | None] = {}
+        for item in self.parsed.instruments:
+            poses[item.name], tree = None, item.kinematics
+            states = [state for _, state in self.parsed.states_of(item.name)]
+            if len(states) == len(self.parsed.frames):
+                back = [np.eye(4) if tree is None else tree.world_from_root(np.eye(4), one.joints) for one in states]
+                poses[item.name] = np.stack([state.pose.numpy() for state in states]), np.stack(back)
+        return poses
 
     def _mistake(self, name: str, recorded: np.ndarray, back: np.ndarray, motion: MotionEvidence) -> Candidate | None:
         """The mistake in the poses [N, 4, 4] of an instrument that the images confirm."""

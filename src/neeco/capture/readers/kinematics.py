@@ -68,17 +68,16 @@ def _parse_link(node: Node) -> Link | None:
     value = _gains(node.child("value")) if node.has("value") else {}
     offset = node.child("offset").number(above=-MAX_MM, below=MAX_MM) if node.has("offset") else 0.0
     limits = node.child("limits").range("rad or mm") if node.has("limits") else None
-    body = node.child("body")
-    if node.has("body") and not isinstance(body.value, bool):
-        body.error(f"expected true or false, found {printable(body.value)}", "correct it")
-        return None
+    body = node.child("body").flag(True)
     if kind not in (None, FIXED) and not node.has("axis"):
         node.child("axis").error("is missing", "give the joint's axis in the parent's frame, three numbers")
         return None
     wrong = (node.has("parent") and parent is None) or (node.has("limits") and limits is None)
-    if name is None or kind is None or origin is None or axis is None or value is None or offset is None or wrong:
+    if wrong or body is None:
         return None
-    return Link(name, parent, kind, origin, axis, value, offset=offset, limits=limits, body=body.value is not False)
+    if name is None or kind is None or origin is None or axis is None or value is None or offset is None:
+        return None
+    return Link(name, parent, kind, origin, axis, value, offset=offset, limits=limits, body=body)
 
 
 def _origin(node: Node) -> Array | None:
