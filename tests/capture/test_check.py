@@ -15,7 +15,6 @@ from PIL import Image
 
 from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture
-from neeco.capture.checks import read_checked
 from neeco.capture.points import read_ply, write_ply
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.cli import check as check_verb
@@ -94,6 +93,7 @@ EDITS = [
     (_frame(2, "mask_path", "masks/none.png"), "frames[2].mask_path", "no such file"),
     (_frame(2, "transform_matrix", [[1, 0], [0, 1]]), "frames[2].transform_matrix", "4x4"),
     (_frame(2, "transform_matrix", None), "frames[2].transform_matrix", "missing"),
+    (lambda d: d["frames"][6]["transform_matrix"][0].__setitem__(3, 1e5), "frames[6].transform_matrix", "far from the"),
     (_frame(2, "time", "soon"), "frames[2].time", "expected a number"),
     (_frame(2, "instruments", {}), "frames[2].instruments", "expected a list"),
     (_frame(2, "instruments", []), "frames[2].instruments", "missing here"),
@@ -115,7 +115,7 @@ EDITS = [
         "missing",
     ),
     (_uncertainty(translation_mm=[1, 2]), "frames[3].instruments[0].uncertainty.translation_mm", "3 numbers"),
-    (_uncertainty(rotation_deg=[1, -1, 2]), "frames[3].instruments[0].uncertainty.rotation_deg", "standard deviation"),
+    (_uncertainty(rotation_deg=[1, -1, 2]), "frames[3].instruments[0].uncertainty.rotation_deg[1]", "out of range"),
     (_uncertainty(joints_deg={"x": 1}), "frames[3].instruments[0].uncertainty.joints_deg.x", "no such joint"),
     (_uncertainty(joints_deg=[]), "frames[3].instruments[0].uncertainty.joints_deg", "expected an object"),
     (_shared(np.diag([1.0] * 5 + [-1.0]).tolist()), "instruments[0].base_uncertainty.covariance", "no covariance"),
@@ -223,11 +223,6 @@ def test_a_sensor_mounted_tilted_is_fine(folder):
     assert problems(folder) == []
 
 
-def test_a_camera_far_from_the_points_is_an_error(folder):
-    folder.edit(lambda d: d["frames"][6]["transform_matrix"][0].__setitem__(3, 1e5))
-    assert_found(folder, "frames[6].transform_matrix", "far from the points")
-
-
 def test_a_roll_that_nobody_knows_is_a_warning(folder):
     def found_in_video(document, roll):
         sure = {"translation_mm": [0.2, 0.2, 1.0], "rotation_deg": [1, 1, roll]}
@@ -274,12 +269,6 @@ def test_a_mask_that_ignores_everything_is_an_error_and_missing_ones_a_warning(f
     folder.edit(_frame(2, "mask_path", "mask.png"))
     assert_found(folder, "frames[2].mask_path", "ignores every pixel")
     assert_found(folder, "frames[0].mask_path", "no mask", "warning")
-
-
-def test_a_link_out_of_the_folder_is_an_error(folder, tmp_path):
-    (folder.root / "images/000001.png").rename(tmp_path / "outside.png")
-    (folder.root / "images/000001.png").symlink_to(tmp_path / "outside.png")
-    assert_found(folder, "frames[1].file_path", "leaves the capture's folder")
 
 
 def test_a_missing_time_is_only_a_warning(folder):
@@ -348,14 +337,6 @@ def test_the_verb_says_what_labels_few_frames_give(folder, capsys):
     assert "labels to expect" not in capsys.readouterr().out
     check_verb.run(check_verb.Arguments(SAMPLE))  # 72 training frames
     assert "labels to expect" not in capsys.readouterr().out
-
-
-def test_a_capture_is_parsed_once_to_be_checked_and_handed_on(folder, monkeypatch):
-    parsed = []
-    real = json.loads
-    monkeypatch.setattr(json, "loads", lambda text, **words: parsed.append(text) or real(text, **words))
-    assert len(read_checked(folder.root).frames) == 8
-    assert len(parsed) == 1
 
 
 def test_frames_that_are_all_left_out_are_an_error(folder):

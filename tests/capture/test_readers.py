@@ -511,23 +511,6 @@ def test_nerfstudio_frames_without_time_are_in_the_order_of_their_numbers(folder
     assert [frame.state.time for frame in frames] == [*range(8)]
 
 
-@pytest.mark.parametrize(("number", "model", "count"), [(12, "SIMPLE_DIVISION", 4), (16, "EUCM", 6), (42, "42", 4)])
-def test_newer_colmap_models_are_named(folder, tmp_path, number, model, count):
-    write_colmap(folder, tmp_path, binary=True)
-    camera = struct.pack(f"<QiiQQ{count}d", 1, 1, number, 32, 24, *[20.0] * count)
-    (tmp_path / "sparse/0/cameras.bin").write_bytes(camera)
-    with pytest.raises(NeecoError, match=f"camera model (is )?{model}.*image_undistorter"):
-        read_capture(tmp_path)
-
-
-def test_equidistant_colmap_images_can_be_undistorted(folder, tmp_path):
-    write_colmap(folder, tmp_path, binary=True)
-    camera = struct.pack("<QiiQQ4d", 1, 1, 15, 32, 24, 40.0, 41.0, 16.5, 12.0)
-    (tmp_path / "sparse/0/cameras.bin").write_bytes(camera)
-    with pytest.raises(NeecoError, match=r"FISHEYE: the images are distorted .*: neeco ingest"):
-        read_capture(tmp_path)
-
-
 @pytest.mark.parametrize("factor", [0.5, 1.5])
 def test_cameras_of_another_image_size_are_a_warning(folder, factor):
     document = folder.document

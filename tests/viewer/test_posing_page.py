@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from posing_world import JOINT, NAME, PosingWorld, measured_world
 
-from neeco.ingest.posing.hand_posed import read_answers
+from neeco.ingest.posing.posed_capture import read_answers
 from neeco.viewer.posing import PosingServer
 
 pytestmark = pytest.mark.browser

@@ -26,7 +26,7 @@ from viewer_world import grasper_scene, write_run
 from neeco.base.errors import NeecoError
 from neeco.capture.readers import read_capture
 from neeco.cli import main
-from neeco.ingest.posing.hand_posed import read_answers
+from neeco.ingest.posing.posed_capture import read_answers
 from neeco.viewer.access import Access
 from neeco.viewer.posing import PosingServer
 

@@ -152,6 +152,13 @@ class Node(Place):
         self.error(f"expected an object, found {printable(self.value)}")
         return False
 
+    def flag(self, default: bool) -> bool | None:
+        """True or false; `default` where nothing is stated."""
+        if self.value is not None and not isinstance(self.value, bool):
+            self.error(f"expected true or false, found {printable(self.value)}", "correct it")
+            return None
+        return default if self.value is None else self.value
+
     def text(self, remedy: str = "") -> str | None:
         """A non-empty string."""
         if isinstance(self.value, str) and self.value.strip():
@@ -187,12 +194,12 @@ class Node(Place):
             return None
         return None if value is None else int(value)
 
-    def numbers(self, count: int, what: str) -> list[float] | None:
-        """A list of so many finite numbers."""
+    def numbers(self, count: int, what: str, least: float | None = None) -> list[float] | None:
+        """A list of so many finite numbers, none below `least`."""
         if not isinstance(self.value, list) or len(self.value) != count:
             self.error(f"expected {count} numbers ({what}), found {printable(self.value)}", "correct it")
             return None
-        found = [number for item in self.items() if (number := item.number()) is not None]
+        found = [number for item in self.items() if (number := item.number(least=least)) is not None]
         return found if len(found) == count else None
 
     def range(self, unit: str) -> tuple[float, float] | None:

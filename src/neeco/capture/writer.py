@@ -18,7 +18,7 @@ from torch import Tensor
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes, sync_disk, write_json, write_unsynced
 from neeco.capture.images import encoded_image, has_alpha
-from neeco.capture.model import SCHEMA, Capture, Frame, FromVideo, Instrument, State, Uncertainty
+from neeco.capture.model import SCHEMA, Capture, Frame, Instrument, State, Uncertainty
 from neeco.capture.points import write_ply
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.rotations import rigid_fault
@@ -105,7 +105,7 @@ def fingerprint(capture: Capture) -> str:
         if item.kinematics is not None:  # captures without keep the fingerprint that older versions noted
             digest.update(json.dumps([item.kinematics.to_json(), item.unrecorded]).encode())
         if item.from_video is not None:
-            digest.update(json.dumps(from_video_to_json(item.from_video)).encode())
+            digest.update(json.dumps(asdict(item.from_video)).encode())
         if item.base_uncertainty is not None:
             digest.update(json.dumps(asdict(item.base_uncertainty)).encode())
     if capture.lens is not None:
@@ -133,11 +133,6 @@ def camera_to_json(world_from_camera: np.ndarray) -> list[list[float]]:
     return (swap_camera_axes(world_from_camera) + 0.0).tolist()  # + 0.0: no negative zeros
 
 
-def from_video_to_json(shaft: FromVideo) -> dict[str, float]:
-    """The `from_video` block that `parse_from_video` reads."""
-    return asdict(shaft)
-
-
 def uncertainty_to_json(uncertainty: Uncertainty) -> dict[str, Any]:
     """The `uncertainty` block that `parse_uncertainty` reads."""
     written: dict[str, Any] = {
@@ -158,7 +153,7 @@ def _instrument_to_json(instrument: Instrument) -> dict[str, Any]:
     if instrument.kinematics is not None:
         written["kinematics"] = instrument.kinematics.to_json()
     if instrument.from_video is not None:
-        written["from_video"] = from_video_to_json(instrument.from_video)
+        written["from_video"] = asdict(instrument.from_video)
     if instrument.base_uncertainty is not None:
         written["base_uncertainty"] = asdict(instrument.base_uncertainty)
     return written

@@ -28,7 +28,7 @@ from neeco.ingest.registration.find_bases import (
     require_no_base,
 )
 from neeco.ingest.registration.hand_eye import Registration
-from neeco.ingest.shaft.video_instruments import find_in_video, on_masks
+from neeco.ingest.shaft.from_video import find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.world import (
     World,

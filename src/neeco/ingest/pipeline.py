@@ -32,7 +32,7 @@ from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.registration.clocks import note_frame_rates
 from neeco.ingest.result import IngestResult
-from neeco.ingest.shaft.video_instruments import NOT_VISIBLE, instruments_of, uncertainties
+from neeco.ingest.shaft.from_video import NOT_VISIBLE, instruments_of, uncertainties
 from neeco.ingest.splits import LEFT_OUT, split_frames
 from neeco.ingest.staging import staged
 from neeco.ingest.still_scope import find_still_world, is_still

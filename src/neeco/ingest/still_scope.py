@@ -27,7 +27,7 @@ from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.recording.model import MOVING, STILL
 from neeco.ingest.registration.clocks import find_instrument_clocks
 from neeco.ingest.registration.find_bases import check_reference_frames, find_bases
-from neeco.ingest.shaft.video_instruments import find_in_video
+from neeco.ingest.shaft.from_video import find_in_video
 from neeco.ingest.timing.episodes import Episodes
 from neeco.ingest.timing.reading import require_lens
 from neeco.ingest.world import (

@@ -28,8 +28,15 @@ from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import LOCK_WAIT_S, own_folder, require_like
 from neeco.capture.images import open_image
 from neeco.ingest.posing.along_shaft import crop
-from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
-from neeco.ingest.posing.posed_capture import N_SUGGESTED, PosedCapture, SolvedPosing, half_turn
+from neeco.ingest.posing.posed_capture import (
+    N_SUGGESTED,
+    HandPose,
+    PosedCapture,
+    SolvedPosing,
+    half_turn,
+    read_answers,
+    write_answers,
+)
 from neeco.labels.drawing import draw
 from neeco.training.run import load_run
 from neeco.viewer.access import HOST, MAX_MESSAGE, PORT, Access, family_of, quiet

@@ -13,17 +13,16 @@ carried along by the poses, lies on moving pixels.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property, partial
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neeco.capture.checks.candidates import Candidate, Pixels, gain_certainty
 from neeco.capture.checks.pictures import Picture, compared_rows, in_threads, reduced_size, resized
-from neeco.capture.checks.settings import SETTINGS
+from neeco.capture.checks.settings import SETTINGS, Margin
 from neeco.capture.model import evenly_spaced
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.camera import Camera
@@ -32,6 +31,28 @@ from neeco.geometry.projection import project
 MIN_DEPTH = 1e-3  # mm; points that are less deep are not in front of a camera
 LUMA = np.array([0.299, 0.587, 0.114])  # brightness of red, green, blue
 DEPTHS = np.linspace(0.35, 1.0, 12)  # at which moving pixels may be, of the tissue's
+Pixels = Callable[..., tuple[np.ndarray, np.ndarray]]  # u, v, width, height -> u, v
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One mistake: what it is, what to do about it, and what is compared with the images without it."""
+
+    kind: str
+    message: str
+    remedy: str
+    margin: Margin
+    _: KW_ONLY
+    poses: np.ndarray | None = None  # [F, 4, 4] of the instrument or the cameras (OpenCV axes); None: as recorded
+    pixels: Pixels | None = None  # where a projected point lies in the images
+    available: np.ndarray | None = None  # [F] frames that have poses; None: all
+    steps: int = 0  # frames by which poses are shifted
+
+
+def gain_certainty(gains: np.ndarray) -> float:
+    """Mean of gains [F] of frames in order, in standard errors over blocks of them."""
+    blocks = np.array([block.mean() for block in np.array_split(gains, min(SETTINGS.blocks, len(gains)))])
+    return float(blocks.mean() / max(blocks.std(ddof=1) / np.sqrt(len(blocks)), 1e-9))
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,30 @@
 """Readers of capture folders and of what they hold: cameras, lenses, instrument states and kinematic trees."""
 
-from neeco.capture.readers._folder import capture_of, parse_capture, read_capture
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neeco.base.errors import NeecoError
+from neeco.base.files import require_utf8
+from neeco.base.placeholders import misplaced
+from neeco.base.plausible import other_size_fault
+from neeco.capture.documents import Node, ProblemReport, errors_only
+from neeco.capture.model import Capture, Instrument, State, share_lamps
+from neeco.capture.points import points_in_view
+from neeco.capture.readers._colmap import find_models, parse_colmap
 from neeco.capture.readers._states import StateLine, read_states
+from neeco.capture.readers._transforms import is_blender, load_document, parse_blender, parse_transforms
 from neeco.capture.readers.cameras import parse_lens
-from neeco.capture.readers.dvrk import read_dvrk_tool
-from neeco.capture.readers.kinematics import kinematics_of, parse_kinematics
-from neeco.capture.readers.urdf import read_urdf
+from neeco.capture.readers.endonerf import is_endonerf_folder, parse_endonerf
+from neeco.capture.readers.kinematics import kinematics_of, parse_kinematics, read_dvrk_tool, read_urdf
+from neeco.capture.readers.parsed import Parsed, inside
+from neeco.geometry.lens import Lens
 
 __all__ = [
     "StateLine",
@@ -19,3 +38,147 @@ __all__ = [
     "read_states",
     "read_urdf",
 ]
+
+
+def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:
+    """Read a capture: neeco-capture/1, nerfstudio, Blender / D-NeRF transforms, a COLMAP model or an EndoNeRF folder.
+
+    Args:
+        path: the capture's folder, or a transforms file in it
+        transforms: which file of the folder to read
+        background: what shows through transparent pixels: 0 black, 1 white
+
+    Image pixels are not read here. Raises NeecoError with the first problem found; `check_capture` finds all of them.
+
+        capture = neeco.read_capture("samples/liver-mini")
+        frame = capture.split("test")[0]
+        frame.load_image().shape, frame.camera.fx, frame.state.instruments["maryland"].pose
+    """
+    report = ProblemReport()
+    parsed = parse_capture(path, report, transforms, background)
+    if not parsed.frames and not errors_only(report.problems):
+        report.error(transforms, "frames", "no frame could be read", "run `neeco check` on the capture")
+    report.raise_first(parsed.root)
+    return capture_of(parsed)
+
+
+def capture_of(parsed: Parsed) -> Capture:
+    """Build the capture from what was read without errors. Poses of articulated instruments become their roots'.
+    Raises NeecoError for an image whose name is not in UTF-8."""
+    frames, instruments = tuple(parsed.frames), parsed.instruments
+    for frame in frames:
+        require_utf8(frame.image_path)
+    points = parsed.points
+    if points is None:
+        points = points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames]))
+    if parsed.still:
+        lit = share_lamps([frame.camera for frame in frames])
+        frames = tuple(replace(frame, camera=camera) for frame, camera in zip(frames, lit, strict=True))
+    if any(item.unrecorded for item in instruments):
+        frames = tuple(replace(frame, state=_with_unrecorded(frame.state, instruments)) for frame in frames)
+    if any(item.kinematics is not None and item.kinematics.pose_of is not None for item in instruments):
+        frames = tuple(replace(frame, state=_of_roots(frame.state, instruments, parsed)) for frame in frames)
+        instruments = tuple(
+            item if item.kinematics is None else replace(item, kinematics=replace(item.kinematics, pose_of=None))
+            for item in instruments
+        )
+    return Capture(
+        parsed.root,
+        frames,
+        instruments,
+        points,
+        registered=parsed.registered,
+        timed=parsed.timed,
+        lens=parsed.lens,
+        still=parsed.still,
+    )
+
+
+def _with_unrecorded(state: State, instruments: Sequence[Instrument]) -> State:
+    """The state with every joint that nobody recorded half way between its limits."""
+    filled = dict(state.instruments)
+    for item in instruments:
+        if item.unrecorded and item.name in filled:
+            halfway = {joint: item.halfway(joint) for joint in item.unrecorded}
+            filled[item.name] = replace(filled[item.name], joints={**filled[item.name].joints, **halfway})
+    return replace(state, instruments=filled)
+
+
+def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -> State:
+    """The state with poses of any other link of an instrument made those of its root, by its kinematics as stated."""
+    moved = dict(state.instruments)
+    for item in instruments:
+        tree, given = item.kinematics, state.instruments.get(item.name)
+        if tree is None or tree.pose_of is None or given is None:
+            continue
+        if missing := [name for name in sorted(tree.readings_of(tree.pose_of)) if name not in given.joints]:
+            raise NeecoError(
+                f"{parsed.root}: kinematics of {item.name}: reading {missing[0]!r} is missing in a frame; run `neeco "
+                "check` on the capture"
+            )
+        root = tree.world_from_root(given.pose.double().numpy(), given.joints)
+        moved[item.name] = replace(given, pose=torch.from_numpy(root))
+    return replace(state, instruments=moved)
+
+
+def parse_capture(
+    path: Path | str,
+    report: ProblemReport,
+    transforms: str = "transforms.json",
+    background: float = 1.0,
+    *,
+    as_source: bool = False,
+) -> Parsed:
+    """Read as much of a capture as can be read; what is wrong with it goes to `report`. as_source: see `Parsed`. Raises
+    NeecoError for a path that is not in UTF-8."""
+    parsed = _parse(Path(path), report, transforms, background, as_source)
+    _warn_of_other_size(parsed)
+    return parsed
+
+
+def _warn_of_other_size(parsed: Parsed) -> None:
+    """Warn of intrinsics of another image size, of the lens or of most cameras."""
+    frames = parsed.with_cameras().frames
+    lenses = [Lens.of(frame.camera) for frame in frames]
+    if parsed.lens is not None:
+        lenses = [parsed.lens]
+    faults = [other_size_fault(lens.cx, lens.cy, *lens.size) for lens in lenses if lens.size is not None]
+    found = [fault for fault in faults if fault is not None]
+    if len(found) > len(faults) / 2:
+        parsed.header("cx, cy" if parsed.lens is None else "lens").warning(*found[0])
+
+
+def _parse(path: Path, report: ProblemReport, transforms: str, background: float, as_source: bool) -> Parsed:
+    require_utf8(path)
+    if os.path.isfile(path) and path.suffix.lower() != ".json":
+        report.error(str(path), "", "is no capture", "give the folder of one, or a transforms file (JSON) in it")
+        return Parsed(path.parent)
+    if os.path.isfile(path):
+        path, transforms = path.parent, path.name
+    if not os.path.isdir(path):
+        report.error(str(path), "", *misplaced(path, "the folder of a capture"))
+        return Parsed(path)
+    try:
+        file = inside(path, path, transforms)
+    except NeecoError as error:
+        Node(None, transforms, "", report).error_from(error)
+        return Parsed(path)
+    if file.is_file():
+        document = load_document(file, path, report)
+        if is_blender(document):
+            return parse_blender({file: document}, path, background, as_source=as_source)
+        return parse_transforms(document, file.parent, path, background, as_source=as_source)
+    if transforms != "transforms.json":
+        report.error(transforms, "", "no such file", "name a transforms file of the capture")
+        return Parsed(path)
+    splits = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
+    if blender_files := [file for file in splits if file.is_file()]:
+        documents = {file: load_document(file, path, report) for file in blender_files}
+        return parse_blender(documents, path, background, as_source=as_source)
+    if models := find_models(path):
+        return parse_colmap(models, path, report, as_source=as_source)
+    if is_endonerf_folder(path):
+        return parse_endonerf(path, report)
+    content = "transforms.json, transforms_train.json, a COLMAP model or poses_bounds.npy"
+    report.error(str(path), "", *misplaced(path, "the folder of a capture", content))
+    return Parsed(path)

@@ -94,7 +94,7 @@ def declared_instruments(document: Node) -> tuple[Instrument, ...]:
             is_object = node.value is not None and node.is_object()
             has_limits = is_object and node.has("limits")
             joints[joint] = node.child("limits").range("rad") if has_limits else None
-            if is_object and _is_unrecorded(node):
+            if is_object and node.child("recorded").flag(True) is False:
                 unrecorded.append(joint)
                 if not has_limits:
                     node.child("limits").error("is missing", "state between which values to look for the joint")
@@ -153,8 +153,8 @@ def parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty | None:
     None, and reported, where it is not that."""
     if not node.is_object():
         return None
-    translation = _deviations(node.child("translation_mm"), "in the camera's axes, mm")
-    rotation = _deviations(node.child("rotation_deg"), "about the instrument's x, y, z, degrees")
+    translation = node.child("translation_mm").numbers(3, "standard deviations in the camera's axes, mm", least=0)
+    rotation = node.child("rotation_deg").numbers(3, "those about the instrument's x, y, z, degrees", least=0)
     named: dict[str, float] = {}
     good = translation is not None and rotation is not None
     if node.has("joints_deg"):
@@ -171,27 +171,8 @@ def parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty | None:
                 named[name] = deviation
     if not good or translation is None or rotation is None:
         return None
-    return Uncertainty(translation, rotation, named)
-
-
-def _deviations(node: Node, what: str) -> tuple[float, float, float] | None:
-    found = node.numbers(3, f"standard deviations {what}")
-    if found is None:
-        return None
-    if min(found) < 0:
-        node.error(f"{min(found):g} is no standard deviation", "give numbers of 0 or more")
-        return None
-    return found[0], found[1], found[2]
-
-
-def _is_unrecorded(joint: Node) -> bool:
-    """Return True if a joint of the header states `"recorded": false`."""
-    if not joint.has("recorded"):
-        return False
-    recorded = joint.child("recorded")
-    if not isinstance(recorded.value, bool):
-        recorded.error(f"expected true or false, found {printable(recorded.value)}", "correct it")
-    return recorded.value is False
+    (across, down, depth), (tilt, turn, roll) = translation, rotation
+    return Uncertainty((across, down, depth), (tilt, turn, roll), named)
 
 
 def _joint_nodes(item: Node) -> dict[str, Node] | None:

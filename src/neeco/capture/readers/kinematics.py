@@ -1,19 +1,27 @@
-"""The kinematics block of an instrument in transforms.json, which `KinematicTree.to_json` writes.
+"""Kinematic trees: the block of transforms.json, tool files of the dVRK (`share/tool/*.json`) and URDF files.
 
-`{"pose_of": NAME, "links": [{"name", "parent", "type", "origin", "axis", "value": {reading: gain}, "offset", "limits",
-"body"}]}`, as `Link` has them; all but a link's name may be left out where it is as `Link` says.
+The block, which `KinematicTree.to_json` writes, is `{"pose_of": NAME, "links": [{"name", "parent", "type", "origin",
+"axis", "value": {reading: gain}, "offset", "limits", "body"}]}`, as `Link` has them; all but a link's name may be left
+out where it is as `Link` says.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from neeco.base.errors import NeecoError
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import distinct_keys, read_text
 from neeco.capture.documents import Node, RaisingReport, printable
-from neeco.capture.kinematics import FIXED, JOINT_TYPES, Array, KinematicTree, Link
+from neeco.capture.kinematics import FIXED, JOINT_TYPES, PRISMATIC, REVOLUTE, Array, KinematicTree, Link
+from neeco.geometry.rotations import rigid
 
 MAX_MM = 1e4  # beyond any instrument
 MAX_GAIN = 1e3
@@ -60,17 +68,16 @@ def _parse_link(node: Node) -> Link | None:
     value = _gains(node.child("value")) if node.has("value") else {}
     offset = node.child("offset").number(above=-MAX_MM, below=MAX_MM) if node.has("offset") else 0.0
     limits = node.child("limits").range("rad or mm") if node.has("limits") else None
-    body = node.child("body")
-    if node.has("body") and not isinstance(body.value, bool):
-        body.error(f"expected true or false, found {printable(body.value)}", "correct it")
-        return None
+    body = node.child("body").flag(True)
     if kind not in (None, FIXED) and not node.has("axis"):
         node.child("axis").error("is missing", "give the joint's axis in the parent's frame, three numbers")
         return None
     wrong = (node.has("parent") and parent is None) or (node.has("limits") and limits is None)
-    if name is None or kind is None or origin is None or axis is None or value is None or offset is None or wrong:
+    if wrong or body is None:
         return None
-    return Link(name, parent, kind, origin, axis, value, offset=offset, limits=limits, body=body.value is not False)
+    if name is None or kind is None or origin is None or axis is None or value is None or offset is None:
+        return None
+    return Link(name, parent, kind, origin, axis, value, offset=offset, limits=limits, body=body)
 
 
 def _origin(node: Node) -> Array | None:
@@ -109,3 +116,223 @@ def _gains(node: Node) -> dict[str, float] | None:
     found = {name: node.child(name).number(above=-MAX_GAIN, below=MAX_GAIN) for name in node.value}
     known = {name: gain for name, gain in found.items() if gain is not None}
     return known if len(known) == len(found) else None
+
+
+DVRK_READINGS = ("wrist_pitch", "wrist_yaw", "jaw")  # what drives the joints beyond the roll
+MM = 1000.0  # per m
+# a string, which stays, or a comment of JSON as the dVRK writes it
+_STRING_OR_COMMENT = re.compile(r'("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/', re.DOTALL)
+DVRK_TOOL = "a tool file of the dVRK: JSON, with comments"
+
+
+def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) -> KinematicTree:
+    """The links beyond the roll of a tool: shaft, wrist, and two jaws on the axis of the yaw (one end effector where
+    the tool has no jaws), joined by readings wrist_pitch, wrist_yaw and jaw in rad. Recorded poses are those of `tip`,
+    the frame of `measured_cp`, which has no body.
+
+    `readings`: how the recording calls any of these. Lengths become mm. The joints' frames are those of Denavit and
+    Hartenberg as modified by Craig. Raises NeecoError for a file of another kind, or a name that is none of the
+    readings.
+    """
+    path, names = Path(path), dict(readings or {})
+    document = Node(_json_with_comments(path), str(path), "", RaisingReport())
+    document.is_object()
+    frames = document.child("DH")
+    if frames.child("convention").value != "modified":
+        found = printable(frames.child("convention").value)
+        frames.child("convention").error(f"is {found}, not 'modified'", "give a tool file of the dVRK")
+    # older files call them outer_wrist_pitch and outer_wrist_yaw
+    joints = {(item.child("name").text() or "").removeprefix("outer_"): item for item in frames.child("joints").items()}
+    # hooks and spatulas have an entry for jaws, too, which no force moves
+    has_jaws = document.has("jaw") and document.child("jaw").child("ftmax").value != 0
+    for joint in DVRK_READINGS[:2]:
+        if joint not in joints:
+            frames.child("joints").error(f"there is no joint {joint}", "only tools with a wrist have a tree")
+    known = DVRK_READINGS if has_jaws else DVRK_READINGS[:2]
+    for given in names:
+        if given not in known:
+            raise NeecoError(f"{path}: readings: {given!r} is no joint of this tool; it has {', '.join(known)}")
+    pitch, yaw, jaw = (names.get(joint, joint) for joint in DVRK_READINGS)
+    wrist, pitch_axis = _frame(joints["wrist_pitch"])
+    pivot, yaw_axis = _frame(joints["wrist_yaw"])
+    low, high = (joints["wrist_pitch"].child(end).number() or 0.0 for end in ("qmin", "qmax"))
+    links = [Link("shaft"), Link("wrist", "shaft", REVOLUTE, wrist, pitch_axis, {pitch: 1.0}, limits=(low, high))]
+    if has_jaws:
+        for side, share in (("left", 0.5), ("right", -0.5)):
+            links.append(Link(f"jaw_{side}", "wrist", REVOLUTE, pivot, yaw_axis, {yaw: 1.0, jaw: share}))
+    else:
+        links.append(Link("end_effector", "wrist", REVOLUTE, pivot, yaw_axis, {yaw: 1.0}))
+    tip = pivot @ _tool_tip(document)
+    return KinematicTree((*links, Link("tip", "wrist", REVOLUTE, tip, yaw_axis, {yaw: 1.0}, body=False)), "tip")
+
+
+def _json_with_comments(path: Path) -> object:
+    text = _STRING_OR_COMMENT.sub(lambda match: match[1] or " ", read_text(path, DVRK_TOOL))
+    try:
+        return json.loads(text, object_pairs_hook=distinct_keys)
+    except (ValueError, RecursionError) as error:
+        raise NeecoError(f"{path}: not readable as {DVRK_TOOL} ({error}); correct it") from None
+
+
+def _frame(joint: Node) -> tuple[Array, Array]:
+    """(parent_from_link [4, 4] mm at a value of 0, the axis [3] in the parent's frame) of a joint in modified
+    Denavit-Hartenberg parameters: Rx(alpha) Tx(A) Rz(theta + offset) Tz(D)."""
+    if joint.child("type").value != REVOLUTE:
+        joint.child("type").error(f"is {printable(joint.child('type').value)}", "wrists turn: write revolute")
+    numbers = [joint.child(key).number() for key in ("alpha", "A", "theta", "offset", "D")]
+    alpha, length, theta, offset, depth = (0.0 if number is None else number for number in numbers)
+    c, s = math.cos(alpha), math.sin(alpha)
+    before = np.array([[1, 0, 0, MM * length], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]], np.float64)
+    c, s = math.cos(theta + offset), math.sin(theta + offset)
+    turned = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, MM * depth], [0, 0, 0, 1]], np.float64)
+    return before @ turned, before[:3, 2].copy()
+
+
+def _tool_tip(document: Node) -> Array:
+    """yaw_from_tip [4, 4] mm."""
+    key = "tooltip_offset" if document.has("tooltip_offset") else "tooltip-offset"
+    if not document.has(key):
+        return np.eye(4)
+    tip = document.child(key).rigid()
+    assert tip is not None
+    tip[:3, 3] *= MM
+    return tip
+
+
+TYPES = {"fixed": FIXED, "revolute": REVOLUTE, "continuous": REVOLUTE, "prismatic": PRISMATIC}
+URDF = "a URDF file: XML (of a .xacro, what `xacro` makes of it)"
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)  # a processed file names its source in one
+_XACRO_PREFIX = re.compile(r"xmlns:([\w.-]+)\s*=\s*[\"'][^\"']*xacro[^\"']*[\"']")  # a processed file keeps it, too
+_SUBSTITUTION = re.compile(r"\$\{|\$\((?:arg|find|eval|env|optenv|dirname|anon)\b")
+
+
+def read_urdf(
+    path: Path | str, root: str | None = None, pose_of: str | None = None, readings: Mapping[str, str] | None = None
+) -> KinematicTree:
+    """The links of a URDF from `root` on (by default its own), joined as it says. Recorded poses are those of the link
+    `pose_of` (by default of `root`).
+
+    Every joint is driven by the reading of its name, or as `readings` calls it; one that mimics another, by
+    the other's. Lengths become mm, and so do the readings of joints that slide. Where any of the links has something
+    visual, those without are frames only. Raises NeecoError for a file of another kind, a joint that neither turns nor
+    slides, or a name that is none of the links or joints.
+    """
+    path, names = Path(path), dict(readings or {})
+    robot = _parse(path)
+    if not robot.links:
+        raise NeecoError(f"{path}: defines no link; give the robot's URDF")
+    children: dict[str, list[Any]] = {}
+    known = {link.name: link for link in robot.links}
+    for joint in robot.joints:
+        children.setdefault(joint.parent, []).append(joint)
+        for name in (joint.parent, joint.child):
+            if name not in known:
+                raise NeecoError(
+                    f"{path}: joint {joint.name!r} joins {name!r}, which is no link; add it, or correct it"
+                )
+    carried = {joint.child for joint in robot.joints}
+    tops = [name for name in known if name not in carried]
+    for what, name in (("root", root), ("pose_of", pose_of)):
+        if name is not None and name not in known:
+            raise NeecoError(f"{path}: {what}: there is no link {name!r}; name one of {', '.join(known)}")
+    if root is None and len(tops) != 1:
+        raise NeecoError(f"{path}: one link has no parent, the root; found {', '.join(tops) or 'none'}; name `root`")
+    first = tops[0] if root is None else root
+    assert first is not None
+    reached = [(first, None), *((joint.child, joint) for joint in _below(first, children, path))]
+    for what, defined in (("link", [link.name for link in robot.links]), ("joint", [j.name for j in robot.joints])):
+        if twice := next((name for name in defined if defined.count(name) > 1), None):
+            raise NeecoError(f"{path}: {what} {twice!r} is defined twice; rename one of them")
+    moving = {joint.name for _, joint in reached if joint is not None and TYPES.get(joint.type) != FIXED}
+    for given in names:
+        if given not in moving:
+            raise NeecoError(f"{path}: readings: {given!r} is no joint that moves; it has {', '.join(sorted(moving))}")
+    visible = {name for name, _ in reached if known[name].visuals}
+    reached_joints = {joint.name: joint for _, joint in reached if joint is not None}
+    links = []
+    for name, joint in reached:
+        body = name in visible or not visible
+        links.append(Link(name, body=body) if joint is None else _link(joint, reached_joints, names, body, path))
+    try:
+        return KinematicTree(tuple(links), pose_of)
+    except NeecoError as error:
+        raise NeecoError(f"{path}: {error}") from None
+
+
+def _parse(path: Path) -> Any:
+    try:
+        from urdf_parser_py import urdf
+        from urdf_parser_py.xml_reflection import core
+    except ImportError:
+        raise NeecoError(f"{path}: needs urdfdom-py to be read; {install_hint('urdf')}") from None
+    text = read_text(path, URDF)
+    _refuse_xacro(path, text)
+    core.on_error = lambda message: None  # of tags that it does not know, which it would print
+    try:
+        return urdf.URDF.from_xml_string(text.encode())
+    # the package raises ParseError, lxml's XMLSyntaxError, AssertionError and others
+    except Exception as error:
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise NeecoError(f"{path}: not readable as {URDF} ({reason}); correct it") from None
+
+
+def _refuse_xacro(path: Path, text: str) -> None:
+    """Raise NeecoError for unprocessed xacro, of which a URDF parser would read what lies outside its macros."""
+    text = _COMMENT.sub("", text)
+    prefixes = "|".join(map(re.escape, {"xacro", *_XACRO_PREFIX.findall(text)}))
+    if _SUBSTITUTION.search(text) or re.search(rf"[<\s/](?:{prefixes}):[\w.-]+[\s=/>]", text):
+        stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
+        target = f"{stem}.urdf" if path.suffix == ".xacro" else f"{stem}_processed.urdf"
+        raise NeecoError(f"{path}: is xacro; run `xacro {path.name} > {target}` and give that")
+
+
+def _below(first: str, children: Mapping[str, list[Any]], path: Path) -> Iterator[Any]:
+    """Joints beyond a link, parents first. Raises NeecoError where they lead in a circle."""
+    waiting, met = [first], {first}
+    while waiting:
+        for joint in children.get(waiting.pop(0), []):
+            if joint.child in met:
+                raise NeecoError(f"{path}: {joint.child!r} is reached twice; every link needs one way to the root")
+            met.add(joint.child)
+            waiting.append(joint.child)
+            yield joint
+
+
+def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body: bool, path: Path) -> Link:
+    if joint.type not in TYPES:
+        raise NeecoError(f"{path}: joint {joint.name!r} is {joint.type}; {', '.join(TYPES)} can be had")
+    kind, origin = TYPES[joint.type], np.eye(4)
+    if joint.origin is not None:
+        turn = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0]).as_matrix()
+        origin = rigid(turn, MM * np.array(joint.origin.xyz or [0, 0, 0], np.float64))
+    if kind == FIXED:
+        return Link(joint.child, joint.parent, FIXED, origin, body=body)
+    axis = np.array(joint.axis or [1.0, 0.0, 0.0], np.float64)  # URDF's own default
+    length = float(np.linalg.norm(axis))
+    if not 1e-6 < length < 1e6:
+        raise NeecoError(f"{path}: joint {joint.name!r}: its axis is no direction; give three numbers, not all 0")
+    axis = origin[:3, :3] @ (axis / length)
+    unit = MM if kind == PRISMATIC else 1.0
+    limit = joint.limit
+    limits = None if limit is None or joint.type == "continuous" else _limits(limit, unit, joint.name, path)
+    driver, gain, offset = joint.name, 1.0, 0.0
+    if joint.mimic is not None:
+        driver = joint.mimic.joint
+        if driver not in joints or joints[driver].mimic is not None:
+            raise NeecoError(
+                f"{path}: joint {joint.name!r} mimics {driver!r}; name a joint beyond the root that is driven"
+            )
+        of_driver = MM if TYPES.get(joints[driver].type) == PRISMATIC else 1.0
+        gain = (1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)) * unit / of_driver
+        offset = unit * float(joint.mimic.offset or 0.0)
+    value = {names.get(driver, driver): gain}
+    return Link(joint.child, joint.parent, kind, origin, axis, value, offset=offset, limits=limits, body=body)
+
+
+def _limits(limit: Any, unit: float, name: str, path: Path) -> tuple[float, float] | None:
+    low, high = unit * float(limit.lower or 0.0), unit * float(limit.upper or 0.0)
+    if low == high == 0.0:  # URDF's own default: none stated
+        return None
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise NeecoError(f"{path}: joint {name!r}: its limits {low:g} to {high:g} are no range; correct them")
+    return low, high

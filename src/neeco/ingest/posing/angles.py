@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from neeco.capture.model import UNKNOWN_DEG
+from neeco.ingest.posing.along_shaft import RollPairs
 from neeco.ingest.posing.measurements import Shapes
-from neeco.ingest.posing.roll_pairs import RollPairs
 
 CORRELATION_S = 0.72  # time scale of a hand's motion
 ROLL_SD = 0.7  # rad, of the roll's changes over longer times

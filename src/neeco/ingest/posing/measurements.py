@@ -20,8 +20,7 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import require_content, require_like, write_atomically
 from neeco.capture.images import open_image
 from neeco.capture.model import Capture
-from neeco.ingest.posing.along_shaft import Load, Shafts, crop
-from neeco.ingest.posing.roll_pairs import RollPairs, roll_pairs, unrolled_textures
+from neeco.ingest.posing.along_shaft import Load, RollPairs, Shafts, crop, roll_pairs, unrolled_textures
 
 FILE = "from_video.safetensors"
 FORMAT = "neeco-from-video/1"

@@ -15,8 +15,7 @@ from neeco.capture.documents import Node, as_float
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import SEPARATE_TISSUES
 from neeco.capture.readers import read_dvrk_tool, read_urdf
-from neeco.capture.readers.dvrk import READINGS as DVRK_READINGS
-from neeco.capture.readers.kinematics import parse_kinematics
+from neeco.capture.readers.kinematics import DVRK_READINGS, parse_kinematics
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers import format_of
 from neeco.ingest.readers.columns import FORMS, TRACKER_CLOCK, VIDEO_CLOCK, JointColumns, PoseColumns, Units
