@@ -17,16 +17,9 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.base.files import LOCK_WAIT_S, own_folder
 from neeco.capture.images import open_image
+from neeco.ingest.posing import posed_capture
 from neeco.ingest.posing.along_shaft import crop
-from neeco.ingest.posing.posed_capture import (
-    N_SUGGESTED,
-    HandPose,
-    PosedCapture,
-    SolvedPosing,
-    half_turn,
-    read_answers,
-    write_answers,
-)
+from neeco.ingest.posing.posed_capture import N_SUGGESTED, PosedCapture, SolvedPosing, half_turn
 from neeco.labels.drawing import draw
 from neeco.training.run import load_run
 
@@ -50,7 +43,7 @@ class PosingSession:
         self.posed = PosedCapture(root if run is None else run.capture().root)
         root = self.posed.root
         self._lock, self._drawing = threading.Lock(), threading.Lock()
-        self._answers = read_answers(root)
+        self._answers = posed_capture.read_answers(root)
         self._posings = self.posed.solve(self._answers)
 
     @property
@@ -61,7 +54,8 @@ class PosingSession:
     def overview(self, instrument: str) -> dict[str, Any]:
         """Requests, answers and estimates of an instrument, as JSON for the page. Raises NeecoError."""
         with self._lock:
-            if (answers := read_answers(self.posed.root)) != self._answers:  # another server's, or an editor's
+            answers = posed_capture.read_answers(self.posed.root)
+            if answers != self._answers:  # another server's, or an editor's
                 self._answers, self._posings = answers, self.posed.solve(answers)
             return self._overview(instrument)
 
@@ -129,8 +123,8 @@ class PosingSession:
                 names = ", ".join(["roll", *posing.joints])
                 raise NeecoError(f"answer: expected {names} in degrees between -360 and 360")
             now = datetime.datetime.now().strftime("%Y-%m-%d %H:%M")
-            answer = HandPose(self.posed.frames[index], instrument, roll_deg, joints_deg, now)
-            self._keep([*read_answers(self.posed.root), answer])
+            answer = posed_capture.HandPose(self.posed.frames[index], instrument, roll_deg, joints_deg, now)
+            self._keep([*posed_capture.read_answers(self.posed.root), answer])
             outliers = [outlier for outlier in self._posings[instrument].outliers() if outlier.frame == index]
             return self._overview(instrument) | {"said": [str(outlier) for outlier in outliers]}
 
@@ -138,7 +132,7 @@ class PosingSession:
         """Take the last answer for an instrument out again; the overview, and under `frame` what it was of. Raises
         NeecoError."""
         with self._lock, self._own_capture():
-            answers = read_answers(self.posed.root)
+            answers = posed_capture.read_answers(self.posed.root)
             own = [position for position, answer in enumerate(answers) if answer.instrument == instrument]
             if not own:
                 return self._overview(instrument) | {"frame": None}
@@ -150,9 +144,9 @@ class PosingSession:
         """The capture for this process alone, from reading its answers to writing them and its states."""
         return own_folder(self.posed.root, wait_s=LOCK_WAIT_S)
 
-    def _keep(self, answers: list[HandPose]) -> None:
+    def _keep(self, answers: list[posed_capture.HandPose]) -> None:
         posings = self.posed.solve(answers)  # raises before anything is written
-        write_answers(self.posed.root, answers)
+        posed_capture.write_answers(self.posed.root, answers)
         self.posed.write_states(posings)
         self._answers, self._posings = answers, posings
 
