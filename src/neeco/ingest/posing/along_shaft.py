@@ -10,6 +10,7 @@ other.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +23,36 @@ from neeco.capture.model import Capture, Instrument
 from neeco.geometry.lines import unit
 from neeco.geometry.projection import project
 
-NEAREST_MM = 1.0  # in front of the camera
+
+@dataclass(frozen=True, kw_only=True)
+class TextureSettings:
+    """Measures of unrolled textures and of their comparison.
+
+    Frames nearer than those of `near_frames` turn by less than a column, and residual shading holds the peak at 0
+    (gains of 0.3 to 0.6 against the truth at 1 to 3 frames, about 1 from 5 on).
+    """
+
+    column_rad: float = math.radians(3.0)  # between columns of the unrolled texture
+    max_azimuth: float = math.radians(63.0)  # either side of the view; beyond, the surface is too oblique
+    row_mm: float = 0.3  # between rows
+    band: tuple[float, float] = (-0.1, 0.4)  # of the working length, from the origin: beyond it jaws move on their own
+    max_columns: int = 20  # by which two textures are shifted against each other: they still overlap by half
+    max_rows: int = 4  # likewise along the shaft, whose end is known to 0.5 mm
+    row_step: int = 2  # between those shifts
+    min_visible: float = 0.9  # share of a texture that must be in the image
+    max_contrast: float = 0.8  # of logarithmic colour: a glint is clipped
+    shading_frames: float = 15.0  # standard deviation of the window over which shading is averaged
+    min_score: float = 0.3  # correlation of a hypothesis
+    max_hypotheses: int = 3  # per pair
+    near_frames: tuple[int, ...] = (5, 6, 8, 10, 12, 15, 20, 30, 60)  # between those that are always compared
+    far_frames: int = 20  # beyond which similar frames are compared: where a view comes back, drift ends
+    far_pairs: int = 8  # of these for every frame
+    block: int = 256  # frames compared with all others at a time
+    nearest_mm: float = 1.0  # in front of the camera
+
+
+SETTINGS = TextureSettings()
+
 Load = Callable[[int], np.ndarray]  # frame's index -> image uint8 [H, W, 3]
 
 
@@ -106,8 +136,8 @@ class Shafts:
         """Pixels [N, ..., 2] (centres at +0.5) of points [N, ..., 3] in the camera's axes of `frames` [N]; far outside
         the image where a point is not in front of the camera."""
         fx, fy, cx, cy = (value.reshape(-1, *[1] * (points.ndim - 2)) for value in self.intrinsics[frames].T)
-        pixels = np.stack(project(points, fx, fy, cx, cy, nearest=NEAREST_MM), -1)
-        return np.where(points[..., 2:] < NEAREST_MM, -1e4, pixels)
+        pixels = np.stack(project(points, fx, fy, cx, cy, nearest=SETTINGS.nearest_mm), -1)
+        return np.where(points[..., 2:] < SETTINGS.nearest_mm, -1e4, pixels)
 
 
 def crop(shafts: Shafts, frame: int, image: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndarray:
@@ -134,24 +164,6 @@ def _sample(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     )
 
 
-COLUMN_RAD = np.radians(3.0)  # between columns of the unrolled texture
-MAX_AZIMUTH = np.radians(63.0)  # azimuths either side of the view; beyond, the surface is too oblique
-ROW_MM = 0.3  # between rows
-BAND = (-0.1, 0.4)  # of the working length, from the origin: beyond it jaws move on their own
-MAX_COLUMNS = 20  # by which two textures are shifted against each other: they still overlap by half
-MAX_ROWS, ROW_STEP = 4, 2  # along the shaft, whose end is known to 0.5 mm
-MIN_VISIBLE = 0.9  # share of a texture that must be in the image
-MAX_CONTRAST = 0.8  # of logarithmic colour: a glint is clipped
-SHADING_FRAMES = 15.0  # standard deviation of the window over which shading is averaged
-MIN_SCORE = 0.3  # correlation of a hypothesis
-MAX_HYPOTHESES = 3  # per pair
-# frames between those that are always compared: nearer ones turn by less than a column, and residual shading holds the
-# peak at 0 (gains of 0.3 to 0.6 against the truth at 1 to 3 frames, about 1 from 5 on)
-NEAR_FRAMES = (5, 6, 8, 10, 12, 15, 20, 30, 60)
-FAR_FRAMES, FAR_PAIRS = 20, 8  # and for every frame the best of those later: where a view comes back, drift ends
-BLOCK = 256  # frames compared with all others at a time
-
-
 @dataclass(frozen=True, eq=False)
 class RollPairs:
     """Frames first, second [P], and hypotheses of the roll from one to the other: `turns` [P, H] rad with correlations
@@ -165,18 +177,20 @@ class RollPairs:
 
 def unrolled_textures(shafts: Shafts, load: Load) -> tuple[np.ndarray, np.ndarray]:
     """Return textures [F, A, B, C] float32 without the view's shading, and which frames [F] show enough of theirs."""
-    along = np.arange(BAND[0] * shafts.working_length_mm, BAND[1] * shafts.working_length_mm, ROW_MM)
-    azimuths = np.arange(-MAX_AZIMUTH, MAX_AZIMUTH + 0.01, COLUMN_RAD)
+    along = np.arange(
+        SETTINGS.band[0] * shafts.working_length_mm, SETTINGS.band[1] * shafts.working_length_mm, SETTINGS.row_mm
+    )
+    azimuths = np.arange(-SETTINGS.max_azimuth, SETTINGS.max_azimuth + 0.01, SETTINGS.column_rad)
     visible = np.empty(len(shafts), bool)
     textures = np.empty((len(shafts), len(along), len(azimuths), 3), np.float32)
     for frame in range(len(shafts)):
         pixels = unroll(shafts, frame, load(frame), along, azimuths)
-        visible[frame] = (pixels.max(-1) > 0).mean() > MIN_VISIBLE
+        visible[frame] = (pixels.max(-1) > 0).mean() > SETTINGS.min_visible
         textures[frame] = np.log(pixels.astype(np.float32) + 10)
     textures -= np.median(textures, axis=(1, 2), keepdims=True)
     if visible.any():
         _take_out_shading(textures, visible)
-    np.clip(textures, -MAX_CONTRAST, MAX_CONTRAST, out=textures)
+    np.clip(textures, -SETTINGS.max_contrast, SETTINGS.max_contrast, out=textures)
     for texture in textures:
         cv2.GaussianBlur(texture, (0, 0), 0.8, dst=texture)
         # light from elsewhere varies slowly across the shaft
@@ -187,7 +201,7 @@ def unrolled_textures(shafts: Shafts, load: Load) -> tuple[np.ndarray, np.ndarra
 def _take_out_shading(textures: np.ndarray, visible: np.ndarray) -> None:
     """Subtract from each texture the mean of those about it in time, in which the instrument has turned."""
     frames = np.arange(len(textures))
-    weights = np.exp(-0.5 * ((frames[:, None] - frames) / SHADING_FRAMES) ** 2) * visible
+    weights = np.exp(-0.5 * ((frames[:, None] - frames) / SETTINGS.shading_frames) ** 2) * visible
     # a frame without neighbours: the mean over the whole video
     weights = weights + 1e-3 * visible
     flat = textures.reshape(len(textures), -1)
@@ -196,16 +210,16 @@ def _take_out_shading(textures: np.ndarray, visible: np.ndarray) -> None:
 
 def _correlations(textures: np.ndarray, rows: slice) -> np.ndarray:
     """Normalised cross-correlation [R, F, 2 M + 1] of some textures with all of [F, A, B, C]; at [i, j, M + q] the
-    second is the first shifted by q columns, and by the number of rows within MAX_ROWS that fits best."""
+    second is the first shifted by q columns, and by the number of rows within `max_rows` that fits best."""
     height, width = textures.shape[1:3]
     own = textures[rows]
-    scores = np.full((len(own), len(textures), 2 * MAX_COLUMNS + 1), -1.0, np.float32)
-    for down in range(-MAX_ROWS, MAX_ROWS + 1, ROW_STEP):
+    scores = np.full((len(own), len(textures), 2 * SETTINGS.max_columns + 1), -1.0, np.float32)
+    for down in range(-SETTINGS.max_rows, SETTINGS.max_rows + 1, SETTINGS.row_step):
         upper, lower = slice(max(-down, 0), height - max(down, 0)), slice(max(down, 0), height - max(-down, 0))
-        for shift in range(-MAX_COLUMNS, MAX_COLUMNS + 1):
+        for shift in range(-SETTINGS.max_columns, SETTINGS.max_columns + 1):
             left, right = slice(max(-shift, 0), width - max(shift, 0)), slice(max(shift, 0), width - max(-shift, 0))
             found = _normalised(own[:, upper, left]) @ _normalised(textures[:, lower, right]).T
-            best = scores[:, :, MAX_COLUMNS + shift]
+            best = scores[:, :, SETTINGS.max_columns + shift]
             np.maximum(best, found, out=best)
     return scores
 
@@ -220,15 +234,18 @@ def roll_pairs(textures: np.ndarray, visible: np.ndarray) -> RollPairs:
     """Compare frames near in time, and every frame with the most similar ones long after it; only those `visible`."""
     blocks = [
         RollPairs(
-            *(np.zeros((0, *shape), kind) for shape, kind in ((((), int),) * 2 + (((MAX_HYPOTHESES,), float),) * 2))
+            *(
+                np.zeros((0, *shape), kind)
+                for shape, kind in ((((), int),) * 2 + (((SETTINGS.max_hypotheses,), float),) * 2)
+            )
         )
     ]
-    for start in range(0, len(textures), BLOCK):
+    for start in range(0, len(textures), SETTINGS.block):
         # pairs are counted once: the second comes later
-        scores = _correlations(textures[start:], slice(0, BLOCK))
+        scores = _correlations(textures[start:], slice(0, SETTINGS.block))
         first, second = _chosen(scores.max(-1), visible[start:])
         turns, found = _peaks(scores[first, second])
-        good = found[:, 0] >= MIN_SCORE
+        good = found[:, 0] >= SETTINGS.min_score
         blocks.append(RollPairs(first[good] + start, second[good] + start, turns[good], found[good]))
     return RollPairs(
         *(np.concatenate([getattr(block, name) for block in blocks]) for name in ("first", "second", "turns", "scores"))
@@ -239,9 +256,9 @@ def _chosen(best: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Choose pairs [R, F] from their highest correlations."""
     apart = np.arange(best.shape[1]) - np.arange(best.shape[0])[:, None]
     both = visible & visible[: len(best), None]
-    far = np.where((apart > FAR_FRAMES) & both, best, -1.0)
-    similar = np.argsort(-far, axis=1, kind="stable")[:, :FAR_PAIRS]
-    chosen = np.isin(apart, NEAR_FRAMES)
+    far = np.where((apart > SETTINGS.far_frames) & both, best, -1.0)
+    similar = np.argsort(-far, axis=1, kind="stable")[:, : SETTINGS.far_pairs]
+    chosen = np.isin(apart, SETTINGS.near_frames)
     np.put_along_axis(chosen, similar, True, axis=1)
     first, second = np.nonzero(chosen & both & (apart > 0))
     return first, second
@@ -249,13 +266,13 @@ def _chosen(best: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def _peaks(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Highest local maxima of correlations [P, 2 M + 1] over the shift, at subcolumn precision: turns rad and scores
-    [P, MAX_HYPOTHESES]."""
+    [P, K] of K hypotheses."""
     before, middle, after = scores[:, :-2], scores[:, 1:-1], scores[:, 2:]
     is_peak = (middle >= before) & (middle > after)
     ranked = np.where(is_peak, middle, 0.0)
-    order = np.argsort(-ranked, axis=1, kind="stable")[:, :MAX_HYPOTHESES]
+    order = np.argsort(-ranked, axis=1, kind="stable")[:, : SETTINGS.max_hypotheses]
     rows = np.arange(len(scores))[:, None]
     a, b, c = before[rows, order], middle[rows, order], after[rows, order]
     fraction = 0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-6)
-    turns = (order + 1 - MAX_COLUMNS + np.clip(fraction, -0.5, 0.5)) * COLUMN_RAD
+    turns = (order + 1 - SETTINGS.max_columns + np.clip(fraction, -0.5, 0.5)) * SETTINGS.column_rad
     return turns, np.maximum(ranked[rows, order], 0.0)

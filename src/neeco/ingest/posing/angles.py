@@ -16,25 +16,40 @@ from neeco.capture.model import UNKNOWN_DEG
 from neeco.ingest.posing.along_shaft import RollPairs
 from neeco.ingest.posing.measurements import Shapes
 
-CORRELATION_S = 0.72  # time scale of a hand's motion
-ROLL_SD = 0.7  # rad, of the roll's changes over longer times
-JOINT_SD = 0.2  # rad, of a joint's, beyond what silhouettes show
-MEAN_SD = 1.4  # rad, of the mean of either
+
+@dataclass(frozen=True, kw_only=True)
+class AngleSettings:
+    """Thresholds and standard deviations by which roll and joints are solved."""
+
+    correlation_s: float = 0.72  # s, time scale of a hand's motion
+    roll_sd: float = 0.7  # rad, of the roll's changes over longer times
+    joint_sd: float = 0.2  # rad, of a joint's, beyond what silhouettes show
+    mean_sd: float = 1.4  # rad, of the mean of either
+    texture_sd_deg: float = 4.0  # of the roll that a texture shows in one frame: from an axis 0.2 mm off
+    pair_sd_deg: float = 3.0  # of a pair of correlation 1
+    uncorrelated_sd_deg: float = 8.0  # added to that towards correlation 0
+    even_score: float = 0.5  # correlation at which a hypothesis is as likely right as wrong
+    score_scale: float = 0.08  # of the correlation about it, over which that changes
+    pair_weight: float = 0.01  # residual shading shifts some hundred pairs of the same two moments by the same angle
+    gain_range: tuple[float, float] = (0.4, 1.2)  # of a turn in textures
+    gain_prior: float = 0.02  # weight of the prior of that gain, which is 1
+    min_gain_answers: int = 3  # hand-posed frames from which that gain is estimated
+    n_rounds: int = 8  # of expectation maximisation
+    first_widening: float = 4.0  # factor on the pairs' deviations in the first round
+    agreeing_deg: float = 6.0  # by which a pair that fits may differ from the rolls
+    min_agreeing: int = 12  # pairs that must span a gap between frames
+    width_sd: float = 0.7  # rad, of a joint by the silhouette's width
+    shape_sd: float = 0.35  # rad, of a joint by the silhouette's whole shape
+    width_noise_deg: float = 3.0  # of an opening by its width, where the hinge's axis points at the camera
+    min_cosine: float = 0.35  # of the roll, by which an opening is divided
+    joint_sd_scale: float = 0.5  # of the posterior: the priors above leave room for any instrument
+    shape_scale: float = 0.8  # of the median distance between two silhouettes
+    jitter: float = 1e-6  # rad^2, so that covariances can be inverted
+
+
+SETTINGS = AngleSettings()
+
 HAND_SD_DEG = 3.5  # of a hand-posed angle
-TEXTURE_SD_DEG = 4.0  # of the roll that a texture shows in one frame: from an axis 0.2 mm off
-PAIR_SD_DEG, UNCORRELATED_SD_DEG = 3.0, 8.0  # of a pair of correlation 1, and added towards correlation 0
-EVEN_SCORE, SCORE_SCALE = 0.5, 0.08  # correlation at which a hypothesis is as likely right as wrong, and its scale
-PAIR_WEIGHT = 0.01  # residual shading shifts some hundred pairs of the same two moments by the same angle
-GAIN_RANGE, GAIN_PRIOR = (0.4, 1.2), 0.02  # of a turn in textures; weight of the prior, which is 1
-MIN_GAIN_ANSWERS = 3  # hand-posed frames from which that gain is estimated
-N_ROUNDS, FIRST_WIDENING = 8, 4.0  # of expectation maximisation; factor on the pairs' deviations at first
-AGREEING_DEG, MIN_AGREEING = 6.0, 12  # a pair that fits; the number of them that must span a gap between frames
-WIDTH_SD, SHAPE_SD = 0.7, 0.35  # rad, of a joint by the silhouette's width and by its whole shape
-WIDTH_NOISE_DEG = 3.0  # standard deviation of an opening by its width, where the hinge's axis points at the camera
-MIN_COSINE = 0.35  # of the roll, by which an opening is divided
-JOINT_SD_SCALE = 0.5  # of the posterior: the priors above leave room for any instrument
-SHAPE_SCALE = 0.8  # of the median distance between two silhouettes
-JITTER = 1e-6  # rad^2, so that covariances can be inverted
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,16 +100,16 @@ def _chained(
     """Solve the rolls of all frames, given those of some [A], which are not taken modulo a turn."""
     angles = angles - view[frames]
     center = angles.mean()
-    covariance = ROLL_SD**2 * _correlation(times, CORRELATION_S) + MEAN_SD**2
-    precision = np.linalg.inv(covariance + JITTER * np.eye(len(times)))
+    covariance = SETTINGS.roll_sd**2 * _correlation(times, SETTINGS.correlation_s) + SETTINGS.mean_sd**2
+    precision = np.linalg.inv(covariance + SETTINGS.jitter * np.eye(len(times)))
     pull = np.zeros(len(times))
     np.add.at(precision, (frames, frames), np.radians(HAND_SD_DEG) ** -2)
     np.add.at(pull, frames, (angles - center) * np.radians(HAND_SD_DEG) ** -2)
     rolls = np.linalg.solve(precision, pull)
-    own = np.eye(len(times)) * np.radians(TEXTURE_SD_DEG) ** -2
+    own = np.eye(len(times)) * np.radians(SETTINGS.texture_sd_deg) ** -2
     shown, known, share = rolls, precision, 1.0
-    for sharpness in np.linspace(0.0, 1.6, N_ROUNDS).clip(max=1.0):
-        widened = FIRST_WIDENING + (1 - FIRST_WIDENING) * sharpness
+    for sharpness in np.linspace(0.0, 1.6, SETTINGS.n_rounds).clip(max=1.0):
+        widened = SETTINGS.first_widening + (1 - SETTINGS.first_widening) * sharpness
         weights, turns = _likely(pairs, shown, view, share, widened)
         between, toward = _differences(pairs, weights, turns, len(times))
         # textures show the roll and an error of each frame, which is solved for, too
@@ -102,7 +117,7 @@ def _chained(
         known = precision + own - own @ inner[:, :-1]
         rolls = np.linalg.solve(known, pull + own @ inner[:, -1])
         shown = inner[:, :-1] @ rolls + inner[:, -1]
-        if len(frames) >= MIN_GAIN_ANSWERS:
+        if len(frames) >= SETTINGS.min_gain_answers:
             share = _share_shown(pairs, rolls + view, weights, turns, view, share)
     return AnglePosterior(rolls + center + view, np.linalg.inv(known))
 
@@ -116,36 +131,36 @@ def solve_joint(
 ) -> AnglePosterior:
     """Solve one joint of all frames, with hand-posed values (frame -> answers, rad), within its limits. Without
     hand-posed frames: by the silhouette's width, over a typical range."""
-    foreshortening = np.maximum(np.abs(np.cos(rolls.values)), MIN_COSINE)
+    foreshortening = np.maximum(np.abs(np.cos(rolls.values)), SETTINGS.min_cosine)
     opening = np.maximum(shapes.widths - np.quantile(shapes.widths, 0.03), 0.0) / foreshortening
     opening /= max(np.quantile(opening, 0.95), 1e-6)
     apart = np.maximum(_squares(shapes.shapes), 0.0)
     covariance = (
-        WIDTH_SD**2 * np.outer(opening, opening)
-        + SHAPE_SD**2 * np.exp(-0.5 * apart / max(SHAPE_SCALE**2 * np.median(apart), 1e-9))
-        + JOINT_SD**2 * _correlation(times, CORRELATION_S * 2 / 3)
-        + np.diag((np.radians(WIDTH_NOISE_DEG) / foreshortening) ** 2)
+        SETTINGS.width_sd**2 * np.outer(opening, opening)
+        + SETTINGS.shape_sd**2 * np.exp(-0.5 * apart / max(SETTINGS.shape_scale**2 * np.median(apart), 1e-9))
+        + SETTINGS.joint_sd**2 * _correlation(times, SETTINGS.correlation_s * 2 / 3)
+        + np.diag((np.radians(SETTINGS.width_noise_deg) / foreshortening) ** 2)
     )
     frames, angles = _answers(posed)
     if not len(frames):
-        return AnglePosterior(_within(opening * WIDTH_SD, limits), JOINT_SD_SCALE**2 * covariance)
+        return AnglePosterior(_within(opening * SETTINGS.width_sd, limits), SETTINGS.joint_sd_scale**2 * covariance)
     center = angles.mean()
     covariance += 0.5
     answered = covariance[np.ix_(frames, frames)] + np.eye(len(frames)) * np.radians(HAND_SD_DEG) ** 2
     gain = np.linalg.solve(answered, covariance[frames]).T
     left = covariance - gain @ covariance[frames]
-    return AnglePosterior(_within(center + gain @ (angles - center), limits), JOINT_SD_SCALE**2 * left)
+    return AnglePosterior(_within(center + gain @ (angles - center), limits), SETTINGS.joint_sd_scale**2 * left)
 
 
 def chain_breaks(pairs: RollPairs, rolls: AnglePosterior) -> list[int]:
     """Frames before which the chain of rolls breaks: too few pairs that agree with the rolls span the gap."""
     found = rolls.values[pairs.second] - rolls.values[pairs.first]
-    agree = np.abs(_wrapped(found[:, None] - pairs.turns)) < np.radians(AGREEING_DEG)
+    agree = np.abs(_wrapped(found[:, None] - pairs.turns)) < np.radians(SETTINGS.agreeing_deg)
     good = (agree & (pairs.scores > 0)).any(1)
     spans = np.zeros(len(rolls.values) + 1)
     np.add.at(spans, pairs.first[good] + 1, 1)
     np.add.at(spans, pairs.second[good] + 1, -1)
-    weak = np.cumsum(spans)[1:-1] < MIN_AGREEING
+    weak = np.cumsum(spans)[1:-1] < SETTINGS.min_agreeing
     # of a stretch of weak gaps the middle one
     edges = np.flatnonzero(np.diff(np.concatenate([[False], weak, [False]]).astype(int)))
     return [int(first + last + 1) // 2 for first, last in edges.reshape(-1, 2)]
@@ -183,8 +198,8 @@ def _share_shown(
     turned = rolls[pairs.second] - rolls[pairs.first]
     measured = (turns + view[pairs.second] - view[pairs.first]) * share
     together = (weights * turned**2).sum()
-    prior = GAIN_PRIOR * together + 1e-12
-    return float(np.clip(((weights * measured * turned).sum() + prior) / (together + prior), *GAIN_RANGE))
+    prior = SETTINGS.gain_prior * together + 1e-12
+    return float(np.clip(((weights * measured * turned).sum() + prior) / (together + prior), *SETTINGS.gain_range))
 
 
 def _likely(
@@ -195,13 +210,13 @@ def _likely(
     apart = (rolls[pairs.second] - rolls[pairs.first])[:, None] - measured
     turns = measured + 2 * np.pi * np.round(apart / (2 * np.pi))
     apart = _wrapped(apart)
-    deviation = np.radians(PAIR_SD_DEG + UNCORRELATED_SD_DEG * (1 - pairs.scores))
-    right = (pairs.scores > 0) / (1 + np.exp(-(pairs.scores - EVEN_SCORE) / SCORE_SCALE))
+    deviation = np.radians(SETTINGS.pair_sd_deg + SETTINGS.uncorrelated_sd_deg * (1 - pairs.scores))
+    right = (pairs.scores > 0) / (1 + np.exp(-(pairs.scores - SETTINGS.even_score) / SETTINGS.score_scale))
     # of several hypotheses one at most is right
     right = right / np.maximum(right.sum(1, keepdims=True), 1e-9) * right.max(1, keepdims=True)
     fits = right * np.exp(-0.5 * (apart / (deviation * widened)) ** 2) / (deviation * widened)
     wrong = (1 - right.sum(1, keepdims=True)) / np.sqrt(2 * np.pi)
-    weights = PAIR_WEIGHT * fits / (fits.sum(1, keepdims=True) + wrong) / deviation**2
+    weights = SETTINGS.pair_weight * fits / (fits.sum(1, keepdims=True) + wrong) / deviation**2
     total = weights.sum(1)
     return total, (weights * turns).sum(1) / np.maximum(total, 1e-12)
 

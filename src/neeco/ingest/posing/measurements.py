@@ -25,15 +25,24 @@ from neeco.ingest.posing.along_shaft import Load, RollPairs, Shafts, crop, roll_
 FILE = "from_video.safetensors"
 FORMAT = "neeco-from-video/1"
 JAWS = "jaw_angle"  # name of a joint that nothing logged
-MIN_OPENING = 0.5  # of the shaft's diameter, by which silhouettes of jaws differ in width
-STEP_MM = 0.5  # between pixels of stabilised silhouettes
-ALONG = (0.3, 1.2)  # of the working length, from the origin: beyond the wrist
-ACROSS = 0.8  # of the working length, to either side
-MAX_DISTANCE_MM = 1.5  # from an outline, at which distances saturate
-WIDTH_RANK = 3  # of the widest cross sections: the first may be a glint on the tissue
-BLUR_MM = 1.0
-MEDIAN_FRAMES = 5  # of outlines: glints on the tissue stay behind when the instrument moves on
-N_COMPONENTS = 24  # principal ones
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasurementSettings:
+    """Measures of silhouettes beyond the wrist."""
+
+    min_opening: float = 0.5  # of the shaft's diameter, by which silhouettes of jaws differ in width
+    step_mm: float = 0.5  # between pixels of stabilised silhouettes
+    along: tuple[float, float] = (0.3, 1.2)  # of the working length, from the origin: beyond the wrist
+    across: float = 0.8  # of the working length, to either side
+    max_distance_mm: float = 1.5  # from an outline, at which distances saturate
+    width_rank: int = 3  # of the widest cross sections: the first may be a glint on the tissue
+    blur_mm: float = 1.0  # standard deviation of the silhouettes' blur
+    median_frames: int = 5  # of outlines: glints on the tissue stay behind when the instrument moves on
+    n_components: int = 24  # principal ones
+
+
+SETTINGS = MeasurementSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,31 +69,35 @@ def silhouette_shapes(shafts: Shafts, load_mask: Load) -> Shapes:
     """Measure silhouettes. load_mask: frame's index -> bool [H, W], where the instrument is, of any size in the image's
     proportions."""
     length = shafts.working_length_mm
-    along = np.arange(ALONG[0] * length, ALONG[1] * length, STEP_MM)
-    across = np.arange(-ACROSS * length, ACROSS * length + STEP_MM / 2, STEP_MM)
+    along = np.arange(SETTINGS.along[0] * length, SETTINGS.along[1] * length, SETTINGS.step_mm)
+    across = np.arange(-SETTINGS.across * length, SETTINGS.across * length + SETTINGS.step_mm / 2, SETTINGS.step_mm)
     signed = np.empty((len(shafts), len(along), len(across)), np.float32)
     for frame in range(len(shafts)):
         inside = crop(shafts, frame, load_mask(frame).astype(np.uint8) * 255, along, across) > 127
-        signed[frame] = np.clip(_distance(inside) - _distance(~inside), -MAX_DISTANCE_MM, MAX_DISTANCE_MM)
-    half = MEDIAN_FRAMES // 2
+        signed[frame] = np.clip(
+            _distance(inside) - _distance(~inside), -SETTINGS.max_distance_mm, SETTINGS.max_distance_mm
+        )
+    half = SETTINGS.median_frames // 2
     padded = np.concatenate([signed[:1]] * half + [signed] + [signed[-1:]] * half)
     widths = np.empty(len(shafts))
     outlines = np.empty((len(shafts), signed[0].size), np.float32)
     for frame in range(len(shafts)):
-        usual = np.median(padded[frame : frame + MEDIAN_FRAMES], 0)
+        usual = np.median(padded[frame : frame + SETTINGS.median_frames], 0)
         inside = usual > 0
         first, last = inside.argmax(1), inside.shape[1] - 1 - inside[:, ::-1].argmax(1)
-        widths[frame] = np.sort(np.where(inside.any(1), (last - first + 1) * STEP_MM, 0.0))[-WIDTH_RANK]
-        outlines[frame] = cv2.GaussianBlur(usual, (0, 0), BLUR_MM / STEP_MM).ravel()
+        widths[frame] = np.sort(np.where(inside.any(1), (last - first + 1) * SETTINGS.step_mm, 0.0))[
+            -SETTINGS.width_rank
+        ]
+        outlines[frame] = cv2.GaussianBlur(usual, (0, 0), SETTINGS.blur_mm / SETTINGS.step_mm).ravel()
     outlines -= outlines.mean(0)
     values, vectors = np.linalg.eigh((outlines @ outlines.T).astype(np.float64))
-    order = np.argsort(-values)[:N_COMPONENTS]
+    order = np.argsort(-values)[: SETTINGS.n_components]
     shapes = vectors[:, order] * np.sqrt(np.maximum(values[order], 0.0))
     return Shapes(widths, shapes / np.sqrt(outlines.shape[1]))
 
 
 def _distance(inside: np.ndarray) -> np.ndarray:
-    return np.asarray(cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 3) * STEP_MM)
+    return np.asarray(cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 3) * SETTINGS.step_mm)
 
 
 def measure(capture: Capture, load_mask: Mapping[str, Load]) -> dict[str, Measurements]:
@@ -104,7 +117,7 @@ def measure(capture: Capture, load_mask: Mapping[str, Load]) -> dict[str, Measur
         masks = load_mask[instrument.name]
         shapes = silhouette_shapes(shafts, masks)
         opened = np.quantile(shapes.widths, 0.95) - np.quantile(shapes.widths, 0.05)
-        jaws = not instrument.joints and opened > MIN_OPENING * shafts.diameter_mm
+        jaws = not instrument.joints and opened > SETTINGS.min_opening * shafts.diameter_mm
         found[instrument.name] = Measurements(roll_pairs(textures, seen), shapes, seen, (JAWS,) if jaws else ())
     return found
 

@@ -38,11 +38,27 @@ HEADER = """\
 """
 OPTIONAL = ("when", "who")
 REMEDY = "mend or remove that line"
-MAX_DEGREES = 720
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosingSettings:
+    """Thresholds of suggested frames and of answers that contradict each other."""
+
+    jaw_limits: tuple[float, float] = (0.0, 2.1)  # rad, of unknown jaws
+    frame_s: float = 0.04  # from frame to frame, where the recording does not say
+    near_break: int = 3  # frames from a break of the chain that count as at it
+    extreme: float = 0.05  # share of the frames in which jaws are called widest or narrowest
+    outlier_deg: float = 12.0  # by which an answer must differ to count as an outlier
+    outlier_sd: float = 3.0  # standard deviations, likewise
+    min_answers: int = 3  # from which on they can contradict each other
+    max_degrees: int = 720  # of an angle in the file of answers
+
+
+SETTINGS = PosingSettings()
 
 
 def _degrees(node: Node) -> float:
-    if type(node.value) not in (int, float) or not abs(node.value) <= MAX_DEGREES:
+    if type(node.value) not in (int, float) or not abs(node.value) <= SETTINGS.max_degrees:
         raise Fault(node.field, f"{printable(node.value)} is no angle in degrees; {REMEDY}")
     return float(node.value)
 
@@ -116,13 +132,7 @@ def _line(answer: HandPose) -> str:
     return str(yaml.dump(value, Dumper=YamlDumper, **style)).strip()
 
 
-JAW_LIMITS = (0.0, 2.1)  # rad, of unknown jaws
 N_SUGGESTED = 10  # frames in all
-FRAME_S = 0.04  # from frame to frame, where the recording does not say
-NEAR_BREAK = 3  # frames
-EXTREME = 0.05  # share of the frames in which jaws are called widest or narrowest
-OUTLIER_DEG, OUTLIER_SD = 12.0, 3.0  # by which an answer must differ to count as one
-MIN_ANSWERS = 3  # from which on they can contradict each other
 
 
 @dataclass(frozen=True)
@@ -188,11 +198,11 @@ class SolvedPosing:
 
     def _reason(self, frame: int, deviations: Sequence[float], breaks: np.ndarray) -> str:
         widths = self.measured.shapes.widths
-        if self.joints and widths[frame] >= np.quantile(widths, 1 - EXTREME):
+        if self.joints and widths[frame] >= np.quantile(widths, 1 - SETTINGS.extreme):
             return "jaws at their widest"
-        if len(breaks) and np.abs(breaks - frame).min() <= NEAR_BREAK:
+        if len(breaks) and np.abs(breaks - frame).min() <= SETTINGS.near_break:
             return "the chain of rolls breaks here"
-        if self.joints and widths[frame] <= np.quantile(widths, EXTREME):
+        if self.joints and widths[frame] <= np.quantile(widths, SETTINGS.extreme):
             return "jaws at their narrowest"
         names = list(self.angles)
         least = int(np.argmax(deviations))
@@ -203,17 +213,20 @@ class SolvedPosing:
         most from the others' prediction, as a wrong one makes others look wrong, too."""
         found = []
         for what, solved in self.angles.items():
-            worst, least = None, OUTLIER_SD
+            worst, least = None, SETTINGS.outlier_sd
             for position, (frame, answer) in enumerate(self.answers):
                 angle = _angle(answer, what)
                 earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
-                if earlier is not None and abs(apart := half_turn(angle - _angle(earlier, what))) > OUTLIER_DEG:
+                if (
+                    earlier is not None
+                    and abs(apart := half_turn(angle - _angle(earlier, what))) > SETTINGS.outlier_deg
+                ):
                     found.append(OutlierAnswer(frame, what, apart, "an earlier answer"))
                 # leaving one answer out of a Gaussian posterior
                 left = max(1 - (float(solved.deviations[frame]) / math.radians(HAND_SD_DEG)) ** 2, 0.02)
                 apart = half_turn(angle - math.degrees(solved.values[frame])) / left
                 far = abs(apart) * math.sqrt(left) / HAND_SD_DEG
-                if len(self.answers) >= MIN_ANSWERS and abs(apart) > OUTLIER_DEG and far > least:
+                if len(self.answers) >= SETTINGS.min_answers and abs(apart) > SETTINGS.outlier_deg and far > least:
                     worst, least = OutlierAnswer(frame, what, half_turn(apart), "what its neighbours say"), far
             found += [] if worst is None else [worst]
         return found
@@ -241,7 +254,7 @@ def prepare(root: Path, load_mask: Mapping[str, Load]) -> None:
     for item in [*document["instruments"], *(item for frame in document["frames"] for item in frame["instruments"])]:
         if item["name"] in measured and (new := measured[item["name"]].joints):
             in_frame = "pose" in item
-            item["joints"] = {joint: 0.0 if in_frame else {"limits": list(JAW_LIMITS)} for joint in new}
+            item["joints"] = {joint: 0.0 if in_frame else {"limits": list(SETTINGS.jaw_limits)} for joint in new}
     write_json(path, document)
     write_measurements(capture, measured)
     posed = PosedCapture(root)
@@ -265,7 +278,7 @@ class PosedCapture:
         self.instruments = {item.name: item for item in found if item.name in self.measured}
         self.frames = [frame.name for frame in self.capture.frames]
         times = np.array([frame.state.time for frame in self.capture.frames], float)
-        self.times = times if self.capture.timed else np.arange(len(times)) * FRAME_S
+        self.times = times if self.capture.timed else np.arange(len(times)) * SETTINGS.frame_s
         self.shafts = {name: Shafts.of(self.capture, item) for name, item in self.instruments.items()}
 
     def solve(self, answers: Sequence[HandPose] | None = None) -> dict[str, SolvedPosing]:

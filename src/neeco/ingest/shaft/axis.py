@@ -16,17 +16,28 @@ from scipy.sparse.linalg import splu
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.lines import places_nearest_to_rays, robust_nearest_point, unit
 
-TURN_ACCELERATION, MOVE_ACCELERATION = 3.0, 300.0  # rad/s^2 and mm/s^2: standard deviations of a hand's accelerations
-PLAY_MM = 2.0  # standard deviation of the distance between axis and fixed trocar; errors of the cameras add to it
-MIN_TROCAR_SCALE_MM = 0.3  # of the robust loss that finds the trocar
-INSET_PX = 0.2  # standard deviation of a common inward shift of all edges
-SCALE_DRIFT = 0.05  # standard deviation of the cameras' scale, by their own drift
-SCALE_PRIOR = 0.5  # prior standard deviation of the logarithm of the cameras' scale
-EDGE_LOSS_SD = 2.0  # scale of the Cauchy loss on edges, standard deviations
-MAX_STEPS, TOLERANCE = 30, 1e-4  # of Levenberg-Marquardt; share of the cost
-DAMPING = 1e-3
-EPSILON = 1e-5  # of numerical derivatives, rad and mm
-MIN_SLOPE = 1e-6  # of these; less is rounding
+
+@dataclass(frozen=True, kw_only=True)
+class AxisSettings:
+    """Standard deviations of what is known of a shaft and its cameras, and how all axes are solved."""
+
+    turn_acceleration: float = 3.0  # rad/s^2, standard deviation of a hand's turns
+    move_acceleration: float = 300.0  # mm/s^2, of its motion
+    play_mm: float = 2.0  # of the distance between axis and fixed trocar; errors of the cameras add to it
+    min_trocar_scale_mm: float = 0.3  # of the robust loss that finds the trocar
+    inset_px: float = 0.2  # of a common inward shift of all edges
+    scale_drift: float = 0.05  # of the cameras' scale, by their own drift
+    scale_prior: float = 0.5  # of the logarithm of the cameras' scale, before anything is measured
+    edge_loss_sd: float = 2.0  # scale of the Cauchy loss on edges, standard deviations
+    max_steps: int = 30  # of Levenberg-Marquardt
+    tolerance: float = 1e-4  # share of the cost by which a step must reduce it
+    damping: float = 1e-3  # at first
+    epsilon: float = 1e-5  # of numerical derivatives, rad and mm
+    min_slope: float = 1e-6  # of these; less is rounding
+
+
+SETTINGS = AxisSettings()
+
 LOCAL = 4  # parameters of an axis: two turns (rad), two shifts across (mm)
 
 Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy, px
@@ -147,10 +158,15 @@ def solve_axes(video: ShaftVideo, start: ShaftAxes, edges: ShaftEdges, *, covari
     axes = start
     if video.trocar and axes.trocar is None:
         points, directions = (item[edges.observed] for item in video.world_lines(axes))
-        axes = replace(axes, trocar=robust_nearest_point(points, directions, MIN_TROCAR_SCALE_MM))
+        axes = replace(axes, trocar=robust_nearest_point(points, directions, SETTINGS.min_trocar_scale_mm))
     problem = _AxesProblem(video, edges)
     axes = levenberg_marquardt(
-        axes, problem.linearise, problem.move, max_steps=MAX_STEPS, damping=DAMPING, tolerance=TOLERANCE
+        axes,
+        problem.linearise,
+        problem.move,
+        max_steps=SETTINGS.max_steps,
+        damping=SETTINGS.damping,
+        tolerance=SETTINGS.tolerance,
     )
     return problem.with_covariance(axes) if covariance else axes
 
@@ -186,11 +202,11 @@ class _AxesProblem:
             change = np.diff(values, axis=0)
             return np.asarray((change[middle] / after - change[middle - 1] / before) / ((before + after) / 2))
 
-        parts += [acceleration(directions) / TURN_ACCELERATION]
-        parts += [_across(acceleration(points), directions[middle]) / MOVE_ACCELERATION]
+        parts += [acceleration(directions) / SETTINGS.turn_acceleration]
+        parts += [_across(acceleration(points), directions[middle]) / SETTINGS.move_acceleration]
         if video.trocar:
-            parts.append(_across(axes.trocar - points, directions) / PLAY_MM)
-        parts.append(np.array([axes.inset / INSET_PX, np.log(axes.scale) / SCALE_PRIOR]))
+            parts.append(_across(axes.trocar - points, directions) / SETTINGS.play_mm)
+        parts.append(np.array([axes.inset / SETTINGS.inset_px, np.log(axes.scale) / SETTINGS.scale_prior]))
         return np.concatenate([part.ravel() for part in parts])
 
     def move(self, axes: ShaftAxes, step: np.ndarray) -> ShaftAxes:
@@ -229,9 +245,9 @@ class _AxesProblem:
         found: list[tuple[np.ndarray, ...]] = []
         for parameters, columns in steps:
             step = np.zeros(LOCAL * count + self.shared)
-            step[parameters] = EPSILON
-            slopes = (self.residuals(self.move(axes, step)) - base) / EPSILON
-            rows = np.flatnonzero(np.abs(slopes) > MIN_SLOPE)
+            step[parameters] = SETTINGS.epsilon
+            slopes = (self.residuals(self.move(axes, step)) - base) / SETTINGS.epsilon
+            rows = np.flatnonzero(np.abs(slopes) > SETTINGS.min_slope)
             found.append((slopes[rows], rows, columns[rows]))
         values, rows, columns = (np.concatenate(part) for part in zip(*found, strict=True))
         return sparse.csr_matrix((values, (rows, columns)), shape=(len(base), LOCAL * count + self.shared))
@@ -242,13 +258,16 @@ class _AxesProblem:
 
     def _cost(self, residuals: np.ndarray) -> float:
         edges, others = np.split(residuals, [self.edges.deviations.size])
-        return float(0.5 * EDGE_LOSS_SD**2 * np.log1p((edges / EDGE_LOSS_SD) ** 2).sum() + 0.5 * (others**2).sum())
+        return float(
+            0.5 * SETTINGS.edge_loss_sd**2 * np.log1p((edges / SETTINGS.edge_loss_sd) ** 2).sum()
+            + 0.5 * (others**2).sum()
+        )
 
     def linearise(self, axes: ShaftAxes) -> Linearisation[ShaftAxes]:
         """Normal equations under the robust weights of the edges."""
         base = self.residuals(axes)
         slopes = self.jacobian(axes, base)
-        weights = 1 / (1 + (base / EDGE_LOSS_SD) ** 2)
+        weights = 1 / (1 + (base / SETTINGS.edge_loss_sd) ** 2)
         weights[self.edges.deviations.size :] = 1.0
         weighted = sparse.diags(weights) @ slopes
         return Linearisation(slopes.T @ weighted, weighted.T @ base, self._cost(base), self.cost)
@@ -263,7 +282,7 @@ class _AxesProblem:
             blocks.append(solver.solve(np.eye(size, LOCAL, -part.start))[part])
         scale_sd = None
         if not self.video.scaled:
-            scale_sd = float(np.hypot(np.sqrt(solver.solve(np.eye(size)[-1])[-1]), SCALE_DRIFT))
+            scale_sd = float(np.hypot(np.sqrt(solver.solve(np.eye(size)[-1])[-1]), SETTINGS.scale_drift))
         return replace(axes, covariance=np.stack(blocks), scale_sd=scale_sd)
 
 
