@@ -23,12 +23,11 @@ from neeco.capture.images import write_image
 from neeco.capture.kinematics import KinematicTree, Link
 from neeco.capture.model import Frame, State
 from neeco.geometry.camera import Camera
-from neeco.ingest.assessment import MAX_SHOWN, assess_ingest
 from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.frames.images import DropReason
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
-from neeco.ingest.result import IngestResult
+from neeco.ingest.result import MAX_SHOWN, IngestResult, assess_ingest
 from neeco.ingest.timing.clock_search import ClockOffset
 from neeco.ingest.timing.episodes import Contradiction
 from neeco.report import ingest_page

@@ -15,7 +15,7 @@ from scipy.spatial import QhullError
 from neeco.capture.model import REFERENCE_PIXELS
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project, project_world
-from neeco.ingest.frames.views import SfmResult
+from neeco.ingest.frames.images import SfmResult
 
 STEP_PX = 4  # between the places where flow is compared
 INTERVAL_S = 0.12  # between frames that are compared: one and two intervals before and after

@@ -16,7 +16,7 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project, project_world
 from neeco.ingest.foreground.residual_flow import STEP_PX
-from neeco.ingest.frames.views import SfmResult
+from neeco.ingest.frames.images import SfmResult
 
 N_CELLS = 48  # of the carving grid, per side
 REACH = 0.4  # of the distance to the camera: half a side of that grid

@@ -9,7 +9,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import FromVideo, Instrument, Uncertainty
-from neeco.ingest.frames.views import SfmResult, Views, reduced
+from neeco.ingest.frames.images import SfmResult, Views, reduced
 from neeco.ingest.recording.model import InstrumentLogs, Recording
 from neeco.ingest.shaft.axis import ShaftVideo
 from neeco.ingest.shaft.from_video import MIN_SHARE, FoundShaft, find_shaft
