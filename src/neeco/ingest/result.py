@@ -136,15 +136,26 @@ class IngestResult:
         return shown + [f"note: {note}" for note in self.notes]
 
 
-# Limits above which there is a warning: conventions, not measurements.
-POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5
-BASE_MM, BASE_DEG = 2.0, 1.5  # standard deviations of a base
-SEVERE = 3.0  # times the limit
-MIN_POINTS = 100
-# Of a base's outline with what moves: right bases reach 0.92 to 0.97 (measured once)
-MIN_OVERLAP, MIN_PLAUSIBLE_OVERLAP = 0.85, 0.7
-MAX_SHOWN = 5  # warnings listed by `lines`
-N_FACTS = 2
+@dataclass(frozen=True, kw_only=True)
+class VerdictSettings:
+    """Limits above which there is a warning: conventions, not measurements."""
+
+    position_mm: float = 1.0  # rms
+    rotation_deg: float = 0.5  # rms
+    reprojection_px: float = 1.0
+    scale: float = 0.015  # standard deviation, share
+    clock_mm: float = 0.5  # that an instrument moves within the standard deviation of its clock
+    base_mm: float = 2.0  # standard deviation of a base
+    base_deg: float = 1.5  # the same
+    severe: float = 3.0  # times the limit
+    min_points: int = 100  # of the tissue
+    min_overlap: float = 0.85  # of a base's outline with what moves: right bases reach 0.92 to 0.97 (measured once)
+    min_plausible_overlap: float = 0.7
+    max_shown: int = 5  # warnings listed by `lines`
+    facts: int = 2  # of an assessment
+
+
+LIMITS = VerdictSettings()
 VERDICTS = {"good": "good", "careful": "usable", "bad": "doubtful"}
 ADVICE = {"good": "good", "careful": "usable", "bad": "do not train"}
 
@@ -171,13 +182,14 @@ class Assessment:
         return [warning for warning in self.warnings if not self.headline.endswith(_lower(warning))]
 
     def lines(self) -> list[str]:
-        """Return the verdict for a terminal: headline (in capitals if doubtful) and the first MAX_SHOWN warnings."""
+        """Return the verdict for a terminal: headline (in capitals if doubtful) and the first `max_shown` warnings."""
         verdict, _, rest = self.headline.partition(":")
         others = self.others
         words = {"good": f"good. {self.headline}", "careful": self.headline, "bad": f"{verdict.upper()}:{rest}"}
         shown = [words[self.level]]
-        shown += [f"  - {warning}" for warning in others[:MAX_SHOWN]]
-        return shown + ([f"  - and {len(others) - MAX_SHOWN} more warnings"] if len(others) > MAX_SHOWN else [])
+        shown += [f"  - {warning}" for warning in others[: LIMITS.max_shown]]
+        left = len(others) - LIMITS.max_shown
+        return shown + ([f"  - and {left} more warnings"] if left > 0 else [])
 
     def as_json(self) -> dict[str, Any]:
         """Return the verdict for scripts (`--json`)."""
@@ -211,7 +223,7 @@ class _Evidence:
     @classmethod
     def measured(cls, fact: str, value: float, limit: float, warning: str) -> _Evidence:
         """A measured value that should stay below a limit."""
-        return cls(fact, 0 if value <= limit else 1 if value <= SEVERE * limit else 2, warning)
+        return cls(fact, 0 if value <= limit else 1 if value <= LIMITS.severe * limit else 2, warning)
 
 
 def rms(values: np.ndarray) -> float:
@@ -230,7 +242,7 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
     if unusable > 0.5 * result.video_frames:
         words = f"{unusable} of {result.video_frames} video frames were dropped as unusable."
         evidence.append(_Evidence.of(words, severe=False))
-    if result.points < MIN_POINTS:
+    if result.points < LIMITS.min_points:
         evidence.append(_Evidence.of(f"Only {result.points} tissue points were found.", severe=False))
     evidence += [
         _Evidence.of(f"Clock {name} was neither given nor found: {clock.source}.", severe=False)
@@ -255,7 +267,7 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
 def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -> Assessment:
     """Return the assessment that all evidence gives, the worst first."""
     ordered = sorted(evidence, key=lambda item: -item.level)
-    facts = tuple(item.fact for item in ordered[:N_FACTS])
+    facts = tuple(item.fact for item in ordered[: LIMITS.facts])
     warnings = tuple(item.reason for item in ordered if item.level)
     worst = ordered[0].level if ordered else 0
     if worst == 2:
@@ -284,33 +296,33 @@ def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
     registration = result.registration
     if registration is not None:
         position = rms(registration.position_residual)
-        says = f"cameras and laparoscope tracker agree to {position:.2f} mm rms (usual: {POSITION_MM:g} or less)"
+        says = f"cameras and laparoscope tracker agree to {position:.2f} mm rms (usual: {LIMITS.position_mm:g} or less)"
         warning = f"Cameras and laparoscope tracker disagree by {position:.2f} mm rms."
-        found.append(_Evidence.measured(says, position, POSITION_MM, warning))
+        found.append(_Evidence.measured(says, position, LIMITS.position_mm, warning))
     if (pixels := result.reprojection_px) is not None:
-        says = f"tissue points are reprojected to {pixels:.2f} px (usual: {REPROJECTION_PX:g} or less)"
+        says = f"tissue points are reprojected to {pixels:.2f} px (usual: {LIMITS.reprojection_px:g} or less)"
         warning = f"Tissue points are off by {pixels:.2f} px on average in the images they were found in."
-        found.append(_Evidence.measured(says, pixels, REPROJECTION_PX, warning))
+        found.append(_Evidence.measured(says, pixels, LIMITS.reprojection_px, warning))
     if registration is not None:
         rotation = float(np.degrees(rms(registration.rotation_residual)))
-        says = f"cameras and laparoscope tracker agree to {rotation:.2f}° rms (usual: {ROTATION_DEG:g} or less)"
+        says = f"cameras and laparoscope tracker agree to {rotation:.2f}° rms (usual: {LIMITS.rotation_deg:g} or less)"
         warning = f"Cameras and laparoscope tracker disagree by {rotation:.2f}° rms."
-        found.append(_Evidence.measured(says, rotation, ROTATION_DEG, warning))
-        says = f"lengths are known to {registration.scale_sd:.1%} (usual: {SCALE:.1%} or less)"
+        found.append(_Evidence.measured(says, rotation, LIMITS.rotation_deg, warning))
+        says = f"lengths are known to {registration.scale_sd:.1%} (usual: {LIMITS.scale:.1%} or less)"
         warning = f"Lengths are known to {registration.scale_sd:.1%} only: the scope travelled too little."
-        found.append(_Evidence.measured(says, registration.scale_sd, SCALE, warning))
+        found.append(_Evidence.measured(says, registration.scale_sd, LIMITS.scale, warning))
         found += _placed(registration, capture, result.bases)
     for name, clock in result.clocks.items():
         moved = clock_cost_mm(name, clock.sd, capture)
         if moved is not None:
             known = f"Clock {name} is known to ±{clock.sd * 1000:.0f} ms, up to {moved:.1f} mm of instrument motion."
-            fact = f"{_lower(known).rstrip('.')} (usual: {CLOCK_MM:g} or less)"
-            found.append(_Evidence.measured(fact, moved, CLOCK_MM, known))
+            fact = f"{_lower(known).rstrip('.')} (usual: {LIMITS.clock_mm:g} or less)"
+            found.append(_Evidence.measured(fact, moved, LIMITS.clock_mm, known))
     train = len(capture.split("train"))
     fact = f"{train} frames to train on (usual: {FEW_TRAIN_FRAMES} or more)"
     few = train < FEW_TRAIN_FRAMES
     found.append(_Evidence(fact, 2 if few else 0, f"Only {train} frames are left to train on."))
-    found.append(_Evidence(f"{result.points:,} tissue points (usual: {MIN_POINTS} or more)", 0))
+    found.append(_Evidence(f"{result.points:,} tissue points (usual: {LIMITS.min_points} or more)", 0))
     return found
 
 
@@ -343,11 +355,11 @@ def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Eviden
     """
     found = []
     if np.isfinite(overlap := base.overlap):
-        level = 0 if overlap >= MIN_OVERLAP else 1 if overlap >= MIN_PLAUSIBLE_OVERLAP else 2
+        level = 0 if overlap >= LIMITS.min_overlap else 1 if overlap >= LIMITS.min_plausible_overlap else 2
         says = f"the outline of {name} and what moves overlap by {overlap:.2f}"
         warning = f"{says[0].upper()}{says[1:]} only: is its clock right?"
-        found.append(_Evidence(f"{says} (usual: {MIN_OVERLAP:g} or more)", level, warning))
-    limit_mm, limit_deg = (PLACED_MM, PLACED_DEG) if base.tracked else (BASE_MM, BASE_DEG)
+        found.append(_Evidence(f"{says} (usual: {LIMITS.min_overlap:g} or more)", level, warning))
+    limit_mm, limit_deg = (PLACED_MM, PLACED_DEG) if base.tracked else (LIMITS.base_mm, LIMITS.base_deg)
     what = f"the {'place' if base.tracked else 'base'} of {name}"
     known = [(what, "mm", limit_mm, base.sd_mm), (what, "deg", limit_deg, base.sd_deg)]
     if base.shaft is not None and linked:

@@ -79,14 +79,22 @@ def reduced(image: np.ndarray) -> np.ndarray:
     return image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-N_NEIGHBOURS = 7  # frames on each side, whose sharpness a frame is compared with
-NOISE = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
-NOISE_PLACE = 0.06  # the same at one place of a thumbnail
-NOISE_MM, NOISE_RAD = 0.3, 0.005  # and of the state, within the tracker's noise
-MAX_RANGES = 3  # of frames, named in a note
-THUMBNAIL_PX = 64  # px, width
-MIN_REPEATED = 5  # frames with the picture before them that are worth a note where no state contradicts it
-ASPECT_TOLERANCE = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
+@dataclass(frozen=True, kw_only=True)
+class ChoiceSettings:
+    """Thresholds of the choice of frames."""
+
+    neighbours: int = 7  # frames on each side, whose sharpness a frame is compared with
+    noise: float = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
+    noise_at_a_place: float = 0.06  # the same at one place of a thumbnail
+    noise_mm: float = 0.3  # of the state, within the tracker's noise
+    noise_rad: float = 0.005  # the same, of rotation
+    max_ranges: int = 3  # of frames, named in a note
+    thumbnail_px: int = 64  # width
+    min_repeated: int = 5  # repeated pictures that are worth a note where no state contradicts them
+    aspect_tolerance: float = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
+
+
+SETTINGS = ChoiceSettings()
 
 
 @dataclass(frozen=True)
@@ -117,7 +125,7 @@ def frame_features(images: Iterable[np.ndarray]) -> FrameFeatures:
         repeats.append(before is not None and is_repeated(before, levels))
         before, half = levels, levels.astype(np.float32) / 255
         sharpness.append(float(cv2.Laplacian(half, cv2.CV_32F).var()))
-        size = (THUMBNAIL_PX, max(1, round(THUMBNAIL_PX * image.shape[0] / image.shape[1])))
+        size = (SETTINGS.thumbnail_px, max(1, round(SETTINGS.thumbnail_px * image.shape[0] / image.shape[1])))
         thumbnails.append(cv2.resize(half, size, interpolation=cv2.INTER_AREA))
     return FrameFeatures(np.array(sharpness), np.array(thumbnails), np.array(repeats))
 
@@ -131,10 +139,10 @@ def frozen_frames(features: FrameFeatures, usable: np.ndarray, states: np.ndarra
 
 
 def describe_ranges(frames: np.ndarray) -> str:
-    """Return increasing frame numbers as `61-89, 104`, the first MAX_RANGES ranges."""
+    """Return increasing frame numbers as `61-89, 104`, the first `max_ranges` ranges."""
     parts = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
-    words = [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts[:MAX_RANGES]]
-    return ", ".join(words) + (", ..." if len(parts) > MAX_RANGES else "")
+    words = [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts[: SETTINGS.max_ranges]]
+    return ", ".join(words) + (", ..." if len(parts) > SETTINGS.max_ranges else "")
 
 
 def choose_frames(
@@ -150,7 +158,7 @@ def choose_frames(
     frozen = DropReason("frozen: the state changed, not the picture")
     dropped |= dict.fromkeys(frozen_frames(features, usable, states).tolist(), frozen)
     for i in np.flatnonzero(usable).tolist():
-        around = features.sharpness[max(0, i - N_NEIGHBOURS) : i + N_NEIGHBOURS + 1]
+        around = features.sharpness[max(0, i - SETTINGS.neighbours) : i + SETTINGS.neighbours + 1]
         if features.sharpness[i] < min_sharpness * np.median(around):
             share = features.sharpness[i] / np.median(around)
             dropped[i] = DropReason(f"blurred: {share:.0%} of its neighbours' sharpness")
@@ -174,9 +182,10 @@ def choose_frames(
 def _same(features: FrameFeatures, states: np.ndarray, a: int, b: int) -> bool:
     moved, turned = np.linalg.norm(states[a, :3] - states[b, :3]), np.linalg.norm(states[a, 3:] - states[b, 3:])
     changes = np.abs(features.thumbnails[a] - features.thumbnails[b])
-    if not states.any() and changes.max() > NOISE_PLACE:  # no state is known yet, and something small moved
+    # no state is known yet, and something small moved
+    if not states.any() and changes.max() > SETTINGS.noise_at_a_place:
         return False
-    return bool(changes.mean() < NOISE and moved < NOISE_MM and turned < NOISE_RAD)
+    return bool(changes.mean() < SETTINGS.noise and moved < SETTINGS.noise_mm and turned < SETTINGS.noise_rad)
 
 
 def _embedding(features: FrameFeatures, states: np.ndarray) -> np.ndarray:
@@ -330,7 +339,7 @@ def _check_pixels(video: VideoSource, lens: Lens | None, where: str, data: Episo
         )
     if lens is not None and video.pixel_aspect != 1:
         found, expected = lens.fl_x / lens.fl_y, 1 / video.pixel_aspect
-        if abs(found / expected - 1) > ASPECT_TOLERANCE:
+        if abs(found / expected - 1) > SETTINGS.aspect_tolerance:
             data.notes.add(
                 f"{where}: fl_x / fl_y is {found:.3g}, the shape of {video.path.name}'s pixels says {expected:.3g}"
             )
@@ -350,7 +359,7 @@ def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[i
     states, usable = data.coverage_states()
     known = states.any()  # else the clocks are found later, by frames that are not frozen
     frozen = frozen_frames(features, usable, states) if known else np.flatnonzero(features.repeats)
-    if len(frozen) >= (1 if known else MIN_REPEATED):
+    if len(frozen) >= (1 if known else SETTINGS.min_repeated):
         why = (
             "while the state changes; frozen, and left out" if known else "and are left out; is the video frozen there?"
         )
