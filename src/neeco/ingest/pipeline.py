@@ -136,7 +136,10 @@ def _result(
 ) -> IngestResult:
     """Return the report on a capture of the `chosen` rows of the views, split by `rule`."""
     data, images, views, registration = world.data, world.images, world.views, world.registration
-    item = data.video_instrument
+    item, unregistered = data.video_instrument, {}
+    if registration is not None:
+        sensors = np.linalg.inv(data.scope_poses(views.times[chosen]))
+        unregistered = {name: sensors @ poses[chosen] for name, (poses, _) in world.states.items()}
     return IngestResult(
         capture=output,
         recording=", ".join(dict.fromkeys(str(part.recording.path) for part in data.parts)),
@@ -156,7 +159,7 @@ def _result(
         split_rule=rule,
         notes=data.notes.sentences,
         search=world.search,
-        unregistered=_unregistered(world, chosen) if registration is not None else {},
+        unregistered=unregistered,
         moving=dict(world.moving),
         registered=capture.registered,
         bases=dict(world.bases),
@@ -178,12 +181,6 @@ def _left_out(world: World, splits: np.ndarray) -> dict[int, DropReason]:
         reasons[int(views.frames[row])] = DropReason(why)
     left_out = views.frames[world.usable & (splits == LEFT_OUT)].tolist()
     return reasons | dict.fromkeys(left_out, DropReason("next to an unseen frame", frame_usable=True))
-
-
-def _unregistered(world: World, chosen: np.ndarray) -> dict[str, np.ndarray]:
-    """`IngestResult.unregistered`, of the `chosen` of the views."""
-    sensors = world.data.scope_poses(world.views.times[chosen])
-    return {name: np.linalg.inv(sensors) @ poses[chosen] for name, (poses, _) in world.states.items()}
 
 
 def _state(states: States, row: int, time: float, uncertainty: Uncertainty | None) -> State:

@@ -41,7 +41,12 @@ def read_episodes(recordings: Sequence[Recording]) -> Episodes:
         parts.append(part)
     _check_episodes(parts)
     _check_split_names(recordings[0], names)
-    return Episodes(tuple(parts), parts[0].video if len(parts) == 1 else _joined_video(parts), notes)
+    video = parts[0].video
+    if len(parts) > 1:
+        videos, first = tuple(part.video for part in parts), tuple(part.first_frame for part in parts)
+        times = np.concatenate([part.times + part.start_s for part in parts])
+        video = _JoinedVideo(video.path, video.size, (), times, videos, (*first, len(times)))
+    return Episodes(tuple(parts), video, notes)
 
 
 def _check_episodes(parts: Sequence[Episode]) -> None:
@@ -227,9 +232,3 @@ class _JoinedVideo(VideoSource):
             if len(own):
                 for index, image in video.read(own.tolist()):
                     yield index + before, image
-
-
-def _joined_video(parts: Sequence[Episode]) -> VideoSource:
-    videos, first = tuple(part.video for part in parts), tuple(part.first_frame for part in parts)
-    times = np.concatenate([part.times + part.start_s for part in parts])
-    return _JoinedVideo(videos[0].path, videos[0].size, (), times, videos, (*first, len(times)))
