@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.geometry.lens import Lens
-from neeco.ingest.frames.views import Views
+from neeco.ingest.frames.images import Views
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.model import InstrumentLogs, Recording, VideoFile

@@ -12,9 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.sfm import StructureFromMotion
-from neeco.ingest.cameras.sfm_strategies import Attempt, strategies
-from neeco.ingest.frames.views import SfmResult, StageProgress
+from neeco.ingest.cameras.sfm import Attempt, StructureFromMotion, strategies
+from neeco.ingest.frames.images import SfmResult, StageProgress
 
 POSE_HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 RECORDING = """\

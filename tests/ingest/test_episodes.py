@@ -13,13 +13,12 @@ from neeco.base.errors import NeecoError
 from neeco.capture import Capture, read_capture
 from neeco.capture.checks import inspect_capture
 from neeco.cli.ingest import Ingest, run
-from neeco.ingest.pipeline import ingest
+from neeco.ingest.pipeline import assign_splits, ingest
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.recording.compatibility import episode_names, separate
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.sources import sources_of
-from neeco.ingest.splits import assign_splits
 from neeco.ingest.timing.episodes import PAUSE_S
 from neeco.ingest.timing.reading import read_episodes
 

@@ -17,11 +17,11 @@ from neeco.capture.checks import check_capture
 from neeco.capture.images import write_image
 from neeco.capture.model import State
 from neeco.geometry.lines import unit
-from neeco.ingest.assessment import assess_ingest
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.posing.posed_capture import HandPose, PosedCapture
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.request import IngestRequest
+from neeco.ingest.result import assess_ingest
 from neeco.ingest.shaft.axis import axis_between, contour_normals, image_lines
 from neeco.ingest.shaft.from_video import find_shaft
 from neeco.ingest.sources import sources_of

@@ -9,7 +9,7 @@ import pytest
 from neeco.geometry.lens import Lens
 from neeco.ingest.foreground.residual_flow import FLOW, ResidualFlow
 from neeco.ingest.foreground.rough_shape import best_lag, carve_shape, lag_of, observations_on, project_mask
-from neeco.ingest.frames.views import SfmResult
+from neeco.ingest.frames.images import SfmResult
 
 PINHOLE = Lens(60.0, 60.0, 32.0, 24.0, (), (64, 48))
 ROWS = np.arange(14)

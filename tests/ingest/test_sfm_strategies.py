@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.cameras import sfm
-from neeco.ingest.cameras.sfm import StructureFromMotion
-from neeco.ingest.cameras.sfm_strategies import Attempt, best_attempt, judge, motion_fault, strategies
+from neeco.ingest.cameras.sfm import Attempt, StructureFromMotion, best_attempt, judge, motion_fault, strategies
 from neeco.ingest.recording.model import IngestSettings
 
 SIZE = (1280, 720)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.ingest.pipeline import LEFT_OUT, UNSEEN_MARGIN, assign_splits
 from neeco.ingest.recording.model import Splits
-from neeco.ingest.splits import LEFT_OUT, UNSEEN_MARGIN, assign_splits
 
 FRAMES = np.arange(200)
 OPENING = np.concatenate([np.linspace(0, 0.8, 150), np.linspace(0.8, 1.4, 50)])

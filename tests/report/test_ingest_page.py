@@ -23,12 +23,11 @@ from neeco.capture.images import write_image
 from neeco.capture.kinematics import KinematicTree, Link
 from neeco.capture.model import Frame, State
 from neeco.geometry.camera import Camera
-from neeco.ingest.assessment import MAX_SHOWN, assess_ingest
 from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.frames.images import DropReason
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.hand_eye import Registration
-from neeco.ingest.result import IngestResult
+from neeco.ingest.result import LIMITS, IngestResult, assess_ingest
 from neeco.ingest.timing.clock_search import ClockOffset
 from neeco.ingest.timing.episodes import Contradiction
 from neeco.report import ingest_page
@@ -306,13 +305,16 @@ def test_sentences_begin_with_a_capital_unless_with_a_files_name():
 
 
 def test_the_terminal_gets_a_doubtful_verdict_in_capitals_and_the_first_doubts():
-    found = tuple(Contradiction(f"reason {number}", True) for number in range(MAX_SHOWN + 3))
+    found = tuple(Contradiction(f"reason {number}", True) for number in range(LIMITS.max_shown + 3))
     verdict = assess_ingest(made(SAMPLE, contradictions=found), read_capture(SAMPLE))
     first, *others = verdict.lines()
     assert first == "DOUBTFUL: reason 0."
-    assert others == [*(f"  - Reason {number}." for number in range(1, MAX_SHOWN + 1)), "  - and 2 more warnings"]
+    assert others == [
+        *(f"  - Reason {number}." for number in range(1, LIMITS.max_shown + 1)),
+        "  - and 2 more warnings",
+    ]
     assert verdict.as_json()["verdict"] == "doubtful"
-    assert len(verdict.as_json()["doubts"]) == MAX_SHOWN + 3
+    assert len(verdict.as_json()["doubts"]) == LIMITS.max_shown + 3
 
 
 def bare(document):

@@ -6,10 +6,10 @@
     split           World       -> splits         which frames train, which test
     write           all         -> Capture        and the IngestResult, which reports how good it is
 
-The world of a scope that moves (`moving_scope.py`): find cameras by structure from motion, register them to the scope's
+The world of a scope that moves (`world.py`): find cameras by structure from motion, register them to the scope's
 tracker, find the instruments, adjust the cameras without these, register again. The world of a scope that stands still
-(`still_scope.py`) is its own frame: find bases, instruments, and the tissue behind them. What a stage learns about
-clocks, bases and instruments is in the `Episodes` that it returns; what it has to report, in `Episodes.notes`.
+is its own frame: find bases, instruments, and the tissue behind them. What a stage learns about clocks, bases and
+instruments is in the `Episodes` that it returns; what it has to report, in `Episodes.notes`.
 """
 
 from __future__ import annotations
@@ -20,25 +20,23 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.capture.model import BaseUncertainty, Capture, Frame, InstrumentState, State, Uncertainty
 from neeco.capture.writer import write_capture
 from neeco.ingest.cameras.still_scene import RightCamera
-from neeco.ingest.frames.images import DropReason, choose_images
-from neeco.ingest.frames.views import StageProgress
-from neeco.ingest.moving_scope import find_moving_world
+from neeco.ingest.frames.images import DropReason, StageProgress, choose_images
 from neeco.ingest.posing.posed_capture import prepare
 from neeco.ingest.recording.compatibility import separate
-from neeco.ingest.recording.model import Recording
+from neeco.ingest.recording.model import Recording, Splits
 from neeco.ingest.registration.clocks import note_frame_rates
 from neeco.ingest.result import IngestResult
 from neeco.ingest.shaft.from_video import NOT_VISIBLE, instruments_of, uncertainties
-from neeco.ingest.splits import LEFT_OUT, split_frames
 from neeco.ingest.staging import staged
-from neeco.ingest.still_scope import find_still_world, is_still
 from neeco.ingest.timing.episodes import Episodes, States
 from neeco.ingest.timing.reading import read_episodes
-from neeco.ingest.world import World
+from neeco.ingest.world import World, find_moving_world, find_still_world, is_still
 
 
 def ingest(
@@ -138,7 +136,10 @@ def _result(
 ) -> IngestResult:
     """Return the report on a capture of the `chosen` rows of the views, split by `rule`."""
     data, images, views, registration = world.data, world.images, world.views, world.registration
-    item = data.video_instrument
+    item, unregistered = data.video_instrument, {}
+    if registration is not None:
+        sensors = np.linalg.inv(data.scope_poses(views.times[chosen]))
+        unregistered = {name: sensors @ poses[chosen] for name, (poses, _) in world.states.items()}
     return IngestResult(
         capture=output,
         recording=", ".join(dict.fromkeys(str(part.recording.path) for part in data.parts)),
@@ -158,7 +159,7 @@ def _result(
         split_rule=rule,
         notes=data.notes.sentences,
         search=world.search,
-        unregistered=_unregistered(world, chosen) if registration is not None else {},
+        unregistered=unregistered,
         moving=dict(world.moving),
         registered=capture.registered,
         bases=dict(world.bases),
@@ -182,12 +183,6 @@ def _left_out(world: World, splits: np.ndarray) -> dict[int, DropReason]:
     return reasons | dict.fromkeys(left_out, DropReason("next to an unseen frame", frame_usable=True))
 
 
-def _unregistered(world: World, chosen: np.ndarray) -> dict[str, np.ndarray]:
-    """`IngestResult.unregistered`, of the `chosen` of the views."""
-    sensors = world.data.scope_poses(world.views.times[chosen])
-    return {name: np.linalg.inv(sensors) @ poses[chosen] for name, (poses, _) in world.states.items()}
-
-
 def _state(states: States, row: int, time: float, uncertainty: Uncertainty | None) -> State:
     instruments = {
         name: InstrumentState(
@@ -209,3 +204,122 @@ def _measure_roll(world: World, result: IngestResult, capture: Path, progress: S
     progress("measuring roll and joints", 0, 0)
     masks = world.masks[np.isin(world.views.frames, result.selected)]
     prepare(capture, {item.name: lambda frame: masks[frame]})
+
+
+UNSEEN_MARGIN = 3  # video frames on each side of an unseen one chosen by us that no other split may use
+MIN_RANGE = 0.1  # rad that a joint's readings must span to be split by
+TEST_EVERY = 8  # frames, or episodes, of which one tests unless the recording states otherwise
+LEFT_OUT = "left out"  # split of a frame too close to an unseen one to train on
+
+
+def split_frames(data: Episodes, frames: np.ndarray, states: States, usable: np.ndarray) -> tuple[np.ndarray, str]:
+    """Split video frames [M] by the first tracked instrument's states where these are `usable` [M]; LEFT_OUT elsewhere.
+
+    Return the splits and the rule in words. Raises NeecoError.
+    """
+    poses, joints = next(iter(states.values()), (np.tile(np.eye(4), (len(frames), 1, 1)), {}))
+    where, rule = data.recording.path, data.recording.splits
+    by = rule.unseen_by if rule else None
+    if by is not None and by not in joints:  # another instrument's
+        owner = next((values for _, values in states.values() if by in values), None)
+        if owner is None:
+            raise NeecoError(f"{where}: splits.unseen_by: {by!r} belongs to an instrument without poses; name another")
+        joints = owner
+    rule = rule or (Splits() if states else Splits(unseen_fraction=0.0))
+    readings = {joint: values[usable] for joint, values in joints.items()}
+    assigned, words = assign_splits(frames[usable], poses[usable], readings, rule, data.ranges)
+    if "train" not in assigned:
+        raise NeecoError(f"{where}: splits: leave no frame to train on ({words}); change them")
+    for name in rule.test_episodes + rule.unseen_episodes:
+        first, last = data.ranges[name]
+        if not ((frames[usable] >= first) & (frames[usable] <= last)).any():
+            data.notes.add(f"splits: no frame of the episode {name} is in the capture")
+    for kind, ranges in (("test", rule.test), ("unseen", rule.unseen)):
+        if ranges and kind not in assigned:
+            data.notes.add(
+                f"splits.{kind}: no frame of the capture lies in the ranges given (the video has "
+                f"{len(data.times)} frames)"
+            )
+    splits = np.full(len(frames), LEFT_OUT, dtype=object)
+    splits[usable] = assigned
+    return splits, words
+
+
+def assign_splits(
+    frames: np.ndarray,
+    poses: np.ndarray,
+    joints: Mapping[str, np.ndarray],
+    rule: Splits,
+    episodes: Mapping[str, tuple[int, int]] | None = None,
+) -> tuple[np.ndarray, str]:
+    """Split video frames [N], given by number; return the splits [N] and the rule in words.
+
+    Unseen frames are chosen by poses [N, 4, 4] of the instrument and readings [N] rad by joint. A frame too close to
+    one of them is LEFT_OUT. episodes: the frames (first, last) of each of several.
+    """
+    episodes = episodes or {}
+    whole = rule.test_episodes
+    if episodes and not (whole or rule.test or rule.test_every is not None):
+        whole = tuple(episodes)[-max(1, len(episodes) // TEST_EVERY) :]
+    every = TEST_EVERY if rule.test_every is None else rule.test_every
+    splits = np.full(len(frames), "train", dtype=object)
+    if whole:
+        splits[_inside(frames, tuple(episodes[name] for name in whole))] = "test"
+        words = f"test: {_listed(whole)}"
+    elif rule.test:
+        splits[_inside(frames, rule.test)] = "test"
+        words = "test: video frames " + _ranges(rule.test)
+    elif every:
+        splits[frames % every == every // 2] = "test"
+        words = f"test: video frames whose number leaves {every // 2} when divided by {every}"
+    else:
+        words = "test: none"
+    if rule.unseen_episodes:
+        splits[_inside(frames, tuple(episodes[name] for name in rule.unseen_episodes))] = "unseen"
+        return splits, f"{words}; unseen: {_listed(rule.unseen_episodes)}"
+    if rule.unseen:
+        splits[_inside(frames, rule.unseen)] = "unseen"
+        return splits, f"{words}; unseen: video frames {_ranges(rule.unseen)}"
+    if rule.unseen_fraction == 0:
+        return splits, f"{words}; unseen: none"
+    unseen, why = _extremes(poses, joints, rule.unseen_fraction, rule.unseen_by)
+    if not unseen.any():
+        return splits, f"{words}; unseen: none, as nothing moves"
+    splits[unseen] = "unseen"
+    splits[~unseen & (np.abs(frames[:, None] - frames[unseen]).min(1) <= UNSEEN_MARGIN)] = LEFT_OUT
+    left_out = f"frames within {UNSEEN_MARGIN} of an unseen one are left out of the capture"
+    return splits, f"{words}; unseen: {why}; {left_out}"
+
+
+def _inside(frames: np.ndarray, ranges: tuple[tuple[int, int], ...]) -> np.ndarray:
+    return np.any([(frames >= first) & (frames <= last) for first, last in ranges], axis=0)
+
+
+def _listed(episodes: tuple[str, ...]) -> str:
+    return f"the recording{'s' * (len(episodes) > 1)} {', '.join(episodes)}"
+
+
+def _ranges(ranges: tuple[tuple[int, int], ...]) -> str:
+    return ", ".join(f"{first}-{last}" for first, last in ranges)
+
+
+def _extremes(
+    poses: np.ndarray, joints: Mapping[str, np.ndarray], fraction: float, by: str | None
+) -> tuple[np.ndarray, str]:
+    """Return the frames [N] at the far end of one joint, of the instrument's turn from its mean direction, or half of
+    each; and the rule in words."""
+    moving = [name for name, values in joints.items() if np.ptp(values) > MIN_RANGE]
+    joint = by or (moving[0] if moving else None)
+    share = fraction if by or joint is None else fraction / 2
+    unseen, words = np.zeros(len(poses), dtype=bool), []
+    if joint is not None:
+        limit = float(np.quantile(joints[joint], 1 - share))
+        unseen |= joints[joint] > limit
+        words.append(f"{joint} above {np.degrees(limit):.0f} deg")
+    if by is None:
+        turn = Rotation.from_matrix(poses[:, :3, :3])
+        away = (turn.mean().inv() * turn).magnitude()
+        limit = float(np.quantile(away, 1 - share))
+        unseen |= away > limit
+        words.append(f"instrument turned more than {np.degrees(limit):.0f} deg from its mean direction")
+    return unseen, " or ".join(words)

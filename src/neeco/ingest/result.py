@@ -1,17 +1,23 @@
-"""The report on one ingest, for the page and for scripts."""
+"""The report on one ingest, for the page and for scripts, and the verdict on its capture."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from neeco.base.plausible import FEW_TRAIN_FRAMES
+from neeco.capture.documents import Problem
+from neeco.capture.model import HOW_TO_REGISTER, UNKNOWN_DEG, Capture
+from neeco.geometry.lines import frame_about
 from neeco.ingest.foreground.rough_shape import RoughShape
 from neeco.ingest.frames.images import DropReason
 from neeco.ingest.registration.base import BaseRegistration
-from neeco.ingest.registration.hand_eye import Registration
+from neeco.ingest.registration.hand_eye import HAND_EYE, Registration
 from neeco.ingest.timing.clock_search import ClockOffset
 from neeco.ingest.timing.episodes import Contradiction
 
@@ -128,3 +134,272 @@ class IngestResult:
         shown += [f"clock {name}: {clock} ({clock.source})" for name, clock in self.clocks.items()]
         shown += [f"cameras: {sentence}" for sentence in self.search]
         return shown + [f"note: {note}" for note in self.notes]
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictSettings:
+    """Limits above which there is a warning: conventions, not measurements."""
+
+    position_mm: float = 1.0  # rms
+    rotation_deg: float = 0.5  # rms
+    reprojection_px: float = 1.0
+    scale: float = 0.015  # standard deviation, share
+    clock_mm: float = 0.5  # that an instrument moves within the standard deviation of its clock
+    base_mm: float = 2.0  # standard deviation of a base
+    base_deg: float = 1.5  # the same
+    severe: float = 3.0  # times the limit
+    min_points: int = 100  # of the tissue
+    min_overlap: float = 0.85  # of a base's outline with what moves: right bases reach 0.92 to 0.97 (measured once)
+    min_plausible_overlap: float = 0.7
+    max_shown: int = 5  # warnings listed by `lines`
+    facts: int = 2  # of an assessment
+
+
+LIMITS = VerdictSettings()
+VERDICTS = {"good": "good", "careful": "usable", "bad": "doubtful"}
+ADVICE = {"good": "good", "careful": "usable", "bad": "do not train"}
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """headline: one sentence; warnings: why it is not better, one sentence each, the worst first; facts: the measured
+    values that decide, with what is usual."""
+
+    level: Literal["good", "careful", "bad"]
+    headline: str
+    warnings: tuple[str, ...]
+    facts: tuple[str, ...] = ()
+
+    @property
+    def conclusion(self) -> str:
+        """Advice on training: the facts behind a good verdict; the warnings have those behind another."""
+        behind = {"good": "; ".join(self.facts), "careful": "better without what is listed above"}
+        return f"{ADVICE[self.level]}: {behind.get(self.level, 'correct what is listed above, and ingest again')}"
+
+    @property
+    def others(self) -> list[str]:
+        """The warnings that the headline does not state."""
+        return [warning for warning in self.warnings if not self.headline.endswith(_lower(warning))]
+
+    def lines(self) -> list[str]:
+        """Return the verdict for a terminal: headline (in capitals if doubtful) and the first `max_shown` warnings."""
+        verdict, _, rest = self.headline.partition(":")
+        others = self.others
+        words = {"good": f"good. {self.headline}", "careful": self.headline, "bad": f"{verdict.upper()}:{rest}"}
+        shown = [words[self.level]]
+        shown += [f"  - {warning}" for warning in others[: LIMITS.max_shown]]
+        left = len(others) - LIMITS.max_shown
+        return shown + ([f"  - and {left} more warnings"] if left > 0 else [])
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the verdict for scripts (`--json`)."""
+        found = {"verdict": VERDICTS[self.level], "headline": self.headline, "doubts": list(self.warnings)}
+        return found | {"advice": ADVICE[self.level], "facts": list(self.facts)}
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """Evidence on a capture: a fact, and a sentence that warns where it is unusual.
+
+    level: 0 where it is usual, 1 for a warning, 2 where the capture is not to be trained on.
+    """
+
+    fact: str
+    level: int
+    warning: str = ""
+
+    @property
+    def reason(self) -> str:
+        """The warning, with what is usual."""
+        usual = re.search(r"( \(usual: [^()]*\))?$", self.fact)
+        assert usual is not None
+        return re.sub(r"(\.?)$", lambda end: usual[0] + end[1], self.warning, count=1)
+
+    @classmethod
+    def of(cls, sentence: str, *, severe: bool) -> _Evidence:
+        """Evidence without a measured value."""
+        return cls(_lower(sentence).rstrip("."), 2 if severe else 1, sentence)
+
+    @classmethod
+    def measured(cls, fact: str, value: float, limit: float, warning: str) -> _Evidence:
+        """A measured value that should stay below a limit."""
+        return cls(fact, 0 if value <= limit else 1 if value <= LIMITS.severe * limit else 2, warning)
+
+
+def rms(values: np.ndarray) -> float:
+    """Return the root mean square; 0 of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
+
+
+def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Problem] = ()) -> Assessment:
+    """Judge a finished ingest by its own numbers, by contradictions in its recording, and by the problems that `check`
+    found in its capture; nothing here knows the truth."""
+    grave = [problem for problem in problems if problem.severity == "error" or problem.contradicted]
+    evidence = [_Evidence.of(_sentence(item.sentence), severe=item.severe) for item in result.contradictions]
+    evidence += [_Evidence.of(_sentence(str(problem)), severe=True) for problem in grave]
+    evidence += _measured(result, capture)
+    unusable = sum(not reason.frame_usable for _, reason in result.dropped)
+    if unusable > 0.5 * result.video_frames:
+        words = f"{unusable} of {result.video_frames} video frames were dropped as unusable."
+        evidence.append(_Evidence.of(words, severe=False))
+    if result.points < LIMITS.min_points:
+        evidence.append(_Evidence.of(f"Only {result.points} tissue points were found.", severe=False))
+    evidence += [
+        _Evidence.of(f"Clock {name} was neither given nor found: {clock.source}.", severe=False)
+        for name, clock in result.clocks.items()
+        if not np.isfinite(clock.sd)
+    ]
+    deviations = [state.uncertainty for frame in capture.frames for state in frame.state.instruments.values()]
+    if result.in_video and any(item is not None and item.rotation_deg[2] >= UNKNOWN_DEG for item in deviations):
+        words = "The instrument's roll is not known: log it, or pose frames by hand, before training."
+        evidence.append(_Evidence.of(words, severe=False))
+    others = [problem for problem in problems if problem not in grave]
+    evidence += [_Evidence.of(_sentence(str(problem)), severe=False) for problem in others]
+    if not capture.instruments:
+        words = "No instrument was tracked: only methods without states, such as 3dgs, can be trained."
+        evidence.append(_Evidence.of(words, severe=False))
+    elif not capture.registered:
+        words = f"Cameras and instrument do not meet: its poses are in a frame of their own; {HOW_TO_REGISTER}."
+        evidence.append(_Evidence.of(words, severe=True))
+    return _judged(evidence, result, capture)
+
+
+def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -> Assessment:
+    """Return the assessment that all evidence gives, the worst first."""
+    ordered = sorted(evidence, key=lambda item: -item.level)
+    facts = tuple(item.fact for item in ordered[: LIMITS.facts])
+    warnings = tuple(item.reason for item in ordered if item.level)
+    worst = ordered[0].level if ordered else 0
+    if worst == 2:
+        return Assessment("bad", "Doubtful: " + _lower(warnings[0]), warnings, facts)
+    if not capture.instruments:
+        return Assessment("careful", "Cameras only: there is no instrument to pose.", warnings, facts)
+    if worst == 1:
+        return Assessment("careful", "Usable, with care: " + _lower(warnings[0]), warnings, facts)
+    fit = "no measurement contradicts it" if result.registration is None else "cameras and instrument fit together"
+    return Assessment("good", f"Ready to train: {fit}.", (), facts)
+
+
+def _sentence(text: str) -> str:
+    begun = text if re.match(r"\S+\.\w+:", text) else text[0].upper() + text[1:]  # a file's name stays
+    return begun + ("" if text.endswith((".", "?")) else ".")
+
+
+def _lower(sentence: str) -> str:
+    return sentence[0].lower() + sentence[1:]
+
+
+def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
+    """Return what was measured, the most telling first."""
+    linked = {item.name for item in capture.instruments if item.kinematics is not None}
+    found = [item for name, base in result.bases.items() for item in _of_base(name, base, linked=name in linked)]
+    registration = result.registration
+    if registration is not None:
+        position = rms(registration.position_residual)
+        says = f"cameras and laparoscope tracker agree to {position:.2f} mm rms (usual: {LIMITS.position_mm:g} or less)"
+        warning = f"Cameras and laparoscope tracker disagree by {position:.2f} mm rms."
+        found.append(_Evidence.measured(says, position, LIMITS.position_mm, warning))
+    if (pixels := result.reprojection_px) is not None:
+        says = f"tissue points are reprojected to {pixels:.2f} px (usual: {LIMITS.reprojection_px:g} or less)"
+        warning = f"Tissue points are off by {pixels:.2f} px on average in the images they were found in."
+        found.append(_Evidence.measured(says, pixels, LIMITS.reprojection_px, warning))
+    if registration is not None:
+        rotation = float(np.degrees(rms(registration.rotation_residual)))
+        says = f"cameras and laparoscope tracker agree to {rotation:.2f}° rms (usual: {LIMITS.rotation_deg:g} or less)"
+        warning = f"Cameras and laparoscope tracker disagree by {rotation:.2f}° rms."
+        found.append(_Evidence.measured(says, rotation, LIMITS.rotation_deg, warning))
+        says = f"lengths are known to {registration.scale_sd:.1%} (usual: {LIMITS.scale:.1%} or less)"
+        warning = f"Lengths are known to {registration.scale_sd:.1%} only: the scope travelled too little."
+        found.append(_Evidence.measured(says, registration.scale_sd, LIMITS.scale, warning))
+        found += _placed(registration, capture, result.bases)
+    for name, clock in result.clocks.items():
+        moved = clock_cost_mm(name, clock.sd, capture)
+        if moved is not None:
+            known = f"Clock {name} is known to ±{clock.sd * 1000:.0f} ms, up to {moved:.1f} mm of instrument motion."
+            fact = f"{_lower(known).rstrip('.')} (usual: {LIMITS.clock_mm:g} or less)"
+            found.append(_Evidence.measured(fact, moved, LIMITS.clock_mm, known))
+    train = len(capture.split("train"))
+    fact = f"{train} frames to train on (usual: {FEW_TRAIN_FRAMES} or more)"
+    few = train < FEW_TRAIN_FRAMES
+    found.append(_Evidence(fact, 2 if few else 0, f"Only {train} frames are left to train on."))
+    found.append(_Evidence(f"{result.points:,} tissue points (usual: {LIMITS.min_points} or more)", 0))
+    return found
+
+
+def _placed(registration: Registration, capture: Capture, found_in_images: Collection[str]) -> list[_Evidence]:
+    """Return how well the cameras' place in the tracker's frame is known where instruments are, but for those whose
+    bases were found in the images. Residuals do not show it: where a scope turns little, they are small far off."""
+    places = [
+        state.pose[:3, 3].numpy()
+        for frame in capture.frames
+        for name, state in frame.state.instruments.items()
+        if name not in found_in_images
+    ]
+    if not places:
+        return []
+    sds = registration.placement_sd(np.stack(places))
+    found = []
+    for sd, unit, limit in zip(sds, (" mm", "°"), (HAND_EYE.placed_mm, HAND_EYE.placed_deg), strict=True):
+        known = f"the place of instruments in the images is known to ±{sd:.1f}{unit}"
+        warning = f"{known[0].upper()}{known[1:]} only (hand-eye calibration): record more turns of the scope."
+        found.append(_Evidence(f"{known} (usual: {limit:g} or less)", 0 if sd <= limit else 1, warning))
+    return found
+
+
+def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Evidence]:
+    """Return what the images say of a robot's base, or of the place of a tracked instrument, which has to be known as
+    well as from a hand-eye calibration.
+
+    linked: its links are stated in its frame, so that every error of the base counts; else a learned shape makes up for
+    a constant offset.
+    """
+    found = []
+    if np.isfinite(overlap := base.overlap):
+        level = 0 if overlap >= LIMITS.min_overlap else 1 if overlap >= LIMITS.min_plausible_overlap else 2
+        says = f"the outline of {name} and what moves overlap by {overlap:.2f}"
+        warning = f"{says[0].upper()}{says[1:]} only: is its clock right?"
+        found.append(_Evidence(f"{says} (usual: {LIMITS.min_overlap:g} or more)", level, warning))
+    limit_mm, limit_deg = (
+        (HAND_EYE.placed_mm, HAND_EYE.placed_deg) if base.tracked else (LIMITS.base_mm, LIMITS.base_deg)
+    )
+    what = f"the {'place' if base.tracked else 'base'} of {name}"
+    known = [(what, "mm", limit_mm, base.sd_mm), (what, "deg", limit_deg, base.sd_deg)]
+    if base.shaft is not None and linked:
+        sd_mm, sd_deg = base.deviations(frame_about(base.shaft).T)
+        known = [
+            (f"the place of {name} along its shaft", "mm", limit_mm, sd_mm[2:]),
+            (f"the place of {name} across its shaft", "mm", limit_mm, sd_mm[:2]),
+            (f"the direction of {name}", "deg", limit_deg, sd_deg),
+        ]
+    elif np.isfinite(base.sd_motion_mm):
+        known = [(f"the motion of {name}", "mm", limit_mm, np.array(base.sd_motion_mm))]
+    for what, unit, limit, sds in known:
+        worst = float(np.max(sds))
+        size = f"±{worst:.1f} {unit}" if np.isfinite(worst) else f"no {unit}"
+        fact = f"{what} is known to {size} (usual: {limit:g} or less)"
+        warning = f"{what[0].upper()}{what[1:]} is known to {size} only."
+        found.append(_Evidence(fact, 0 if worst <= limit else 1, warning))
+    return found
+
+
+def clock_cost_mm(name: str, sd: float, capture: Capture) -> float | None:
+    """Return the mm that an instrument moves within a clock's standard deviation, at its 90th percentile of speed.
+
+    None for a joint's clock, and where the deviation is not known.
+    """
+    joints = {joint for instrument in capture.instruments for joint in instrument.joints}
+    speeds = [instrument_speed(capture, instrument.name) for instrument in capture.instruments]
+    if name in joints or not speeds or not np.isfinite(sd):
+        return None
+    return sd * max(speeds)
+
+
+def instrument_speed(capture: Capture, name: str) -> float:
+    """Return the 90th percentile of an instrument's speed between consecutive frames, mm/s; 0 for fewer than two."""
+    frames = sorted((f for f in capture.frames if name in f.state.instruments), key=lambda frame: frame.state.time)
+    if len(frames) < 2:
+        return 0.0
+    steps = np.diff([frame.state.time for frame in frames])
+    places = np.stack([frame.state.instruments[name].pose.numpy()[:3, 3] for frame in frames])
+    moved, usable = np.linalg.norm(np.diff(places, axis=0), axis=1), steps > 0
+    return float(np.quantile(moved[usable] / steps[usable], 0.9)) if usable.any() else 0.0

@@ -1,22 +1,48 @@
-"""One world of an ingest: cameras, tissue and instruments, found by a still or a moving scope."""
+"""One world of an ingest: cameras, tissue and instruments. Of a scope that moves, structure from motion finds the
+cameras and its tracker registers them; the frame of one that stands still is the world."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 
-from neeco.capture.model import PointCloud
-from neeco.ingest.cameras.still_scene import RightCamera
+from neeco.base.errors import NeecoError
+from neeco.capture.model import SEPARATE_TISSUES, PointCloud, evenly_spaced
+from neeco.geometry.lens import Lens
+from neeco.ingest.cameras.sfm import StructureFromMotion
+from neeco.ingest.cameras.still_scene import (
+    N_FRAMES,
+    RightCamera,
+    look_behind,
+    read_right_camera,
+    same_place,
+    stands_still,
+    still_cameras,
+)
+from neeco.ingest.foreground.background import find_background
+from neeco.ingest.foreground.masks import moving_masks, passing_masks
 from neeco.ingest.foreground.residual_flow import ResidualFlow
-from neeco.ingest.foreground.rough_shape import RoughShape
-from neeco.ingest.frames.images import ChosenImages
-from neeco.ingest.frames.views import SfmResult, Views
+from neeco.ingest.foreground.rough_shape import RoughShape, best_lag, carve_shape, observations_on
+from neeco.ingest.frames.images import ChosenImages, SfmResult, StageProgress, Views, undistort_images
+from neeco.ingest.readers.columns import CAMERA
+from neeco.ingest.recording.model import MIN_FRAMES, MOVING, STILL
 from neeco.ingest.registration.base import BaseRegistration
+from neeco.ingest.registration.clocks import find_instrument_clocks, register
+from neeco.ingest.registration.find_bases import (
+    check_reference_frames,
+    correct_placement,
+    find_bases,
+    follow_cameras,
+    require_no_base,
+)
 from neeco.ingest.registration.hand_eye import Registration
-from neeco.ingest.shaft.from_video import FoundShaft
+from neeco.ingest.shaft.from_video import FoundShaft, find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes, States
+from neeco.ingest.timing.reading import require_lens
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,3 +95,310 @@ def note_motion_contradiction(data: Episodes, name: str, moves: bool, lag: float
             f"nothing in the images moves with the tracked pose of {name}: check its log, its frame and its clock"
         )
     data.notes.contradict(f"motion of {name}", sentence, severe=True)
+
+
+def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progress: StageProgress) -> World:
+    """Find cameras, registration, clocks, bases and instruments; then adjust the cameras without what moves.
+
+    folder: for temporary files. Raises NeecoError where too few images get a camera.
+    """
+    check_reference_frames(data, moving=True)
+    settings = data.recording.settings
+    lens = images.lens
+    motion = StructureFromMotion(
+        work=folder / "sfm", source=data.video.path, folder=images.folder / "raw", names=images.names,
+        size=images.size, pinhole=lens.pinhole(images.size) if lens else None, masks=images.masks, settings=settings,
+        episodes=data.episode_of(images.selected),
+    )  # fmt: skip
+    sfm = motion.reconstruct(progress)
+    _check_joined(data, images.selected[sfm.indices])
+    if lens is None:
+        assert sfm.lens is not None
+        data.notes.add(
+            f"intrinsics were estimated by structure from motion (focal length {sfm.lens.fl_x:.1f} px, radial "
+            f"distortion {sfm.lens.distortion[0]:.3f}); a calibration is better"
+        )
+        images = undistort_images(images, sfm.lens, data.video, progress)
+
+    views = images.views(data, sfm.indices, sfm.world_from_camera)
+    flow = residual_flow(sfm, views)
+
+    def foreground(rows: np.ndarray) -> np.ndarray:
+        return passing_masks(views.load, flow, rows, settings.moving_px, views.visible)
+
+    data, registration = register(data, views)
+    data = find_instrument_clocks(data, flow, views, progress)
+    bases: dict[str, BaseRegistration] = {}
+    shapes: dict[str, RoughShape] = {}
+    evidence: dict[int, np.ndarray] = {}
+    before: Views | None = None
+    masks = None
+    on_instruments = np.zeros(len(sfm.observations), dtype=bool)
+    if registration is None:
+        require_no_base(data)
+    else:
+        before = _registered(views, registration)
+        data, bases = find_bases(data, before, foreground, progress, registration)
+        data, corrected = correct_placement(data, before, registration, foreground, progress)
+        bases |= corrected
+        data = data.with_assumed_clocks()
+        progress("finding the instrument", 0, 0)
+        on_instruments, shapes, evidence = _carve_instruments(data, sfm, views, flow, registration)
+    if data.video_instrument is not None:
+        progress("finding what moves", 0, 0)
+        masks = foreground(np.arange(len(sfm.indices)))
+        on_instruments |= on_masks(masks, sfm, images.size)
+
+    first = sfm.indices
+    sfm = motion.adjust(sfm, on_instruments, progress)
+    views = images.views(data, sfm.indices, sfm.world_from_camera)
+    data, registration = register(data, views)  # first: it may find clocks
+    distance, shaft = settings.scene_distance_mm, None
+    placed, points = _in_mm(sfm, views, registration, distance)
+    if before is not None and registration is not None:
+        data, bases = follow_cameras(data, bases, before, placed)
+    if data.video_instrument is not None:
+        assert masks is not None
+        masks = masks[np.isin(first, sfm.indices)]
+        tissue = None if registration is not None else float(np.median(_distances(points, placed.world_from_camera)))
+        progress("finding the shaft", 0, 0)
+        data, shaft = find_in_video(data, data.video_instrument, placed, masks, tissue)
+        placed, points = _in_mm(sfm, views, registration, shaft.axes.scale * distance)
+    data = data.with_assumed_clocks()
+    if registration is not None and evidence:
+        _compare_motion(data, placed, shapes, evidence, flow.pinhole)
+    states, usable = data.states_at(views.times)
+    return World(
+        data=data, images=images, views=placed, states=states, usable=usable, tissue=_reliable(data, sfm, points),
+        shapes=shapes, bases=bases, shaft=shaft, masks=masks, registration=registration,
+        reprojection_px=sfm.reprojection_px, search=motion.search, moving=evidence, still=False,
+    )  # fmt: skip
+
+
+def _check_joined(data: Episodes, placed: np.ndarray) -> None:
+    """Raise NeecoError for an episode that structure from motion did not join to the others. placed [M]: the frames
+    that got a camera."""
+    counts = np.bincount(data.episode_of(placed), minlength=len(data.parts))
+    for part, count in zip(data.parts, counts, strict=True):
+        if count < MIN_FRAMES and not data.single:
+            raise NeecoError(
+                f"{part.recording.path}: {part.name} stands alone: {count} of its frames show enough of what the other "
+                f"recordings show to find their cameras together (at least {MIN_FRAMES} are needed); where it "
+                f"shows another tissue, {SEPARATE_TISSUES}, else leave it out"
+            )
+
+
+def _registered(views: Views, registration: Registration) -> Views:
+    return replace(views, world_from_camera=registration.cameras(views.world_from_camera))
+
+
+def _in_mm(
+    sfm: SfmResult, views: Views, registration: Registration | None, distance_mm: float
+) -> tuple[Views, np.ndarray]:
+    """Return views and points [P, 3] in the tracker's frame, or in SfM's with the tissue `distance_mm` away."""
+    if registration is not None:
+        return _registered(views, registration), registration.points(sfm.points)
+    scale = distance_mm / float(np.median(_distances(sfm.points, sfm.world_from_camera)))
+    cameras = sfm.world_from_camera.copy()
+    cameras[:, :3, 3] *= scale
+    return replace(views, world_from_camera=cameras), sfm.points * scale
+
+
+def _distances(points: np.ndarray, cameras: np.ndarray) -> np.ndarray:
+    """Return distances [P, C] between points [P, 3] and every tenth camera."""
+    return np.asarray(np.linalg.norm(points[:, None] - cameras[None, ::10, :3, 3], axis=-1))
+
+
+def _reliable(data: Episodes, sfm: SfmResult, points: np.ndarray) -> PointCloud:
+    """Return the tissue from the points [P, 3] mm of a reconstruction that several images observe and that fit well."""
+    reliable = sfm.reliable_points()
+    if not reliable.any():
+        reliable = np.ones(len(points), dtype=bool)
+        data.notes.add("no tissue point is observed by several frames and fits well: all of them are kept")
+    return PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
+
+
+def _carve_instruments(
+    data: Episodes, sfm: SfmResult, views: Views, flow: ResidualFlow, registration: Registration
+) -> tuple[np.ndarray, dict[str, RoughShape], dict[int, np.ndarray]]:
+    """Carve the rough shape of every tracked instrument from what moves with its pose.
+
+    Return the observations bool [Q] on instruments, the shapes, and by video frame where [h, w] pixels moved.
+    """
+    settings = data.recording.settings
+    rows = np.unique(np.linspace(0, len(sfm.indices) - 1, settings.shape_frames).astype(int))
+    evidence = flow.moving_pixels(rows, settings.moving_px)
+    points, views = registration.points(sfm.points), _registered(views, registration)
+    camera_from_world = np.linalg.inv(views.world_from_camera)
+    on_instruments, shapes = np.zeros(len(sfm.observations), dtype=bool), {}
+    for name in data.parts[0].poses:
+        poses, valid = data.instrument_poses(name, views.times)
+        camera_from_instrument = camera_from_world @ np.where(valid[:, None, None], poses, np.eye(4))
+        usable = valid[rows]
+        shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], flow.pinhole)
+        if shape is None:
+            continue
+        shapes[name] = shape
+        for row in np.flatnonzero(valid):
+            on_instruments |= observations_on(
+                shape, camera_from_instrument[row], sfm, int(row), points,
+                camera=flow.pinhole.camera(views.world_from_camera[row]),
+            )  # fmt: skip
+    return on_instruments, shapes, dict(zip(views.frames[rows].tolist(), evidence, strict=True))
+
+
+def _compare_motion(
+    data: Episodes, views: Views, shapes: Mapping[str, RoughShape], evidence: Mapping[int, np.ndarray], pinhole: Lens
+) -> None:
+    """Note instruments that do not move in the images as their poses do, by the capture's own clocks and cameras.
+
+    evidence: by video frame where [h, w] pixels moved.
+    """
+    rows = np.flatnonzero(np.isin(views.frames, list(evidence)))
+    moved = np.stack([evidence[frame] for frame in views.frames[rows].tolist()])
+    camera_from_world = np.linalg.inv(views.world_from_camera[rows])
+    for name in data.parts[0].poses:
+
+        def before_cameras(lag: float, of: str = name) -> tuple[np.ndarray, np.ndarray]:
+            poses, known = data.instrument_poses(of, views.times[rows], lag)
+            return camera_from_world @ np.where(known[:, None, None], poses, np.eye(4)), known
+
+        lag = best_lag(moved, before_cameras, pinhole, longest_lag(data))
+        note_motion_contradiction(data, name, name in shapes, lag)
+
+
+SAME_PLACE = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
+SAME_MOMENT_S = 1e-3  # between two cameras' images
+MOSTLY_SIMILAR = 0.7  # less is worth a note
+
+
+def is_still(data: Episodes, images: ChosenImages, progress: StageProgress) -> bool:
+    """Return whether the scope stands still: as the recording states, else as its images show."""
+    stated, stereo = data.recording.camera, data.recording.stereo is not None
+    if stereo and stated == MOVING:
+        data.notes.add("stereo: the second camera of a scope that moves is not used")
+    if stated is not None:
+        return stated == STILL
+    progress("looking whether the scope moves", 0, 0)
+    still = all(stands_still(images.loader(rows), len(rows)) for rows in _rows_by_episode(data, images).values())
+    if still:
+        data.notes.add("the scope stands still: nothing but the foreground moves in the images")
+    elif stereo:
+        sentence = "its second camera is for a scope that stands still, and the background moves: state `camera`"
+        data.notes.contradict("scope", sentence, severe=False)
+    return still or stereo
+
+
+def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progress: StageProgress) -> World:
+    """Find clocks, bases, instruments and tissue in front of a scope whose frame is the world.
+
+    folder: for temporary files. Raises NeecoError for an unknown lens.
+    """
+    require_lens(data.recording, images.lens)
+    if data.parts[0].scope is not None:
+        data.notes.add("the scope stands still: the laparoscope's log adds nothing to its images, and is ignored")
+    check_reference_frames(data, moving=False)
+    _check_one_place(data, images, progress)
+    right = _right_camera(data, images, folder, progress)
+    count = len(images.selected)
+    cameras = still_cameras(count)
+    views = images.views(data, cameras.indices, cameras.world_from_camera)
+
+    def moving(rows: np.ndarray) -> np.ndarray:
+        return moving_masks(views.load, count, rows, views.visible)
+
+    data = find_instrument_clocks(data, residual_flow(cameras, views), views, progress)
+    in_camera = [name for name, log in data.parts[0].poses.items() if log.frame == CAMERA]
+    data = replace(data, world_from_base={name: np.eye(4) for name in in_camera})
+    data, bases = find_bases(data, views, moving, progress)
+    if unplaced := [name for name in data.parts[0].poses if name not in data.world_from_base]:
+        data.notes.add(
+            f"nothing states how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}, "
+            "or camera_from_base): they stay in their own frame (unregistered)"
+        )
+    shaft = masks = None
+    if data.video_instrument is not None:
+        progress("finding what moves", 0, 0)
+        masks = moving(cameras.indices)
+        progress("finding the shaft", 0, 0)
+        data, shaft = find_in_video(data, data.video_instrument, views, masks, None)
+    data = data.with_assumed_clocks()
+    names = (*data.world_from_base, *data.video_poses)
+    tracked = {name: partial(data.instrument_poses, name, views.times) for name in names}
+    progress("finding the tissue behind the instrument", 0, 0)
+    behind = look_behind(views, tracked, longest_lag(data), data.recording.settings, right)
+    for note in behind.notes:
+        data.notes.add(note)
+    data.notes.contradict("stereo", behind.doubt, severe=True)
+    for name, lag in behind.lags.items():
+        note_motion_contradiction(data, name, name in behind.shapes, lag)
+    states, usable = data.states_at(views.times)
+    return World(
+        data=data, images=images, views=views, states=states, usable=usable,
+        tissue=PointCloud(behind.points.astype(np.float32), (behind.colors / 255).astype(np.float32)),
+        shapes=behind.shapes, bases=bases, shaft=shaft, masks=masks, still=True, depth_source=behind.how,
+        right=right,
+    )  # fmt: skip
+
+
+def _rows_by_episode(data: Episodes, images: ChosenImages) -> dict[int, np.ndarray]:
+    """Return the rows of the chosen frames, by episode, of those that have some."""
+    episodes = data.episode_of(images.selected)
+    return {int(episode): np.flatnonzero(episodes == episode) for episode in np.unique(episodes)}
+
+
+def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgress) -> None:
+    """Raise NeecoError for an episode in which a still scope looked at something else than in the first."""
+    if data.single:
+        return
+    progress("comparing what the recordings show", 0, 0)
+    backgrounds = {}
+    for episode, rows in _rows_by_episode(data, images).items():
+        load = images.loader(rows[evenly_spaced(len(rows), N_FRAMES)])
+        found = find_background(load, min(len(rows), N_FRAMES))
+        backgrounds[episode] = np.clip(found.colors, 0, 255).astype(np.uint8)
+    first, *others = backgrounds
+    for episode in others:
+        share = same_place(backgrounds[first], backgrounds[episode])
+        name, before = data.parts[episode].name, data.parts[first].name
+        if share is not None and share < SAME_PLACE:
+            raise NeecoError(
+                f"{data.parts[episode].recording.path}: {name} shows another place than {before}: {share:.0%} of "
+                f"the background is where it was; ingest each place alone; of several tissues, {SEPARATE_TISSUES}"
+            )
+        if share is not None and share < MOSTLY_SIMILAR:
+            data.notes.add(
+                f"{1 - share:.0%} of the background is not where it was in {before}: what changed is blurred", episode
+            )
+
+
+def _right_camera(data: Episodes, images: ChosenImages, folder: Path, progress: StageProgress) -> RightCamera | None:
+    """Write the right camera's images of all episodes into `folder`."""
+    if data.recording.stereo is None:
+        return None
+    names = [data.frame_name(int(frame)) for frame in images.selected]
+    cameras = []
+    for episode, rows in _rows_by_episode(data, images).items():
+        part = data.parts[episode]
+        own, stems = images.selected[rows] - part.first_frame, [names[row] for row in rows]
+        found = read_right_camera(part.recording, own, part.times, stems, folder / "right", progress)
+        moved = {row: int(rows[row]) for row in found.names}
+        late = np.array([*found.delays.values()])
+        if np.median(np.abs(late)) > SAME_MOMENT_S:
+            data.notes.add(
+                f"the right camera's images were taken {1000 * np.median(late):+.0f} ms after the left one's (median; "
+                f"{1000 * late.min():+.0f} to {1000 * late.max():+.0f} ms): theirs are the states of these moments",
+                episode,
+            )
+        cameras.append(
+            replace(
+                found,
+                names={moved[row]: name for row, name in found.names.items()},
+                delays={moved[row]: delay for row, delay in found.delays.items()},
+            )
+        )
+    return replace(
+        cameras[0],
+        names={row: name for camera in cameras for row, name in camera.names.items()},
+        delays={row: delay for camera in cameras for row, delay in camera.delays.items()},
+    )

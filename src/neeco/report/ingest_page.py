@@ -18,11 +18,10 @@ from neeco.capture import read_capture
 from neeco.capture.checks import inspect_capture
 from neeco.capture.documents import Problem, errors_only
 from neeco.capture.model import Capture, evenly_spaced
-from neeco.ingest.assessment import VERDICTS, Assessment, assess_ingest, clock_cost_mm, rms
-from neeco.ingest.frames.views import StageProgress
+from neeco.ingest.frames.images import StageProgress
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.model import Recording
-from neeco.ingest.result import IngestResult
+from neeco.ingest.result import VERDICTS, Assessment, IngestResult, assess_ingest, clock_cost_mm, rms
 from neeco.report import ingest_figures as figures
 from neeco.report.page import split_counts, write_page
 

@@ -1,41 +1,217 @@
-"""Cameras and tissue points from images alone, by pycolmap on the CPU, in a process of its own."""
+"""Cameras and tissue points from images alone, by pycolmap on the CPU, in a process of its own: strategies are tried in
+turn, then a result is chosen, or the reasons are given why none is good."""
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_json
 from neeco.capture.images import open_image
 from neeco.geometry.lens import Lens
-from neeco.ingest.cameras.sfm_strategies import (
-    Attempt,
-    Strategy,
-    best_attempt,
-    estimated_lens,
-    judge,
-    motion_fault,
-    strategies,
-)
-from neeco.ingest.frames.views import SfmResult, StageProgress
+from neeco.ingest.frames.images import SfmResult, StageProgress
 from neeco.ingest.readers.video import require_installed
 from neeco.ingest.recording.model import MIN_FRAMES, IngestSettings
 
-KEY_NEIGHBOURS = (1, 2, 3, 4, 6, 8, 12, 16)  # keyframes on, that a keyframe is matched with
-N_NEAR_KEYFRAMES = 3  # on each side, that another frame is matched with
-LOOP_STRIDE = 4  # keyframes between those that are all matched with each other: closes loops
-LARGE_PX = 1280  # of an image, whose features are not detected at twice the size, which takes four times as long
-DENSE_FACTOR = 3  # on the number of features, in the attempt from more of them
-PEAK, DENSE_PEAK = 0.004, 0.002  # minimum contrast of a feature: tissue is smooth, COLMAP's 0.0067 leaves too few
-N_MOTION_PAIRS = 40  # of keyframes, that are tested for parallax
+
+@dataclass(frozen=True, kw_only=True)
+class SfmSettings:
+    """Thresholds of structure from motion: of its pairs of images, its attempts, and the reasons why it fails."""
+
+    fields_of_view: tuple[float, float] = (70.0, 100.0)  # degrees, across the round image: laparoscopes, wide ones
+    min_field_of_view: float = 30.0  # degrees, of an estimated lens
+    max_field_of_view: float = 140.0  # degrees
+    max_distortion: float = 0.35  # share of its radius by which an estimated lens shifts the farthest pixel
+    complete_share: float = 0.9  # share of the keyframes that ends the search
+    rank_step: float = 0.05  # share of the keyframes by which one attempt outranks another whatever its error
+    max_error_px: float = 2.5  # mean reprojection error
+    min_parallax_deg: float = 1.0  # between the views of a point
+    still_share: float = 0.02  # of the image's width, by which a still scope's features move (tissue breathes)
+    homography_share: float = 0.004  # of the image's width: inlier threshold of a homography
+    min_explained: float = 0.9  # share of the epipolar inliers that a homography explains without parallax
+    min_matches: int = 30  # of features
+    min_pairs: int = 5  # of views
+    key_neighbours: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16)  # keyframes on, that a keyframe is matched with
+    near_keyframes: int = 3  # on each side, that another frame is matched with
+    loop_stride: int = 4  # keyframes between those that are all matched with each other: closes loops
+    large_px: int = 1280  # of an image whose features are not detected at twice the size: takes four times as long
+    dense_factor: int = 3  # on the number of features, in the attempt from more of them
+    peak: float = 0.004  # minimum contrast of a feature: tissue is smooth, COLMAP's 0.0067 leaves too few
+    dense_peak: float = 0.002  # the same, in the attempt from more features
+    motion_pairs: int = 40  # of keyframes, that are tested for parallax
+
+
+SETTINGS = SfmSettings()
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """A strategy. words: its description; focal: px where the estimate begins, 0 for a given lens; free_lens: estimated
+    with each frame added, not held until the keyframes are mapped; first_angle: degrees between the first two frames;
+    several_models: begin again where a model ends; global_mapping: all frames at once; dense: from more features."""
+
+    words: str
+    focal: float = 0.0
+    _: KW_ONLY
+    free_lens: bool = False
+    first_angle: float = 6.0
+    several_models: bool = False
+    global_mapping: bool = False
+    dense: bool = False
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Result of a strategy. models: keyframes in each model, the largest first, which the rest describes; error: px;
+    parallax: median degrees between the views of a point; fault: why it is not used, in words, or empty."""
+
+    strategy: Strategy
+    keyframes: int
+    _: KW_ONLY
+    models: tuple[int, ...] = ()
+    focal: float = 0.0
+    distortion: float = 0.0
+    points: int = 0
+    error: float = 0.0
+    parallax: float = 0.0
+    fault: str = ""
+
+    @property
+    def placed(self) -> int:
+        """Keyframes of the largest model."""
+        return self.models[0] if self.models else 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is gained by trying further."""
+        return not self.fault and self.placed >= SETTINGS.complete_share * self.keyframes
+
+    def sentence(self) -> str:
+        """Describe the attempt and its result."""
+        if self.fault:
+            return f"{self.strategy.words}: {self.fault}"
+        lens = f", focal length {self.focal:.0f} px" if self.strategy.focal else ""
+        return (
+            f"{self.strategy.words}: {self.placed} of {self.keyframes} keyframes placed, {self.error:.2f} px, "
+            f"{self.parallax:.1f} degrees of parallax{lens}"
+        )
+
+
+def strategies(radius: float | None) -> tuple[Strategy, ...]:
+    """Return what to try, the likeliest first. radius: px from the image's middle to its farthest visible pixel; None
+    where the lens is given."""
+    if radius is None:
+        dense = Strategy("with more features", first_angle=3.0, several_models=True, dense=True)
+        return (
+            Strategy("with the lens given"),
+            Strategy("from other first frames, less far apart", first_angle=3.0, several_models=True),
+            Strategy("all frames at once", global_mapping=True),
+            dense,
+        )
+    likely, wide = (radius / math.tan(math.radians(angle) / 2) for angle in SETTINGS.fields_of_view)
+    return (
+        Strategy(f"beginning with a lens that sees {SETTINGS.fields_of_view[0]:.0f} degrees", likely),
+        Strategy(f"beginning with a lens that sees {SETTINGS.fields_of_view[1]:.0f} degrees", wide),
+        Strategy(
+            "with the lens estimated from the first frames on",
+            likely,
+            free_lens=True,
+            first_angle=4.0,
+            several_models=True,
+        ),
+        Strategy("all frames at once", likely, global_mapping=True),
+        Strategy("with more features", likely, first_angle=3.0, several_models=True, dense=True),
+    )
+
+
+def judge(attempt: Attempt, size: tuple[int, int], least: int) -> Attempt:
+    """Return the attempt with its fault, if it has one. size: of the images; least: frames that a capture needs."""
+    fault = ""
+    if not attempt.models:
+        fault = "no first pair of frames fits"
+    elif attempt.placed < min(least, attempt.keyframes):
+        fault = f"ends after {attempt.placed} of {attempt.keyframes} keyframes"
+    elif attempt.points == 0:
+        fault = "finds no point of the tissue"
+    elif attempt.parallax < SETTINGS.min_parallax_deg:
+        fault = f"the views of a point differ by {attempt.parallax:.1f} degrees only: its depth is not known"
+    elif attempt.error > SETTINGS.max_error_px:
+        fault = f"points are off by {attempt.error:.1f} px on average"
+    elif attempt.strategy.focal:
+        fault = _lens_fault(attempt, size)
+    return replace(attempt, fault=fault)
+
+
+def _lens_fault(attempt: Attempt, size: tuple[int, int]) -> str:
+    half = math.hypot(*size) / 2
+    sees = 2 * math.degrees(math.atan(half / attempt.focal)) if attempt.focal > 0 else 180.0
+    bends = abs(attempt.distortion) * (half / max(attempt.focal, 1e-9)) ** 2
+    if not SETTINGS.min_field_of_view <= sees <= SETTINGS.max_field_of_view:
+        return f"ends at a focal length of {attempt.focal:.0f} px, which no endoscope has"
+    if bends > SETTINGS.max_distortion:
+        return f"ends at a radial distortion of {attempt.distortion:.2f}, which no endoscope has"
+    try:
+        estimated_lens(attempt.focal, attempt.distortion, size).pinhole(size)
+    except NeecoError:
+        return f"ends at a radial distortion of {attempt.distortion:.2f}, which folds the image over"
+    return ""
+
+
+def estimated_lens(focal: float, distortion: float, size: tuple[int, int]) -> Lens:
+    """A lens of one focal length px, one radial term (k1), and the principal point in the middle: more cannot be
+    estimated from a video of tissue that moves."""
+    return Lens(focal, focal, size[0] / 2, size[1] / 2, (distortion, 0.0, 0.0, 0.0))
+
+
+def best_attempt(attempts: Sequence[Attempt]) -> Attempt | None:
+    """Return the attempt without a fault that places most keyframes (in steps of `rank_step`), then fits best, then
+    has most parallax; the earlier of equals. None when all have a fault."""
+    usable = [attempt for attempt in attempts if not attempt.fault]
+
+    def rank(attempt: Attempt) -> tuple[int, float, float]:
+        return round(attempt.placed / attempt.keyframes / SETTINGS.rank_step), -attempt.error, attempt.parallax
+
+    return max(usable, key=rank, default=None)
+
+
+def motion_fault(matches: np.ndarray, width: int) -> str:
+    """Explain why there is no parallax, where the features that match between views show it; else return nothing.
+
+    matches [N, 5]: number of the pair of views, x, y, x', y' px. A homography explains all of two views from one place
+    (Hartley & Zisserman 2004, section 13.6), and of a plane.
+    """
+    moved, explained = [], []
+    for pair in np.unique(matches[:, 0]):
+        first, second = np.split(matches[matches[:, 0] == pair, 1:], 2, axis=1)
+        if len(first) < SETTINGS.min_matches:
+            continue
+        _, by_homography = cv2.findHomography(first, second, cv2.RANSAC, SETTINGS.homography_share * width)
+        _, by_any = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, SETTINGS.homography_share * width / 2)
+        rotated, counted = (np.zeros(len(first)) if fit is None else fit.ravel() for fit in (by_homography, by_any))
+        if max(rotated.sum(), counted.sum()) < SETTINGS.min_matches / 2:
+            continue
+        explained.append(rotated.sum() / max(rotated.sum(), counted.sum()))
+        moved.append(np.median(np.linalg.norm(second - first, axis=1)[rotated > 0]) if rotated.any() else math.inf)
+    if len(moved) < SETTINGS.min_pairs:
+        return ""
+    if np.quantile(moved, 0.9) < SETTINGS.still_share * width:
+        return "the scope seems to stand still"
+    if np.median(explained) > SETTINGS.min_explained:
+        return "the scope seems only to turn or zoom where it stands"
+    return ""
+
+
 # run by its path, not as a module of the package: nothing of ours may be loaded together with pycolmap
 WORKER = Path(__file__).with_name("_sfm_worker.py")
 
@@ -46,8 +222,8 @@ def image_pairs(count: int, keys: Sequence[int], episodes: np.ndarray | None = N
 
     episodes [count]: which of several recordings each is of; half of all pairs of keyframes of two of them are matched.
     """
-    pairs = {(keys[i], keys[i + step]) for step in KEY_NEIGHBOURS for i in range(len(keys) - step)}
-    anchors = keys[::LOOP_STRIDE]
+    pairs = {(keys[i], keys[i + step]) for step in SETTINGS.key_neighbours for i in range(len(keys) - step)}
+    anchors = keys[:: SETTINGS.loop_stride]
     pairs |= {(a, b) for a in anchors for b in anchors if a < b}
     if episodes is not None:
         numbered = list(enumerate(keys))
@@ -57,7 +233,7 @@ def image_pairs(count: int, keys: Sequence[int], episodes: np.ndarray | None = N
     stride = keys[1] - keys[0] if len(keys) > 1 else 1
     for frame in range(count):
         place = frame // stride
-        for near in range(place - N_NEAR_KEYFRAMES + 1, place + N_NEAR_KEYFRAMES + 1):
+        for near in range(place - SETTINGS.near_keyframes + 1, place + SETTINGS.near_keyframes + 1):
             if 0 <= near < len(keys) and keys[near] != frame:
                 pairs.add((min(frame, keys[near]), max(frame, keys[near])))
         if frame:
@@ -100,7 +276,7 @@ class StructureFromMotion:
             "work": str(work),
             "camera_model": "PINHOLE" if pinhole else "SIMPLE_RADIAL",
             "camera_params": [*pinhole.intrinsics] if pinhole else [],
-            "first_octave": -1 if max(size) < LARGE_PX else 0,
+            "first_octave": -1 if max(size) < SETTINGS.large_px else 0,
             "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         }
         count = len(self.names)
@@ -187,9 +363,10 @@ class StructureFromMotion:
         """Features and matches of all frames, into the database that strategies like this one share."""
         pairs = [(self.names[a], self.names[b]) for a, b in self.pairs]
         features = self.settings.sfm_features
-        job = {"task": "match", "pairs": pairs, "features": features, "peak": PEAK} | self._parameters(strategy)
+        job = {"task": "match", "pairs": pairs, "features": features, "peak": SETTINGS.peak}
+        job |= self._parameters(strategy)
         if strategy.dense:
-            job |= {"features": DENSE_FACTOR * features, "peak": DENSE_PEAK, "first_octave": -1}
+            job |= {"features": SETTINGS.dense_factor * features, "peak": SETTINGS.dense_peak, "first_octave": -1}
         self._work(self.job | job, progress)
 
     def _try(self, strategy: Strategy, parameters: dict[str, Any], progress: StageProgress) -> Attempt:
@@ -203,7 +380,7 @@ class StructureFromMotion:
 
     def _failure(self, progress: StageProgress) -> str:
         """Explain why no strategy was of use, and what to do."""
-        apart = max(1, len(self.keys) // N_MOTION_PAIRS)
+        apart = max(1, len(self.keys) // SETTINGS.motion_pairs)
         pairs = [(self.keys[i], self.keys[i + step]) for step in (2, 8) for i in range(0, len(self.keys) - step, apart)]
         names = [(self.names[a], self.names[b]) for a, b in pairs if (a, b) in set(self.pairs)]
         self._work(self.job | {"task": "matches", "pairs": names, "database": str(self.work / "database.db")}, progress)

@@ -26,7 +26,7 @@ from neeco.ingest.foreground.background import Background, find_background
 from neeco.ingest.foreground.masks import moving_masks
 from neeco.ingest.foreground.residual_flow import FLOW
 from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shape, project_mask
-from neeco.ingest.frames.views import SfmResult, StageProgress, Views, reduced
+from neeco.ingest.frames.images import SfmResult, StageProgress, Views, reduced
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import IngestSettings, Recording, VideoFile
 

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 from neeco.ingest.foreground.background import find_background
 from neeco.ingest.foreground.residual_flow import ResidualFlow
-from neeco.ingest.frames.views import reduced
+from neeco.ingest.frames.images import reduced
 
 
 @dataclass(frozen=True, kw_only=True)

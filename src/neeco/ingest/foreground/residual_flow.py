@@ -16,7 +16,7 @@ from scipy.spatial import QhullError
 from neeco.capture.model import REFERENCE_PIXELS
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project, project_world
-from neeco.ingest.frames.views import SfmResult
+from neeco.ingest.frames.images import SfmResult
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project, project_world
 from neeco.ingest.foreground.residual_flow import FLOW
-from neeco.ingest.frames.views import SfmResult
+from neeco.ingest.frames.images import SfmResult
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,5 @@
 """The chosen frames of a recording: sharp ones that differ, spread over states and views; as images, they are written,
-undistorted once the lens is known, and their dark border is masked."""
+undistorted once the lens is known, and their dark border is masked. Also their cameras, once these are found."""
 
 from __future__ import annotations
 
@@ -16,22 +16,85 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_unsynced
 from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, encoded_rgb, is_repeated, open_image, write_labels
-from neeco.capture.model import evenly_spaced
+from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
-from neeco.ingest.frames.views import StageProgress, Views
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.timing.episodes import Episodes
 
-N_NEIGHBOURS = 7  # frames on each side, whose sharpness a frame is compared with
-NOISE = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
-NOISE_PLACE = 0.06  # the same at one place of a thumbnail
-NOISE_MM, NOISE_RAD = 0.3, 0.005  # and of the state, within the tracker's noise
-MAX_RANGES = 3  # of frames, named in a note
-THUMBNAIL_PX = 64  # px, width
-MIN_REPEATED = 5  # frames with the picture before them that are worth a note where no state contradicts it
-ASPECT_TOLERANCE = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
+MIN_POINT_IMAGES, MAX_POINT_ERROR_PX = 4, 1.2  # of points that are tissue: images that observe them, and misfit
+StageProgress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SfmResult:
+    """A reconstruction by structure from motion, in a frame and unit of its own."""
+
+    indices: np.ndarray  # [M] which of the images given got a camera
+    world_from_camera: np.ndarray  # [M, 4, 4] OpenCV axes
+    points: np.ndarray  # [P, 3]
+    colors: np.ndarray  # [P, 3] uint8
+    errors: np.ndarray  # [P] px
+    lengths: np.ndarray  # [P] images that observe the point
+    observations: np.ndarray  # [Q, 5] row of world_from_camera, point, x px, y px, number of the image's feature
+    lens: Lens | None  # estimated; None where it was given
+    reprojection_px: float
+
+    def reliable_points(self) -> np.ndarray:
+        """Return [P] bool: observed by enough images and well fitted."""
+        return (self.lengths >= MIN_POINT_IMAGES) & (self.errors < MAX_POINT_ERROR_PX)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Views:
+    """Chosen frames that have a camera, in the frame and unit of their cameras."""
+
+    rows: np.ndarray  # [M] of the chosen frames
+    frames: np.ndarray  # [M] numbers of the video frames
+    times: np.ndarray  # [M] s, joint timeline
+    episodes: np.ndarray  # [M] which of several recordings each is of
+    world_from_camera: np.ndarray  # [M, 4, 4] OpenCV axes
+    load: Callable[[int], np.ndarray]  # image uint8 [H, W, 3] of a row of these arrays, as `pinhole` projects it
+    pinhole: Lens
+    visible: np.ndarray | None = None  # bool [H, W], the field of view, where it has a border
+
+    @property
+    def reduced_pinhole(self) -> Lens:
+        """The lens of the images `reduced`."""
+        return Lens.of(self.pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
+
+    @property
+    def reduced_border(self) -> np.ndarray | None:
+        """Pixels of the images `reduced`, bool [h, w], at least in part beyond the field of view."""
+        return None if self.visible is None else reduced(self.visible.astype(np.uint8) * 255) < 255
+
+
+def reduced(image: np.ndarray) -> np.ndarray:
+    """Return an image uint8 [H, W, 3] (or [H, W]) scaled down to REFERENCE_PIXELS, in which motion is looked for."""
+    height, width = image.shape[:2]
+    whole = Lens(width, width, width / 2, height / 2, (), (width, height)).camera(np.eye(4))
+    small = whole.within(REFERENCE_PIXELS)
+    size = small.width, small.height
+    return image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChoiceSettings:
+    """Thresholds of the choice of frames."""
+
+    neighbours: int = 7  # frames on each side, whose sharpness a frame is compared with
+    noise: float = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
+    noise_at_a_place: float = 0.06  # the same at one place of a thumbnail
+    noise_mm: float = 0.3  # of the state, within the tracker's noise
+    noise_rad: float = 0.005  # the same, of rotation
+    max_ranges: int = 3  # of frames, named in a note
+    thumbnail_px: int = 64  # width
+    min_repeated: int = 5  # repeated pictures that are worth a note where no state contradicts them
+    aspect_tolerance: float = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
+
+
+SETTINGS = ChoiceSettings()
 
 
 @dataclass(frozen=True)
@@ -62,7 +125,7 @@ def frame_features(images: Iterable[np.ndarray]) -> FrameFeatures:
         repeats.append(before is not None and is_repeated(before, levels))
         before, half = levels, levels.astype(np.float32) / 255
         sharpness.append(float(cv2.Laplacian(half, cv2.CV_32F).var()))
-        size = (THUMBNAIL_PX, max(1, round(THUMBNAIL_PX * image.shape[0] / image.shape[1])))
+        size = (SETTINGS.thumbnail_px, max(1, round(SETTINGS.thumbnail_px * image.shape[0] / image.shape[1])))
         thumbnails.append(cv2.resize(half, size, interpolation=cv2.INTER_AREA))
     return FrameFeatures(np.array(sharpness), np.array(thumbnails), np.array(repeats))
 
@@ -76,10 +139,10 @@ def frozen_frames(features: FrameFeatures, usable: np.ndarray, states: np.ndarra
 
 
 def describe_ranges(frames: np.ndarray) -> str:
-    """Return increasing frame numbers as `61-89, 104`, the first MAX_RANGES ranges."""
+    """Return increasing frame numbers as `61-89, 104`, the first `max_ranges` ranges."""
     parts = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
-    words = [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts[:MAX_RANGES]]
-    return ", ".join(words) + (", ..." if len(parts) > MAX_RANGES else "")
+    words = [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts[: SETTINGS.max_ranges]]
+    return ", ".join(words) + (", ..." if len(parts) > SETTINGS.max_ranges else "")
 
 
 def choose_frames(
@@ -95,7 +158,7 @@ def choose_frames(
     frozen = DropReason("frozen: the state changed, not the picture")
     dropped |= dict.fromkeys(frozen_frames(features, usable, states).tolist(), frozen)
     for i in np.flatnonzero(usable).tolist():
-        around = features.sharpness[max(0, i - N_NEIGHBOURS) : i + N_NEIGHBOURS + 1]
+        around = features.sharpness[max(0, i - SETTINGS.neighbours) : i + SETTINGS.neighbours + 1]
         if features.sharpness[i] < min_sharpness * np.median(around):
             share = features.sharpness[i] / np.median(around)
             dropped[i] = DropReason(f"blurred: {share:.0%} of its neighbours' sharpness")
@@ -119,9 +182,10 @@ def choose_frames(
 def _same(features: FrameFeatures, states: np.ndarray, a: int, b: int) -> bool:
     moved, turned = np.linalg.norm(states[a, :3] - states[b, :3]), np.linalg.norm(states[a, 3:] - states[b, 3:])
     changes = np.abs(features.thumbnails[a] - features.thumbnails[b])
-    if not states.any() and changes.max() > NOISE_PLACE:  # no state is known yet, and something small moved
+    # no state is known yet, and something small moved
+    if not states.any() and changes.max() > SETTINGS.noise_at_a_place:
         return False
-    return bool(changes.mean() < NOISE and moved < NOISE_MM and turned < NOISE_RAD)
+    return bool(changes.mean() < SETTINGS.noise and moved < SETTINGS.noise_mm and turned < SETTINGS.noise_rad)
 
 
 def _embedding(features: FrameFeatures, states: np.ndarray) -> np.ndarray:
@@ -275,7 +339,7 @@ def _check_pixels(video: VideoSource, lens: Lens | None, where: str, data: Episo
         )
     if lens is not None and video.pixel_aspect != 1:
         found, expected = lens.fl_x / lens.fl_y, 1 / video.pixel_aspect
-        if abs(found / expected - 1) > ASPECT_TOLERANCE:
+        if abs(found / expected - 1) > SETTINGS.aspect_tolerance:
             data.notes.add(
                 f"{where}: fl_x / fl_y is {found:.3g}, the shape of {video.path.name}'s pixels says {expected:.3g}"
             )
@@ -295,7 +359,7 @@ def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[i
     states, usable = data.coverage_states()
     known = states.any()  # else the clocks are found later, by frames that are not frozen
     frozen = frozen_frames(features, usable, states) if known else np.flatnonzero(features.repeats)
-    if len(frozen) >= (1 if known else MIN_REPEATED):
+    if len(frozen) >= (1 if known else SETTINGS.min_repeated):
         why = (
             "while the state changes; frozen, and left out" if known else "and are left out; is the video frozen there?"
         )

@@ -8,7 +8,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.foreground.residual_flow import ResidualFlow
-from neeco.ingest.frames.views import StageProgress, Views
+from neeco.ingest.frames.images import StageProgress, Views
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.registration.hand_eye import Registration, register_with_laparoscope
 from neeco.ingest.timing.clock_search import (

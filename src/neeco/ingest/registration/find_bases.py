@@ -14,7 +14,7 @@ from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
 from neeco.geometry.rotations import rigid
 from neeco.geometry.trocar import line_through_trocar
-from neeco.ingest.frames.views import StageProgress, Views, reduced
+from neeco.ingest.frames.images import StageProgress, Views, reduced
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import ReadingLog

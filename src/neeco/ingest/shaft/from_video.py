@@ -13,7 +13,7 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import UNKNOWN_DEG, FromVideo, Instrument, Uncertainty, evenly_spaced
 from neeco.geometry.lines import distances_to_lines, unit
 from neeco.ingest.foreground.silhouettes import shaft_lines
-from neeco.ingest.frames.views import SfmResult, Views, reduced
+from neeco.ingest.frames.images import SfmResult, Views, reduced
 from neeco.ingest.recording.model import InstrumentLogs, Recording
 from neeco.ingest.shaft.axis import ShaftAxes, ShaftEdges, ShaftVideo, across_axes, edge_distances, solve_axes
 from neeco.ingest.shaft.edges import (

@@ -1,7 +1,7 @@
 """The clock of a log against the video's, from motion that both recorded.
 
 t_log = seconds + rate * t_video. Speeds are compared by correlation at all offsets and, because a stated frame rate may
-be wrong, at all rates from 1 / MAX_RATE to MAX_RATE. Where rate 1 fits as well, it is taken.
+be wrong, at all rates from 1 / `max_rate` to `max_rate`. Where rate 1 fits as well, it is taken.
 """
 
 from __future__ import annotations
@@ -16,21 +16,29 @@ from neeco.base.errors import NeecoError
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog
 
-STEP_S = 0.02  # s, of the coarse search for an offset
-STRIDE_S = 0.12  # s, over which a turn is measured: long enough to stand out of the tracker's noise
-MIN_CORRELATION = 0.6  # of two recordings of one motion
-SAME_MOTION = 0.95  # from which on no other rate is tried: ends are off by less than a lobe
-MIN_LEAD = 0.08  # by how much the best offset must beat every other, apart from its own lobe
-LOBE_S = 0.3  # s
-MIN_SIGNIFICANCE = 3.5  # standard deviations of chance: the best of tens of offsets in a short recording has 3
-MIN_OVERLAP = 0.6  # of the video, that the log covers
-MAX_LENGTH_S = 24 * 3600.0  # s that a recording may last: a longer log or video has stray stamps
-MAX_RATE = 2.5  # s of a log in one second of the video: 60 frames a second taken for 25
-SEGMENT_S = 40.0  # s of the video on which all rates are tried; around the best one the rest of it is added
-RATE_MISMATCH_S = 0.1  # s by which the ends of a segment are off between two rates tried
-RATE_CORRELATION = 0.85  # that another rate needs: of hundreds tried one fits by chance
-RATE_LEAD = 0.04  # by how much the correlation at another rate must beat that at rate 1
-RATE_SIGNIFICANCE = 2.0  # standard deviations from 1, at which a rate is taken to differ
+
+@dataclass(frozen=True, kw_only=True)
+class ClockSearchSettings:
+    """Steps and thresholds of the search for a clock."""
+
+    step_s: float = 0.02  # of the coarse search for an offset
+    stride_s: float = 0.12  # over which a turn is measured: long enough to stand out of the tracker's noise
+    min_correlation: float = 0.6  # of two recordings of one motion
+    same_motion: float = 0.95  # correlation from which on no other rate is tried: ends are off by less than a lobe
+    min_lead: float = 0.08  # by how much the best offset must beat every other, apart from its own lobe
+    lobe_s: float = 0.3
+    min_significance: float = 3.5  # sd of chance: the best of tens of offsets in a short recording has 3
+    min_overlap: float = 0.6  # of the video, that the log covers
+    max_length_s: float = 24 * 3600.0  # of a recording: a longer log or video has stray stamps
+    max_rate: float = 2.5  # s of a log in one second of the video: 60 frames a second taken for 25
+    segment_s: float = 40.0  # of the video, on which all rates are tried; around the best one the rest is added
+    rate_mismatch_s: float = 0.1  # by which the ends of a segment are off between two rates tried
+    rate_correlation: float = 0.85  # that another rate needs: of hundreds tried one fits by chance
+    rate_lead: float = 0.04  # by how much the correlation at another rate must beat that at rate 1
+    rate_significance: float = 2.0  # standard deviations from 1, at which a rate is taken to differ
+
+
+SEARCH = ClockSearchSettings()
 GIVEN, SCOPE_MOTION, INSTRUMENT_MOTION = "given", "scope motion", "instrument motion"  # sources of clocks
 ASSUMED = "assumed equal to the video's"
 
@@ -77,14 +85,14 @@ def clock_from_turning(world_from_camera: np.ndarray, times: np.ndarray, log: Po
     two never fit, or fit at several offsets.
     """
     _check_span(log)
-    video_grid = np.arange(times[0] + STRIDE_S, times[-1] - STRIDE_S, STEP_S)
-    log_grid = np.arange(log.times[0] + STRIDE_S, log.times[-1] - STRIDE_S, STEP_S)
+    video_grid = np.arange(times[0] + SEARCH.stride_s, times[-1] - SEARCH.stride_s, SEARCH.step_s)
+    log_grid = np.arange(log.times[0] + SEARCH.stride_s, log.times[-1] - SEARCH.stride_s, SEARCH.step_s)
     if len(video_grid) < 50 or len(log_grid) < 50:
         raise NeecoError(f"{log.path}: video or log is shorter than a second; give its clock offset in `sync`")
     video = _turning_speed(video_grid, times, Rotation.from_matrix(world_from_camera[:, :3, :3]))
     sensor = _turning_speed(log_grid, log.times, Rotation.from_quat(log.quats, scalar_first=True))
     rate, lags, scores = best_rate(video, sensor)
-    seconds = log_grid[0] + _peak(lags, scores, rate, log) * STEP_S - rate * video_grid[0]
+    seconds = log_grid[0] + _peak(lags, scores, rate, log) * SEARCH.step_s - rate * video_grid[0]
     return ClockOffset(float(seconds), float("nan"), SCOPE_MOTION, rate)
 
 
@@ -97,12 +105,12 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
     _check_span(log)
     steps = np.diff(times)
     middle, speed = (times[1:] + times[:-1]) / 2, motion / steps
-    grid = np.arange(middle[0], middle[-1], STEP_S)
-    log_grid = np.arange(log.times[0] + STRIDE_S, log.times[-1] - STRIDE_S, STEP_S)
+    grid = np.arange(middle[0], middle[-1], SEARCH.step_s)
+    log_grid = np.arange(log.times[0] + SEARCH.stride_s, log.times[-1] - SEARCH.stride_s, SEARCH.step_s)
     if len(grid) < 100 or len(log_grid) < 100:
         raise NeecoError(f"{log.path}: video or log is shorter than two seconds; give its clock offset in `sync`")
-    before, after = (poses_at(log, log_grid + side * STEP_S) for side in (-1, 1))
-    tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * STEP_S)
+    before, after = (poses_at(log, log_grid + side * SEARCH.step_s) for side in (-1, 1))
+    tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * SEARCH.step_s)
     tracked = np.sqrt(np.where(before[1] & after[1], tracked, np.nanmedian(tracked)))
     observed = np.sqrt(np.interp(grid, middle, speed))  # roots: a fast stroke must not outweigh all others
     rate, lags, scores = best_rate(observed, tracked)
@@ -110,15 +118,15 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
         rate = _finer_rate(observed, tracked, rate)
         lags, scores = correlate(_stretched(observed, rate), tracked)
     best, length, stretched = _peak(lags, scores, rate, log), grid[-1] - grid[0], _stretched(observed, rate)
-    if (sds := significance(stretched, tracked, best, float(scores.max()))) < MIN_SIGNIFICANCE:
+    if (sds := significance(stretched, tracked, best, float(scores.max()))) < SEARCH.min_significance:
         raise NeecoError(
             f"{log.path}: its clock cannot be determined from the images: in so short a recording the best offset's "
-            f"correlation of {scores.max():.2f} is {sds:.1f} standard deviations of chance, of {MIN_SIGNIFICANCE:g} "
-            "that are needed; give it in `sync`, or record more motion"
+            f"correlation of {scores.max():.2f} is {sds:.1f} standard deviations of chance, of "
+            f"{SEARCH.min_significance:g} that are needed; give it in `sync`, or record more motion"
         )
     sd = _spread_of_parts(stretched, tracked, best)
     rate_sd = np.sqrt(12) * sd / length if rate != 1 else 0.0  # of a line through offsets spread over the video
-    seconds = log_grid[0] + _vertex(lags, scores) * STEP_S - rate * grid[0]
+    seconds = log_grid[0] + _vertex(lags, scores) * SEARCH.step_s - rate * grid[0]
     return ClockOffset(float(seconds), sd, INSTRUMENT_MOTION, rate, float(rate_sd))
 
 
@@ -131,15 +139,15 @@ def _spread_of_parts(observed: np.ndarray, tracked: np.ndarray, best: int) -> fl
     found = []
     for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
         near, fit = correlate(observed[part], tracked)
-        around = np.abs((near - part.start - best) * STEP_S) < LOBE_S
+        around = np.abs((near - part.start - best) * SEARCH.step_s) < SEARCH.lobe_s
         if around.any():
             found.append(_vertex(near[around] - part.start, fit[around]))
-    return max(float(np.std(found)) * STEP_S if len(found) > 1 else LOBE_S, STEP_S / 4)
+    return max(float(np.std(found)) * SEARCH.step_s if len(found) > 1 else SEARCH.lobe_s, SEARCH.step_s / 4)
 
 
 def _check_span(log: PoseLog) -> None:
     """Raise NeecoError when stray stamps make a log too long to search."""
-    if log.times[-1] - log.times[0] > MAX_LENGTH_S:
+    if log.times[-1] - log.times[0] > SEARCH.max_length_s:
         raise NeecoError(
             f"{log.path}: its times span {(log.times[-1] - log.times[0]) / 3600:.3g} h; remove rows with stray times, "
             "or give its clock offset in `sync`"
@@ -147,20 +155,20 @@ def _check_span(log: PoseLog) -> None:
 
 
 def best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the rate at which motions [V] and [L], sampled every STEP_S, fit best; all lags, and their correlation.
+    """Return the rate at which motions [V] and [L], sampled every `step_s`, fit best; all lags, and their correlation.
 
     All rates are tried on the segment of most variance; it grows to the whole video while the rates narrow down.
     """
     lags, scores = correlate(video, log)
-    if scores.max(initial=-1.0) > SAME_MOTION:
+    if scores.max(initial=-1.0) > SEARCH.same_motion:
         return 1.0, lags, scores
-    size = min(len(video), round(SEGMENT_S / STEP_S))
+    size = min(len(video), round(SEARCH.segment_s / SEARCH.step_s))
     variances = [float(np.var(video[start : start + size])) for start in range(0, len(video) - size + 1, size)]
     centre = int(np.argmax(variances)) * size + size // 2
-    span = np.log(MAX_RATE)
+    span = np.log(SEARCH.max_rate)
     rate = 1.0
     while True:
-        step = RATE_MISMATCH_S / (size * STEP_S / 2)
+        step = SEARCH.rate_mismatch_s / (size * SEARCH.step_s / 2)
         rates = rate * np.exp(step * np.arange(-round(span / step), round(span / step) + 1))
         start = int(np.clip(centre - size // 2, 0, len(video) - size))
         fits = [correlate(_stretched(video[start : start + size], one), log)[1].max(initial=-1.0) for one in rates]
@@ -169,21 +177,21 @@ def best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, np
             break
         size = min(2 * size, len(video))
     other = correlate(_stretched(video, rate), log)
-    if other[1].max(initial=-1.0) < max(scores.max(initial=-1.0) + RATE_LEAD, RATE_CORRELATION):
+    if other[1].max(initial=-1.0) < max(scores.max(initial=-1.0) + SEARCH.rate_lead, SEARCH.rate_correlation):
         return 1.0, lags, scores
     return rate, *other
 
 
 def _finer_rate(video: np.ndarray, log: np.ndarray, rate: float) -> float:
     """Return the rate near a coarse one at which the correlation has its vertex."""
-    step = RATE_MISMATCH_S / (len(video) * STEP_S / 2) / 4
+    step = SEARCH.rate_mismatch_s / (len(video) * SEARCH.step_s / 2) / 4
     rates = rate * (1 + step * np.arange(-6, 7))
     fits = np.array([correlate(_stretched(video, one), log)[1].max(initial=-1.0) for one in rates])
     return rate * (1 + step * _vertex(np.arange(-6.0, 7.0), fits))
 
 
 def _stretched(video: np.ndarray, rate: float) -> np.ndarray:
-    """Resample a signal [V] of the video from every STEP_S of its clock to every STEP_S of a log's at `rate`."""
+    """Resample a signal [V] of the video from every `step_s` of its clock to every `step_s` of a log's at `rate`."""
     if rate == 1:
         return video
     return np.interp(np.arange(int(rate * (len(video) - 1)) + 1) / rate, np.arange(len(video)), video)
@@ -192,9 +200,9 @@ def _stretched(video: np.ndarray, rate: float) -> np.ndarray:
 def _peak(lags: np.ndarray, scores: np.ndarray, rate: float, log: PoseLog) -> int:
     """Return the best lag. Raises NeecoError when it is no fit, or one of several."""
     best = int(scores.argmax())
-    rivals = scores[np.abs(lags - lags[best]) * STEP_S > LOBE_S * max(rate, 1.0)]
+    rivals = scores[np.abs(lags - lags[best]) * SEARCH.step_s > SEARCH.lobe_s * max(rate, 1.0)]
     rival = float(rivals.max()) if len(rivals) else -1.0
-    if scores[best] < MIN_CORRELATION or scores[best] - rival < MIN_LEAD:
+    if scores[best] < SEARCH.min_correlation or scores[best] - rival < SEARCH.min_lead:
         raise NeecoError(
             f"{log.path}: its clock cannot be determined from the images: the best offset fits with correlation "
             f"{scores[best]:.2f}, another with {rival:.2f}; give it in `sync`, or shake what is tracked at the start "
@@ -232,18 +240,18 @@ def _vertex(lags: np.ndarray, scores: np.ndarray) -> float:
 
 
 def _turning_speed(grid: np.ndarray, times: np.ndarray, turns: Rotation) -> np.ndarray:
-    """Return angular speeds [G] rad/s at the grid's times s, from interpolated rotations STRIDE_S apart."""
+    """Return angular speeds [G] rad/s at the grid's times s, from interpolated rotations `stride_s` apart."""
     along = Slerp(times, turns)
-    before, after = (along(np.clip(grid + side * STRIDE_S / 2, times[0], times[-1])) for side in (-1, 1))
-    return (before.inv() * after).magnitude() / STRIDE_S
+    before, after = (along(np.clip(grid + side * SEARCH.stride_s / 2, times[0], times[-1])) for side in (-1, 1))
+    return (before.inv() * after).magnitude() / SEARCH.stride_s
 
 
 def correlate(short: np.ndarray, long: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return lags (`long` index of `short`'s first sample) and the Pearson correlation of two signals at each.
 
-    They overlap by at least MIN_OVERLAP of the shorter.
+    They overlap by at least `min_overlap` of the shorter.
     """
-    least = int(MIN_OVERLAP * min(len(short), len(long)))
+    least = int(SEARCH.min_overlap * min(len(short), len(long)))
     lags = np.arange(-(len(short) - least), len(long) - least + 1)
     # without their means, which correlation does not see, less is lost to rounding
     short, long = short - short.mean(), long - long.mean()

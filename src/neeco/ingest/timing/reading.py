@@ -16,7 +16,7 @@ from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_r
 from neeco.ingest.recording.base import STATED
 from neeco.ingest.recording.compatibility import check_recordings, episode_names, refusal
 from neeco.ingest.recording.model import STILL, Recording
-from neeco.ingest.timing.clock_search import GIVEN, MAX_LENGTH_S, ClockOffset
+from neeco.ingest.timing.clock_search import GIVEN, SEARCH, ClockOffset
 from neeco.ingest.timing.episodes import PAUSE_S, Episode, Episodes, Notes, assumed_clock
 
 MIN_FPS, MAX_FPS = 0.01, 10_000.0
@@ -41,7 +41,12 @@ def read_episodes(recordings: Sequence[Recording]) -> Episodes:
         parts.append(part)
     _check_episodes(parts)
     _check_split_names(recordings[0], names)
-    return Episodes(tuple(parts), parts[0].video if len(parts) == 1 else _joined_video(parts), notes)
+    video = parts[0].video
+    if len(parts) > 1:
+        videos, first = tuple(part.video for part in parts), tuple(part.first_frame for part in parts)
+        times = np.concatenate([part.times + part.start_s for part in parts])
+        video = _JoinedVideo(video.path, video.size, (), times, videos, (*first, len(times)))
+    return Episodes(tuple(parts), video, notes)
 
 
 def _check_episodes(parts: Sequence[Episode]) -> None:
@@ -168,7 +173,7 @@ def require_lens(recording: Recording, lens: Lens | None) -> None:
 def _check_video(recording: Recording, video: VideoSource) -> None:
     """Raise NeecoError for times that no recording has, and for frames too small."""
     rate, length = 1 / float(np.median(np.diff(video.times))), video.times[-1] - video.times[0]
-    if not (MIN_FPS < rate < MAX_FPS and length < MAX_LENGTH_S):
+    if not (MIN_FPS < rate < MAX_FPS and length < SEARCH.max_length_s):
         raise NeecoError(
             f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
             "cannot be; correct fps or the times' unit"
@@ -227,9 +232,3 @@ class _JoinedVideo(VideoSource):
             if len(own):
                 for index, image in video.read(own.tolist()):
                     yield index + before, image
-
-
-def _joined_video(parts: Sequence[Episode]) -> VideoSource:
-    videos, first = tuple(part.video for part in parts), tuple(part.first_frame for part in parts)
-    times = np.concatenate([part.times + part.start_s for part in parts])
-    return _JoinedVideo(videos[0].path, videos[0].size, (), times, videos, (*first, len(times)))
