@@ -25,7 +25,7 @@ from neeco.labels.drawing import EDGE_WIDTH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
 from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.camera_effects import read_effects
-from neeco.synthesis.card import write_card
+from neeco.synthesis.card import write_card, write_preview
 from neeco.synthesis.generator import (
     ENTERS_ANOTHER,
     ENTERS_TISSUE,
@@ -37,7 +37,6 @@ from neeco.synthesis.generator import (
     format_counts,
 )
 from neeco.synthesis.parallel import draw_in_workers
-from neeco.synthesis.preview import write_preview
 from neeco.synthesis.samplers import N_SIMILAR, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
 from neeco.synthesis.writers import Writer, WrittenImages
