@@ -60,9 +60,8 @@ ALLOWED = {
     "neeco.viewer.export": "reads the package's own files",
     "neeco.viewer.posing": "reads the package's own files",
     "neeco.cli": "opens the null device in place of a closed stream",
-    "neeco.synthesis.card": "asks a README.md in a folder of its own whether it is the user's",
+    "neeco.synthesis.card": "asks a README.md whether it is the user's, and reads back what it wrote",
     "neeco.synthesis.writers.bop": "reads back what it wrote",
-    "neeco.synthesis.preview": "reads back what it wrote",
     "neeco.report.page": "reads back what it wrote",
 }
 

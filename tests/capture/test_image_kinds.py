@@ -12,7 +12,7 @@ from PIL import Image, ImageFile
 from neeco.base.errors import NeecoError
 from neeco.capture.images import has_alpha, image_size, open_image, read_image, read_mask
 from neeco.ingest.readers.video import open_images
-from neeco.synthesis.preview import draw_tile
+from neeco.synthesis.card import draw_tile
 
 READERS: list[Callable[[Path], object]] = [
     open_image,

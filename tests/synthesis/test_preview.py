@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFont
 
-from neeco.synthesis.preview import BOX, PAIR_WIDTH, TILE_WIDTH, draw_name, draw_tile, wrap
+from neeco.synthesis.card import BOX, PAIR_WIDTH, TILE_WIDTH, draw_name, draw_tile, wrap
 
 ITEMS = ["arm1 16% seen", "arm1_shaft 99% seen", "arm2 0% seen", "arm2_shaft 97% seen", "camera_holder 5% seen"]
 
@@ -20,16 +20,16 @@ def test_a_caption_is_wrapped_between_its_items():
     assert all(width(f"{line} · {after.split(' · ')[0]}") > 240 for line, after in pairwise(lines))
 
 
-def test_a_caption_that_fits_stays_one_line():
-    assert wrap(ITEMS[:2], 400, 12) == ["arm1 16% seen · arm1_shaft 99% seen"]
-
-
-def test_an_item_wider_than_the_tile_has_a_line_of_its_own():
-    assert wrap(["a", "b" * 100, "c"], 100, 12) == ["a", "b" * 100, "c"]
-
-
-def test_no_items_no_lines():
-    assert wrap([], 100, 12) == []
+@pytest.mark.parametrize(
+    ("items", "width", "lines"),
+    [
+        (ITEMS[:2], 400, ["arm1 16% seen · arm1_shaft 99% seen"]),
+        (["a", "b" * 100, "c"], 100, ["a", "b" * 100, "c"]),  # wider than the tile: a line of its own
+        ([], 100, []),
+    ],
+)
+def test_items_share_a_line_where_they_fit(items, width, lines):
+    assert wrap(items, width, 12) == lines
 
 
 @pytest.mark.parametrize("x", [10.0, TILE_WIDTH - 5.0])

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rod_world import make_scene
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
@@ -248,3 +249,16 @@ def test_poses_are_moved_one_by_one_and_joints_and_time_are_kept(state):
         assert torch.equal(shifted.instruments[name].pose[:3, 3], item.pose[:3, 3].double() + 1)
         assert shifted.instruments[name].joints == item.joints
     assert shifted.time == posed.time
+
+
+def test_views_of_a_still_scope_stay_near_what_it_saw():
+    scene = make_scene()
+    scene.recorded = replace(scene.recorded, still=True)
+    sampler = make_sampler(scene, "interpolate", 0.2, "perturbed", 1)
+    rng = np.random.default_rng(0)
+    places = np.stack([camera.world_from_camera[:3, 3].numpy() for camera in scene.recorded.cameras])
+    for state in scene.recorded.states[:10]:
+        place = sampler.views(state, rng).world_from_camera[:3, 3].numpy()
+        assert np.linalg.norm(places - place, axis=1).min() < 5
+    with pytest.raises(NeecoError, match="--views orbit: the scope stood still"):
+        make_sampler(scene, "interpolate", 0.2, "orbit", 1)

@@ -16,9 +16,8 @@ from neeco.base.errors import NeecoError
 from neeco.capture.images import to_bytes
 from neeco.cli import main
 from neeco.labels.drawing import draw
-from neeco.synthesis.rendered_views import View
+from neeco.synthesis.rendered_views import FPS, View, views_along, write_video
 from neeco.synthesis.settings import ImageSettings
-from neeco.synthesis.video import FPS, views_along, write_video
 
 av = pytest.importorskip("av", reason="the extra ingest")
 

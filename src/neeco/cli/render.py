@@ -41,8 +41,15 @@ def run(arguments: Arguments) -> int:
     from neeco.cli._output import require_ending
     from neeco.cli._progress import counting
     from neeco.raster.devices import device_of
-    from neeco.synthesis.rendered_views import STATES_FOLDER, render, split_views, state_views
-    from neeco.synthesis.video import require_pyav, views_along, write_video
+    from neeco.synthesis.rendered_views import (
+        STATES_FOLDER,
+        render,
+        require_pyav,
+        split_views,
+        state_views,
+        views_along,
+        write_video,
+    )
     from neeco.training.run import open_run
 
     arguments.images.check()

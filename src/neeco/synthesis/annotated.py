@@ -29,8 +29,8 @@ from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, instruments_of
 from neeco.raster.resampling import of_rendered_size, resampled
 from neeco.states.alignment import AlignConfig, AlignedFrame, align_frame, pose_changes
-from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
+from neeco.synthesis.samplers import DrawnCameras
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings, parse_class_names
 from neeco.synthesis.writers.folder import Record, encoded_sample, skipped_sample
 

@@ -25,7 +25,7 @@ from neeco.labels.drawing import EDGE_WIDTH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
 from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.camera_effects import read_effects
-from neeco.synthesis.card import write_card
+from neeco.synthesis.card import write_card, write_preview
 from neeco.synthesis.generator import (
     ENTERS_ANOTHER,
     ENTERS_TISSUE,
@@ -37,7 +37,6 @@ from neeco.synthesis.generator import (
     format_counts,
 )
 from neeco.synthesis.parallel import draw_in_workers
-from neeco.synthesis.preview import write_preview
 from neeco.synthesis.samplers import N_SIMILAR, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
 from neeco.synthesis.writers import Writer, WrittenImages
@@ -148,7 +147,12 @@ def synthesize(
         known = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
         spec = GeneratorSpec(scene_file, known, str(scene.center.device), tuple(others))
         made = 0
-        for record in _draw_all(generator, spec, output, missing, min(workers, len(missing))):
+        processes = min(workers, len(missing))
+        if missing and (processes > 1 or address()):
+            rendered = draw_in_workers(spec, output, missing, processes)
+        else:
+            rendered = (draw_to_folder(generator, output, index) for index in missing)
+        for record in rendered:
             records[record["index"]] = record
             made += not record.get("skipped")
             on_progress(len(records))
@@ -164,15 +168,6 @@ def synthesize(
         skipped=skipped(records.values()),
         still=scene.recorded.still,
     )
-
-
-def _draw_all(
-    generator: SampleGenerator, spec: GeneratorSpec, output: Path, missing: list[int], workers: int
-) -> Iterator[Record]:
-    """Yield the records of the missing images as they are rendered."""
-    if missing and (workers > 1 or address()):
-        return draw_in_workers(spec, output, missing, workers)
-    return (draw_to_folder(generator, output, index) for index in missing)
 
 
 def description(

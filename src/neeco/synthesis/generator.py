@@ -37,9 +37,8 @@ from neeco.synthesis.camera_effects import (
     read_effects,
     subframes,
 )
-from neeco.synthesis.cameras import RECORDED_CAMERAS, DrawnCameras
 from neeco.synthesis.mixing import MixedSampler, Mixture
-from neeco.synthesis.samplers import Sampler, make_sampler
+from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers.folder import Encoded, Record, encoded_sample, skipped_sample
 

@@ -1,34 +1,38 @@
-"""`neeco render`: render the frames of a split, or given states, with part ids and masks."""
+"""`neeco render`: render the frames of a split, or given states, with part ids and masks, or as a video."""
 
 from __future__ import annotations
 
+import importlib.util
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 
-from neeco.base.errors import NeecoError
-from neeco.base.files import write_json
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import write_atomically, write_json
 from neeco.capture import read_capture
 from neeco.capture.checks.truth import PARTS_FILE
-from neeco.capture.images import write_image, write_labels
+from neeco.capture.images import to_bytes, write_image, write_labels
 from neeco.capture.model import State
 from neeco.capture.readers import read_states
 from neeco.geometry.camera import Camera
-from neeco.labels.drawing import draw
-from neeco.synthesis.cameras import DrawnCameras
+from neeco.labels.drawing import draw, to_numpy
 from neeco.synthesis.dataset import part_ids
-from neeco.synthesis.samplers import moved_camera
+from neeco.synthesis.samplers import DrawnCameras, moved_camera
 from neeco.synthesis.settings import AS_RECORDED, ImageSettings
+from neeco.synthesis.states import PathStates, interpolate_pose
 
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene
     from neeco.training.run import TrainedRun
 
 STATES_FOLDER = "states"
+FPS = 25  # of a video
+QUALITY = {"crf": "18"}  # of x264: visually lossless
 
 
 @dataclass(frozen=True)
@@ -101,3 +105,57 @@ def render(
     if scene.label_names:
         write_json(folder / PARTS_FILE, {"ids": part_ids(scene.label_names)})
     return Rendered(folder, len(views), bool(scene.label_names))
+
+
+def require_pyav() -> None:
+    """Raise NeecoError where PyAV is missing."""
+    if importlib.util.find_spec("av") is None:
+        raise NeecoError(f"--video: needs PyAV; {install_hint('ingest')}")
+
+
+def views_along(views: Sequence[View], count: int) -> list[View]:
+    """Return `count` views evenly spread along given ones, the first and last included: states as `PathStates`, camera
+    poses as `interpolate_pose`. Raises NeecoError for fewer than two views."""
+    path, rng = PathStates([view.state for view in views], count), np.random.default_rng(0)
+    poses = [to_numpy(view.camera.world_from_camera) for view in views]
+    along = []
+    for k in range(count):
+        segment, weight = path.place(k)
+        pose = interpolate_pose(poses[segment], poses[segment + 1], weight)
+        along.append(View(f"{k:06d}", path(k, rng), moved_camera(views[segment].camera, pose)))
+    return along
+
+
+def write_video(
+    scene: DrawableScene,
+    views: Sequence[View],
+    path: Path,
+    on_progress: Callable[[int], None] = lambda done: None,
+    images: ImageSettings = AS_RECORDED,
+) -> None:
+    """Write the views' images in order, FPS of them a second, without the last row or column where that is odd (H.264
+    has colours of two by two pixels). Raises NeecoError where PyAV is missing, images differ in size, or the disk
+    refuses."""
+    require_pyav()
+    import av
+
+    cameras = DrawnCameras.of(images, scene.recorded, (view.camera for view in views))
+    if len(sizes := {(camera.width, camera.height) for camera in (cameras(view.camera) for view in views)}) != 1:
+        raise NeecoError(f"--video: images of {len(sizes)} sizes; give --size")
+    width, height = (2 * (side // 2) for side in sizes.pop())
+
+    def frames() -> Iterator[av.VideoFrame]:
+        for done, view in enumerate(views, 1):
+            image = to_bytes(draw(scene, view.state, cameras(view.camera)).image)[:height, :width]
+            yield av.VideoFrame.from_ndarray(np.ascontiguousarray(image.numpy()), format="rgb24")
+            on_progress(done)
+
+    def write(temporary: Path) -> None:
+        with av.open(str(temporary), "w", format="mp4", options={"movflags": "faststart"}) as container:
+            stream = container.add_stream("h264", rate=FPS, options=QUALITY)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            for frame in frames():
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+
+    write_atomically(path, write)

@@ -1,4 +1,4 @@
-"""Samplers of views, and of the state and camera of image `index`.
+"""Samplers of views, and of the state and camera of image `index`; the cameras that render them.
 
 Views: recorded cameras, cameras near them, cameras in orbit about the tissue.
 """
@@ -6,7 +6,7 @@ Views: recorded cameras, cameras near them, cameras in orbit about the tissue.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,11 +22,13 @@ from neeco.capture.model import RecordedStates, State, evenly_spaced
 from neeco.capture.readers import read_states
 from neeco.geometry.camera import Camera
 from neeco.geometry.distortion import rays_of_pixels
+from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid
 from neeco.labels.annotation import any_in_image, working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
-from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Views
+from neeco.scene.drawable import Recorded
+from neeco.synthesis.settings import PATH_PREFIX, RECORDED_SIZE, SAMPLERS, ImageSettings, SizeSettings, Views
 from neeco.synthesis.states import (
     ExtrapolatedStates,
     GridStates,
@@ -265,3 +267,36 @@ def surface_centre(scene: GaussianScene) -> np.ndarray:
     if len(seen) == 0:
         raise NeecoError("--views orbit: the scene shows no surface to orbit about; use --views recorded")
     return np.median(seen, axis=0)
+
+
+@dataclass(frozen=True)
+class DrawnCameras:
+    """Maps cameras with recorded intrinsics to those that render. `lens`: the recording's, where distortion is
+    wanted."""
+
+    size: SizeSettings
+    lens: Lens | None = None
+
+    @classmethod
+    def of(cls, images: ImageSettings, recorded: Recorded, cameras: Iterable[Camera]) -> DrawnCameras:
+        """Return the cameras that `images` request. Raises NeecoError for invalid settings, a recording without a lens,
+        and a camera among `cameras` whose images have another shape."""
+        images.check()
+        if images.lens and recorded.lens is None:
+            raise NeecoError(
+                "--lens: the scene's capture does not tell of its lens; ingest the recording again and train on it, or "
+                "leave --lens out"
+            )
+        found = cls(images, recorded.lens if images.lens else None)
+        for camera in cameras:
+            found(camera)
+        return found
+
+    def __call__(self, camera: Camera) -> Camera:
+        """The camera in the place of `camera`, a pinhole."""
+        seen = camera if self.lens is None else self.lens.distorted_camera(camera)
+        size = self.size.of(seen.width, seen.height)
+        return seen if size == (seen.width, seen.height) else seen.resized(*size)
+
+
+RECORDED_CAMERAS = DrawnCameras(RECORDED_SIZE)

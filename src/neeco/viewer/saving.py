@@ -18,8 +18,7 @@ from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene.gaussian_scene import require_gaussians
-from neeco.synthesis.cameras import DrawnCameras
-from neeco.synthesis.samplers import moved_camera
+from neeco.synthesis.samplers import DrawnCameras, moved_camera
 from neeco.synthesis.settings import RECORDED_SIZE, Settings, SizeSettings
 from neeco.synthesis.writers.folder import encoded_sample, load_record, record_path
 
