@@ -142,8 +142,7 @@ def import_modules() -> None:
 
 def hasten_ingest() -> None:
     """Let structure from motion be answered from known cameras (as in tests/ingest)."""
-    from neeco.ingest.cameras.sfm import StructureFromMotion
-    from neeco.ingest.cameras.sfm import Attempt, strategies
+    from neeco.ingest.cameras.sfm import Attempt, StructureFromMotion, strategies
 
     world = module_at(TESTS / "ingest" / "conftest.py", "ingest_world")
     known = world.Recorded(world.World(Path(os.devnull)))

@@ -14,26 +14,26 @@ from source_trees import module_paths, module_trees
 
 # lines of Python: the limit, and the aim
 ROOMS = {
-    "cli": (2100, 1700),
-    "viewer": (2850, 2100),
-    "report": (1700, 1500),
-    "studies": (3300, 2600),
-    "ingest": (18_100, 10_500),
-    "tracking": (1440, 1200),
-    "synthesis": (4400, 3200),
-    "evaluation": (1550, 1200),
-    "labels": (950, 800),
-    "methods": (6200, 3500),
-    "training": (2050, 1700),
+    "cli": (2080, 1700),
+    "viewer": (2910, 2100),
+    "report": (1590, 1500),
+    "studies": (3040, 2600),
+    "ingest": (18_070, 10_500),
+    "tracking": (1420, 1200),
+    "synthesis": (4340, 3200),
+    "evaluation": (1400, 1200),
+    "labels": (920, 800),
+    "methods": (5660, 3500),
+    "training": (2020, 1700),
     "states": (3400, 2600),
     "evidence": (300, 1200),
     "scene": (2000, 1800),
-    "capture": (5100, 3900),
-    "raster": (4050, 3800),
-    "geometry": (950, 1000),
-    "base": (1600, 1500),
+    "capture": (4980, 3900),
+    "raster": (4060, 3800),
+    "geometry": (1000, 1000),
+    "base": (1590, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (330, 240), (3750, 3000), (980, 300)
+FILES, FUNCTIONS, NUMBERS = (307, 240), (3629, 3000), (704, 300)
 
 
 def lines_of_rooms() -> Counter[str]:
