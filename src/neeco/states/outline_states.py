@@ -1,6 +1,6 @@
 """Sizes of the errors of recorded states, and states that are wrong altogether, from where images show an instrument.
 
-Fits of all states (`link_states`) say how far each is off and how well that is known. The standard deviations under
+Fits of all states (`outline_fit`) say how far each is off and how well that is known. The standard deviations under
 which these corrections are most likely (restricted maximum likelihood of variance components: Patterson, Thompson,
 Biometrika 1971) replace those that were expected where they are clearly larger.
 """
@@ -26,8 +26,7 @@ from neeco.states.refinement import Refinement, Verdict
 class OutlineStatesSettings:
     """Settings of the search by outlines."""
 
-    # standard deviations of errors that are tried: tilts, roll (rad), across, depth (mm), revolute (rad), prismatic
-    # (mm)
+    # standard deviations of errors that are tried: tilts, roll (rad), across, depth (mm), joints (rad, or mm of slides)
     tried: tuple[float, ...] = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
     # of a state that is wrong altogether, about each of its starts
     wrong: tuple[float, ...] = (12 * DEG, 30 * DEG, 4.0, 8.0, 20 * DEG, 8.0)
