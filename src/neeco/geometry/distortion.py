@@ -18,7 +18,7 @@ class DistortionSettings:
 
     max_slope: float = 3.0  # (72 degrees) of a ray that a lens may bend into the image
     max_miss_px: float = 0.05  # distance of a distorted ray from the pixel that it was found for
-    n_newton_steps: int = 6
+    n_newton_steps: int = 6  # at most, from a first guess
     node_spacing_px: int = 4  # between pixels whose rays are computed; the others are interpolated, to 0.01 px
     derivative_step: float = 1e-6  # slope, over which the derivative of a distortion is taken
 

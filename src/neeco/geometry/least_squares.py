@@ -19,8 +19,8 @@ class DampingSettings:
 
     max_trials: int = 6  # steps, each shorter, before a state counts as the minimum
     damping_factor: float = 4.0  # by which damping grows after a trial that fails, and falls after a step
-    min_damping: float = 1e-6  # the least; and that at which a step counts as undamped
-    free_damping: float = 1e-5
+    min_damping: float = 1e-6  # the least
+    free_damping: float = 1e-5  # at which a step counts as undamped
 
 
 DAMPING = DampingSettings()

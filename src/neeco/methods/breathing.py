@@ -27,11 +27,11 @@ class BreathingSettings:
     """Settings of the search for breathing."""
 
     n_harmonics: int = 2  # breath is no pure sine: the pause after breathing out is longer
-    n_control_points: int = 24
+    n_control_points: int = 24  # of the tissue's motion
     max_frames: int = 240  # in which displacements are measured
     n_pixels: int = 96 * 77  # of the images in which they are measured: the motion is a pixel or two there
     robust_scale: float = 0.04  # of white: larger residuals have little weight (instruments, highlights)
-    n_reweightings: int = 4
+    n_reweightings: int = 4  # of the robust fit
     periods_s: tuple[float, float] = (1.5, 10.0)  # of breath
     min_breaths: float = 2.0  # in the recording, so that the second confirms the first
     oversampling: int = 8  # periods tried per independent frequency

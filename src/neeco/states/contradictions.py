@@ -41,10 +41,10 @@ class ContradictionSettings:
     start_scale: float = 3.0  # of the prior about another start, times usual errors
     suspect: float = 1.0  # robust standard deviations of a log misfit above which a state may be wrong
     alike: float = 1.15  # times a state's misfit, below which the mirrored state may be right instead
-    n_own: int = 12  # starts sampled from the prior about a recorded state, and about another
-    n_near: int = 64
-    max_share: float = 1 / 3  # of all frames
-    max_suspects: int = 24
+    n_own: int = 12  # starts sampled from the prior about a recorded state
+    n_near: int = 64  # starts sampled from the prior about another state
+    max_share: float = 1 / 3  # of all frames, that are judged again though they are no outliers
+    max_suspects: int = 24  # the same, as a number of frames
     max_named: int = 8  # frames in a line
 
 

@@ -34,7 +34,7 @@ class CropSettings:
     n_trimmings: int = 5  # of pixels that a linear map of colours does not explain: instruments and foreground
     same_color: float = 0.02  # mean difference of colours in [0, 1] below which they are left as they are
     max_unexplained: float = 0.5  # of the colours' standard deviation
-    gain_range: tuple[float, float] = (0.2, 3.0)
+    gain_range: tuple[float, float] = (0.2, 3.0)  # of a colour's light, within which a map is plausible
 
 
 CROPS = CropSettings()

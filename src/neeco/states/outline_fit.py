@@ -29,20 +29,20 @@ class OutlineFitSettings:
     """Settings of the fit of outlines to colours."""
 
     bins: int = 24  # of colours, per channel
-    smooth_bins: float = 0.8
+    smooth_bins: float = 0.8  # standard deviation of the smoothing of a histogram, in bins
     common: float = 0.05  # share of pixels whose colour says nothing
-    block_px: int = 8  # blocks of cells that are chosen together; grid on which colours are attributed
-    grid_px: int = 4
+    block_px: int = 8  # of blocks of cells that are chosen together
+    grid_px: int = 4  # of the grid on which colours are attributed
     # pixels that count as one: errors of outlines and of the model are correlated along them
     correlated_px: float = 12.0
-    max_ratio: float = 3.0  # of likelihoods that count in a misfit; and blocks' worth of them, at least
-    min_blocks: float = 40.0
+    max_ratio: float = 3.0  # of log likelihoods that count in a misfit
+    min_blocks: float = 40.0  # blocks' worth of the largest ratio, that an instrument counts for at least
     ears_mm: float = 15.0  # before the first joint, that count neither as shaft nor as beyond it
-    base_sd_rad: float = 0.035
-    base_sd_mm: float = 3.0
-    tube_tilt_sd: float = 0.1  # of the shaft's axis and end, where no trocar gives the axis
-    end_sd_mm: float = 6.0
-    least_end_mm: float = -10.0
+    base_sd_rad: float = 0.035  # of the error that all states share
+    base_sd_mm: float = 3.0  # of the error that all states share
+    tube_tilt_sd: float = 0.1  # rad, of the shaft's axis where no trocar gives it
+    end_sd_mm: float = 6.0  # of the shaft's end, there
+    least_end_mm: float = -10.0  # of the shaft's end before the first pivot, there
     steps: tuple[float, float] = (0.002, 0.05)  # rad, mm, of differences
     parameter_step: float = 0.02  # standard deviations
     max_step_sds: float = 3.0  # of one step

@@ -25,34 +25,34 @@ class OutlineModelSettings:
 
     tube_mm: float = 150.0  # of the root link that is modelled
     nearest_mm: float = 8.0  # depth at which cones are cut off
-    pivot_sd_mm: float = 1.2  # of what is stated; values of joints include shapes' errors
-    axis_sd_rad: float = 0.06
-    offset_sd_rad: float = 0.05
+    pivot_sd_mm: float = 1.2  # of stated pivots
+    axis_sd_rad: float = 0.06  # of stated axes
+    offset_sd_rad: float = 0.05  # of stated offsets of revolute joints, which include errors of shapes
     # of an outermost link's direction from the tube's at rest: a curved jaw looks like an offset
     heading_sd_rad: float = 0.15
     slide_sd_mm: float = 1.0  # of the offset of a prismatic joint
     play_sd_rad: float = 0.012  # by which readings lag behind, or lead, with the sign of motion
-    play_sd_mm: float = 0.3
+    play_sd_mm: float = 0.3  # the same, of prismatic joints
     motion_steps: int = 2  # moments before and after, between which the sign of motion is taken
-    tilt_sd_rad: float = 0.03  # of the tube's axis about its first guess, and from the first pivot
-    aside_sd_mm: float = 0.7
-    log_radius_sd: float = 0.4  # of radii, and of the ratio of one link's to its parent's
-    ratio_sd: float = 0.3
+    tilt_sd_rad: float = 0.03  # of the tube's axis about its first guess
+    aside_sd_mm: float = 0.7  # of the tube's axis from the first pivot
+    log_radius_sd: float = 0.4  # of the tube's radius
+    ratio_sd: float = 0.3  # of the logarithm of the ratio of one link's radius to its parent's
     flat_sd: float = 0.2  # of the relative change of a radius with the viewing direction
     ears_mm: float = 6.0  # from the tube's end to the first pivot
-    ears_sd_mm: float = 3.0
-    length_mm: float = 13.0  # of outermost links, and of the difference between them
-    length_sd_mm: float = 5.0
-    unequal_sd_mm: float = 1.5
-    tube_radius_mm: float = 3.8  # first guesses; of outermost links
-    taper: float = 0.5
-    min_radius_mm: float = 0.2
-    min_length_mm: float = 2.0
+    ears_sd_mm: float = 3.0  # of that distance
+    length_mm: float = 13.0  # of outermost links
+    length_sd_mm: float = 5.0  # of that length
+    unequal_sd_mm: float = 1.5  # of the difference between the lengths of outermost links
+    tube_radius_mm: float = 3.8  # first guess
+    taper: float = 0.5  # first guess, of outermost links: ratio of their radii
+    min_radius_mm: float = 0.2  # of any cone
+    min_length_mm: float = 2.0  # of an outermost link
     max_bend_mm: float = 1.5  # of a logged pose's line from the trocar, rms
     min_pivot_mm: float = 5.0  # from the root's origin, for a direction
     max_along: float = 0.9  # cosine between a joint's axis and the shaft, above which it turns the shaft about itself
     min_motion: float = 0.02  # standard deviation of a joint's value, rad, from which it bends
-    min_slide_mm: float = 0.5
+    min_slide_mm: float = 0.5  # standard deviation of a prismatic joint's value, from which it moves
 
 
 MODEL = OutlineModelSettings()

@@ -37,11 +37,11 @@ class OutlineStatesSettings:
     # of the errors tried, the least that is assumed of any parameter where those of another are large
     min_share: float = 0.5
     min_factor: float = 2.0  # times these, from which a size counts
-    em_steps: int = 200
+    em_steps: int = 200  # of expectation maximisation
     max_estimated: int = 30  # states from which sizes are estimated
-    bad_mads: float = 6.0  # median absolute deviations, and more than the median, from which a state is bad
-    bad_misfit: float = 0.08
-    bad_weight: float = 0.02
+    bad_mads: float = 6.0  # median absolute deviations above the median, from which a misfit is bad
+    bad_misfit: float = 0.08  # above the median, from which a misfit is bad, at least
+    bad_weight: float = 0.02  # of bad states in the fit of what all states share
     large_sds: float = 1.8  # root mean square of a correction in standard deviations
     max_usual_misfit: float = 0.25  # median, above which colours do not show the instrument
     max_misfit: float = 0.4  # from which a state is wrong even where nothing explains it better

@@ -23,12 +23,12 @@ class PredictionSettings:
     """Settings of the prediction."""
 
     n_blocks: int = 6  # stretches of the recording, left out one after the other
-    min_instants: int = 12
+    min_instants: int = 12  # with fewer, nothing is predicted
     min_explained: float = 0.1  # share of the corrections' variance: independent errors reach 0.06 by chance
     lengths: tuple[float, float, float, float] = (0.5, 1.0, 2.0, 4.0)  # of the kernel, in units of features
     # variance of a single instant's correction over the kernel's
     noises: tuple[float, float, float, float] = (0.1, 0.3, 1.0, 3.0)
-    jitter: float = 1e-6
+    jitter: float = 1e-6  # added to the kernel's diagonal
     # median absolute deviations of the corrections of states that were not wrong altogether
     max_deviations: float = 8.0
 

@@ -26,11 +26,11 @@ class SearchSettings:
 
     # standard deviations of states by a robot's log and a rough base: of the shaft's tilt and roll (degrees), of the
     # origin across the view and in depth (mm), of joints (degrees)
-    tilt: float = 2.0
-    roll: float = 6.0
-    across: float = 0.4
-    depth: float = 1.5
-    joint: float = 4.0
+    tilt: float = 2.0  # degrees
+    roll: float = 6.0  # degrees
+    across: float = 0.4  # mm
+    depth: float = 1.5  # mm
+    joint: float = 4.0  # degrees
     largest: float = 1.5  # times them, of errors that are looked for
     usual: float = 0.15  # times them: a tracker's errors
     # classes of errors that tell: a tracker's across the view are as large as a robot's
@@ -39,8 +39,8 @@ class SearchSettings:
     kept_share: float = 0.85  # of squared corrections that count, without the largest
     correlation_px: float = 100.0  # pixels that count as one observation, as the scene is still learned
     beyond_limits: float = 0.5  # of the range of a joint's limits, by which readings may be off
-    levels: tuple[float, float, float] = (0.25, 0.5, 1.0)
-    steps: tuple[int, int, int] = (4, 4, 4)
+    levels: tuple[float, float, float] = (0.25, 0.5, 1.0)  # sizes of the images compared, as shares of the view's
+    steps: tuple[int, int, int] = (4, 4, 4)  # of Levenberg-Marquardt, at each
     n_sampled: int = 16  # frames by which errors are sized
     large: float = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
     scale: float = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are

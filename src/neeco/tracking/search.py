@@ -24,7 +24,7 @@ class TrackSearchSettings:
 
     # along the shaft: its teeth, rings and end hold a fit where it was
     shifts_mm: tuple[float, ...] = (-5.0, -2.5, 0.0, 2.5, 5.0)
-    rolls_deg: tuple[float, float, float] = (-8.0, 0.0, 8.0)
+    rolls_deg: tuple[float, float, float] = (-8.0, 0.0, 8.0)  # tried about a prediction
     n_samples: int = 48  # of the prediction
     prior_scale: float = 3.0  # by which the prediction's standard deviations are widened
     n_fitted_near: int = 3  # starts near the prediction that are fitted
@@ -34,10 +34,11 @@ class TrackSearchSettings:
     n_turned: int = 3  # of the best one with other rolls and joints
     n_finalists: int = 2  # fitted at full size
     apart_mm: float = 8.0  # closer states lead to the same fit
-    apart_deg: float = 15.0
-    apart_joint_deg: float = 15.0
+    apart_deg: float = 15.0  # the same, of turns
+    apart_joint_deg: float = 15.0  # the same, of joints
+    # of states that look alike
     other_rolls_deg: tuple[float, ...] = (-90.0, -60.0, -40.0, -25.0, 25.0, 40.0, 60.0, 90.0, 180.0)
-    other_joints_deg: tuple[float, float] = (-15.0, 15.0)
+    other_joints_deg: tuple[float, float] = (-15.0, 15.0)  # of states that look alike
     mm_per_deg: float = 0.25  # of prismatic joints, wherever a number of degrees is asked for
 
 

@@ -47,19 +47,19 @@ class TrackTrustSettings:
     min_misfit: float = 0.08  # smaller ones count as much: about 4 of 255 grey levels
     min_error: float = 0.012  # the same, of a pixel's colour in [0, 1]
     half_trust_misfit: float = 4.0  # times the usual one, where `explained` is 1/2
-    steepness: float = 4.0
+    steepness: float = 4.0  # of the fall of `explained` about there
     # from the nearest recorded direction: the misfit must be half as large, since the scene is a guess
     halving_deg: float = 8.0
     min_observed: float = 0.9  # of the share in the worst reference frame, that counts as fully observed
     confident: float = 0.9  # product of the other factors below which another state is searched for
-    n_others_fitted: int = 2
+    n_others_fitted: int = 2  # of the states that are searched for
     # deg, mm, deg of joints: standard deviations of the other state
     other_prior: tuple[float, float, float] = (20.0, 5.0, 20.0)
     # sizes of the images compared, and steps at each
     other_levels: tuple[tuple[float, int], tuple[float, int]] = ((0.25, 4), (0.5, 2))
     max_other_misfit: float = 2.0  # times that of the fit: of states that are not fitted further
     other_deg: float = 10.0  # closer states are the same
-    other_joint_deg: float = 8.0
+    other_joint_deg: float = 8.0  # the same, of joints
     misfit_ratios: tuple[float, float] = (1.3, 1.0)  # of another state: where `single` is 1, and where it is lowest
     ambiguous: float = 0.6  # by which it is lowered there
     wrong_deg: float = 10.0  # error of rotation or a joint with which a state is wrong

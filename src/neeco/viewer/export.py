@@ -48,9 +48,9 @@ class ExportSettings:
     """Limits of what an exported page holds."""
 
     embedded_degree: int = 1  # in a report: half the size, and for a first look
-    max_instruments: int = 8  # that the page's rasteriser has room for; axes of one instrument
-    max_axes: int = 8
-    max_labels: int = 32
+    max_instruments: int = 8  # that the page's rasteriser has room for
+    max_axes: int = 8  # of one instrument
+    max_labels: int = 32  # that the page's rasteriser has room for
     thinnest_mm: float = 0.01  # thinner than any pixel
     position_steps: int = 2**20 - 1  # of a body's box: 2**16 change the order in depth of neighbours, which costs 5 dB
 

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 class PanelSettings:
     """Settings of the panel's sliders and plots."""
 
-    slide_mm: float = 30.0
-    yaw_deg: float = 45.0
+    slide_mm: float = 30.0  # of the sliders of position, to either side
+    yaw_deg: float = 45.0  # of the sliders of yaw and pitch, to either side
     plots_every_s: float = 0.5  # while more becomes known
     plot_height: int = 140  # px
     line: int = 80  # characters of a name or message that are shown

@@ -33,15 +33,15 @@ class ViewerSettings:
     """Settings of what a viewer renders, and when."""
 
     settled_s: float = 0.15  # without a request: what is shown stands still and is rendered sharp
-    idle_s: float = 0.5
+    idle_s: float = 0.5  # at most, between two looks for something to render
     moving_px: int = 256  # high, at most
     sharp_px: int = 720
-    min_px: int = 32
-    moving_s: float = 0.15  # that rendering may take
-    sharp_s: float = 0.4
+    min_px: int = 32  # high, at least
+    moving_s: float = 0.15  # that rendering may take while something moves
+    sharp_s: float = 0.4  # that a sharp rendering may take
     remembered: int = 3  # renderings; a single one that had to compute something first does not count
-    jpeg_moving: int = 80
-    jpeg_sharp: int = 92
+    jpeg_moving: int = 80  # quality while something moves
+    jpeg_sharp: int = 92  # quality of a sharp rendering
     played_per_s: float = 10.0  # frames of `play`
     status_every_s: float = 0.25  # while things move
 

@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 class SceneSettings:
     """Sizes and limits of what the viewer places in a scene."""
 
-    max_aspect: float = 8.0
-    narrowest: float = 0.01  # rad
-    widest: float = 3.0
+    max_aspect: float = 8.0  # of a window's width to its height, or the reverse
+    narrowest: float = 0.01  # rad, field of view
+    widest: float = 3.0  # rad, field of view
     same_place: float = 2e-4  # of the distance to what is looked at
     same_turn: float = 1e-3  # rad
-    max_frusta: int = 24
-    max_points: int = 20_000
-    frustum_units: float = 0.06 * VIEW.distance_units
-    gizmo_units: float = 0.2 * VIEW.distance_units
-    point_units: float = 0.005 * VIEW.distance_units
+    max_frusta: int = 24  # of cameras
+    max_points: int = 20_000  # of a sparse cloud
+    frustum_units: float = 0.06 * VIEW.distance_units  # size of a camera's frustum
+    gizmo_units: float = 0.2 * VIEW.distance_units  # length of axes
+    point_units: float = 0.005 * VIEW.distance_units  # size of a point
 
 
 SCENE = SceneSettings()

@@ -28,24 +28,24 @@ class MaskSettings:
     min_share: float = 1e-7  # of a colour that never occurs
     # before a still scope
     min_area: float = 0.001  # share of the image
-    margin_px: int = 4  # about what moves: neither colour counts; the background does not
-    hidden_px: int = 3
-    min_odds: float = 0.5  # logarithms
-    certain_odds: float = 1.0
-    tissue_odds: float = -2.0
-    smooth_px: float = 1.5  # over which odds are averaged, at first and for outlines
-    outline_px: float = 0.7
+    margin_px: int = 4  # about what moves, where its colour counts for neither side
+    hidden_px: int = 3  # about what moves, where the background does not count
+    min_odds: float = 0.5  # logarithm, from which colours belong to a piece in the first pass
+    certain_odds: float = 1.0  # logarithm, from which a pixel is instrument by its colour alone
+    tissue_odds: float = -2.0  # logarithm, up to which a pixel that moves is tissue
+    smooth_px: float = 1.5  # over which odds are averaged, at first
+    outline_px: float = 0.7  # over which odds are averaged for outlines
     moving_share: float = 0.2  # of a piece with the instrument's colours
     min_seen: float = 0.02  # share of images that show the background, without which it is unknown
     # before a scope that moves
-    may_move: float = 0.3  # shares of neighbours in time against which a pixel moves
-    moves: float = 0.7
-    still: float = 0.2
-    flow_min_odds: float = 1.0
-    flow_outline_odds: float = 0.5
+    may_move: float = 0.3  # share of neighbours in time against which a pixel moves, from which it may be an instrument
+    moves: float = 0.7  # the same share, from which its colour counts as an instrument's
+    still: float = 0.2  # the same share, up to which its colour counts as tissue
+    flow_min_odds: float = 1.0  # logarithm, from which colours belong to a piece
+    flow_outline_odds: float = 0.5  # logarithm, from which a pixel is instrument in the end
     n_rounds: int = 4  # each with the colours of the masks before
     flow_min_area: float = 0.004  # share of the image
-    flow_outline_px: float = 1.0
+    flow_outline_px: float = 1.0  # over which odds are averaged for outlines
     flow_moving_share: float = 0.3  # of a piece with the instrument's colours
 
 

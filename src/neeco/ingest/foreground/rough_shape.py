@@ -29,13 +29,13 @@ class RoughShapeSettings:
     min_agreement: float = 0.3  # share of the frames in which a point of the instrument lies on moving pixels
     # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
     min_relative: float = 0.85
-    lag_cells: int = 16  # of the grid for lags, per side; lags that are tried
-    lag_step_s: float = 0.1
-    max_lag_s: float = 60.0
+    lag_cells: int = 16  # of the grid for lags, per side
+    lag_step_s: float = 0.1  # between lags that are tried
+    max_lag_s: float = 60.0  # of lags that are tried
     min_known: float = 0.5  # share of the frames that need a pose at a lag
     lag_gain: float = 1.1  # ratio of agreement to that at 0 and at all other lags
-    lag_peak: float = 0.8  # share of the best agreement, and s about its lag, of the weighted mean
-    lag_lobe_s: float = 0.5
+    lag_peak: float = 0.8  # share of the best agreement, from which a lag counts in the weighted mean
+    lag_lobe_s: float = 0.5  # about the best lag, within which lags count in it
     margin_px: int = 6  # about its projection
     nearest_mm: float = 1e-3  # in front of the camera
 

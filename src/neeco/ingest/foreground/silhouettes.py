@@ -18,7 +18,7 @@ class ShaftLineSettings:
     edge_px: int = 2  # from the image's border, within which a piece continues beyond it
     entering: float = 0.5  # share of a piece that its line is fitted to; px long at least
     min_slices: int = 6
-    line_rounds: int = 4
+    line_rounds: int = 4  # of the robust fit of a line
     smooth_px: float = 1.5  # of distances: the steps of a mask's outline would be taken for its shape
 
 

@@ -49,22 +49,22 @@ from neeco.states.outline_model import ArticulatedModel, bends, joint_values, wi
 class ArticulatedSettings:
     """Settings of the search for a base by links."""
 
-    start_frames: int = 16  # on which starts are compared, and that the result is fitted to
-    fit_frames: int = 48
+    start_frames: int = 16  # on which starts are compared
+    fit_frames: int = 48  # that the result is fitted to
     along_mm: tuple[float, float, float, float] = (-10.0, -5.0, 5.0, 10.0)  # starts along the shaft
     rolls_rad: tuple[float, float] = (-0.25, 0.25)  # starts turned about it
     n_refined: int = 3  # starts that are fitted to all frames
     apart_mm: float = 3.0  # between results that count as different
-    apart_rad: float = 0.035
+    apart_rad: float = 0.035  # between results that count as different
     # added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
     floor_mm: float = 0.25
-    floor_depth_mm: float = 0.35
-    floor_deg: float = 0.25
+    floor_depth_mm: float = 0.35  # the same, along the view
+    floor_deg: float = 0.25  # the same, of turns
     scatter: float = 1.3  # factor on standard deviations; assumed, as the floors are: few recordings were measured
-    usual_overlap: float = 0.85  # of the silhouette with the masks, and by which another base betters the stated
-    min_gain: float = 0.1
-    least_overlap: float = 0.4  # beyond, nothing is found
-    max_residual_px: float = 2.5
+    usual_overlap: float = 0.85  # of the silhouette with the masks, of a right base
+    min_gain: float = 0.1  # of that overlap, by which another base betters the stated one
+    least_overlap: float = 0.4  # below, nothing is found
+    max_residual_px: float = 2.5  # above, nothing is found
     reversed_share: float = 0.8  # of the cost, from which a joint counts as reversed
     min_exchanged: float = 1.25  # times the cost, with poses of other moments
     max_sds: float = 3.2  # from its prior, by which a stated length or angle, or the base, may be off

@@ -37,10 +37,10 @@ class ArticulatedFitSettings:
     parameter_step: float = 0.1  # of differences, in standard deviations of priors
     inside_px: float = -0.7  # of another cone's outline, from which a point is no outline
     max_turn_rad: float = 0.15  # of one step
-    max_shift_mm: float = 12.0
-    max_sds: float = 2.0
-    damping: float = 1e-2
-    tolerance: float = 1e-4
+    max_shift_mm: float = 12.0  # of one step
+    max_sds: float = 2.0  # of one step of the model's parameters
+    damping: float = 1e-2  # of Levenberg-Marquardt, at first
+    tolerance: float = 1e-4  # share of the cost, below which steps end
     pose_blocks: int = 2  # of the recording, after which errors of logged poses are independent
 
 

@@ -27,7 +27,7 @@ class TextureSettings:
     max_shift_px: float = 14.0  # of a first fit
     noise: float = 0.04  # standard deviation of the logarithm of a colour
     dark: float = 12.0  # of 255, added before logarithms are taken
-    n_rounds: int = 5
+    n_rounds: int = 5  # of shifts against the template
     min_marked: float = 0.5  # share of the frames, whose shift must be known
     min_overlap: float = 0.6  # of the template's information, that a frame must show
     max_sd_px: float = 1.0  # of a frame's shift

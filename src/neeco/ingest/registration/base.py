@@ -43,19 +43,19 @@ class BaseSettings:
     """Settings of the search for a base, and of what counts as undetermined."""
 
     min_frames: int = 12  # that show a shaft
-    search_frames: int = 40  # on which starts are compared, and that the result is fitted to
-    fit_frames: int = 140
+    search_frames: int = 40  # on which starts are compared
+    fit_frames: int = 140  # that the result is fitted to
     n_blocks: int = 10  # stretches of a recording whose errors are taken to be independent
-    size_factors: tuple[float, float] = (1.25, 1.1)  # by which the scale is varied, and how often at most
-    max_size_steps: int = 8
-    log_size_range: float = 0.15  # of the loss about its minimum
-    size_samples: int = 9
+    size_factors: tuple[float, float] = (1.25, 1.1)  # by which the scale is varied
+    max_size_steps: int = 8  # in one direction, of each factor
+    log_size_range: float = 0.15  # about the size, over which the loss is sampled
+    size_samples: int = 9  # of the loss over that range
     min_overlap_ratio: float = 0.95  # to the overlap before: less of an instrument fits more easily
     min_overlap: float = 0.25  # of the instrument's silhouette with the masks
     # Standard deviations that more frames do not lower, as wrists and jaws blur the tip: of the logarithm of the
     # size, and of the place along the shaft, which a rigid shape hardly determines (measured once)
     size_sd: float = 0.03
-    along_sd_mm: float = 4.0
+    along_sd_mm: float = 4.0  # of the place along the shaft
     radius_range_mm: tuple[float, float] = (1.5, 5.5)  # of shafts; one outside is first taken to be typical
     lever_mm: float = 40.0  # from the instrument's middle, at which a turn counts as a shift
     open_sd_mm: float = 3.0  # at that lever, from which a direction counts as undetermined

@@ -38,9 +38,9 @@ class FindBasesSettings:
     min_bend_mm: float = 2.0  # from the root to the logged link: nearer, nothing bends there
     min_read_share: float = 0.5  # of the frames, that a joint's log has to cover: those without a reading are left out
     min_overlap: float = 0.85  # of an instrument's outline with what moves, where its place is corrected
-    min_overlap_gain: float = 0.2
-    max_prior_mm: float = 8.0  # standard deviations of a place, from which outlines find it
-    max_prior_deg: float = 5.0
+    min_overlap_gain: float = 0.2  # of that overlap over the one before
+    max_prior_mm: float = 8.0  # standard deviation of a place, up to which outlines find it
+    max_prior_deg: float = 5.0  # the same, of its turn
     min_travel_mm: float = 2.0  # root mean square, from which an arm counts as moving
 
 

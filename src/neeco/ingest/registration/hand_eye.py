@@ -29,7 +29,7 @@ from neeco.ingest.timing.clock_search import SCOPE_MOTION, SEARCH, ClockOffset, 
 class HandEyeSettings:
     """Settings of the calibration."""
 
-    min_frames: int = 12
+    min_frames: int = 12  # that fall on the log
     # rad, spread of the scope's directions below which the hand-eye rotation is not determined
     min_turn_rad: float = 0.05
     min_travel_mm: float = 3.0  # mm, spread of the scope's positions below which the scale is not determined
@@ -39,8 +39,8 @@ class HandEyeSettings:
     correlated_s: tuple[float, float, float] = (0.1, 0.3, 1.0)
     # bins of the autocovariance: a frame with itself, with later ones
     lags_s: tuple[float, ...] = (0.0, 1e-6, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
-    placed_mm: float = 1.0  # standard deviations of the cameras' place in the tracker's frame: usual, or less
-    placed_deg: float = 0.7
+    placed_mm: float = 1.0  # standard deviation of the cameras' place in the tracker's frame: usual, or less
+    placed_deg: float = 0.7  # the same, of their turn
 
 
 HAND_EYE = HandEyeSettings()

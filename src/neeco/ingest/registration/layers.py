@@ -24,21 +24,22 @@ class LayerSettings:
     """Settings of the fit of layers."""
 
     radius_mm: float = 3.8  # of a shaft
-    log_radius_sd: float = 0.2
+    log_radius_sd: float = 0.2  # of its logarithm
     ahead_mm: float = 8.0  # from the logged frame's origin to the instrument's end
-    ahead_sd_mm: float = 6.0
+    ahead_sd_mm: float = 6.0  # of that distance
     length_mm: float = 140.0  # of the shaft that is modelled
     max_wrist_mm: float = 40.0  # length beyond the bend
-    widths_px: tuple[int, int, int] = (40, 80, 160)  # of images, one after the other, and how many of them
-    n_images: tuple[int, int, int] = (30, 36, 48)
+    widths_px: tuple[int, int, int] = (40, 80, 160)  # of images, one after the other
+    n_images: tuple[int, int, int] = (30, 36, 48)  # of each width
     color_scale: float = 20.0  # of 255, of the robust loss on colours
-    step_mm: float = 2.0  # cells of the shaft's colours along it, and across
-    n_columns: int = 5
+    step_mm: float = 2.0  # of the cells of the shaft's colours, along it
+    n_columns: int = 5  # of these cells, across it
     min_background: float = 2.0  # images that show a pixel's background, for it to count
     prior_weight: float = 1e-4  # of the mean loss: cost of a parameter one standard deviation off
-    # cross-entropy search: bases tried and rounds at first, then in each size of image
-    n_first: int = 400
-    first_sd: float = 1.2
+    # cross-entropy search of the base
+    n_first: int = 400  # bases tried at first
+    first_sd: float = 1.2  # standard deviations of the prior, of bases tried at first
+    # bases and rounds, in each size of image
     n_tried: tuple[tuple[int, int], tuple[int, int], tuple[int, int]] = ((60, 9), (30, 5), (24, 5))
     widening: float = 1.5  # of the search from one size of image to the next
     max_elite: int = 15  # of the bases tried, at most half, about which the next are tried
@@ -46,14 +47,14 @@ class LayerSettings:
     exchanged_shares: tuple[float, float] = (0.37, 0.61)  # of the recording, by which poses are shifted for comparison
     # standard deviations by which poses must explain images better than those of other moments
     min_certainty: float = 3.0
-    probe_sd: float = 0.25  # about the minimum, of the loss's second derivatives
-    n_probes: int = 140
-    size_sd: float = 0.03  # errors common to all images: of the distance, along, and anywhere
-    end_sd_mm: float = 4.0
-    edge_sd_mm: float = 1.0
+    probe_sd: float = 0.25  # standard deviations about the minimum, of probes for the loss's second derivatives
+    n_probes: int = 140  # of the loss about its minimum
+    size_sd: float = 0.03  # error common to all images: share of the distance
+    end_sd_mm: float = 4.0  # error common to all images, along the shaft
+    edge_sd_mm: float = 1.0  # error common to all images, in any direction
     min_curvature: float = 1e-4  # of the loss
-    grown: float = 1.3  # times the radius, and beyond the end, that a shaft is taken to cover
-    beyond_mm: float = 10.0
+    grown: float = 1.3  # times the radius, that a shaft is taken to cover
+    beyond_mm: float = 10.0  # beyond the end, that a shaft is taken to cover
     n_blocks: int = 10  # stretches of a recording whose errors are taken to be independent
 
 

@@ -35,8 +35,8 @@ class SilhouetteFitSettings:
     shape_sd_mm: tuple[float, float, float] = (10.0, 1.0, 0.7)
     joint_sd_mm: float = 2.0  # of what a standard deviation of a reading adds to any order
     level_sd_mm: float = 1.0  # of the difference of neighbouring radii: shafts are tubes
-    line_sd_mm: float = 30.0  # of the line about its first guess
-    line_sd_rad: float = 0.5
+    line_sd_mm: float = 30.0  # of shifts of the line about its first guess
+    line_sd_rad: float = 0.5  # of turns of the line about its first guess
     end_sd_mm: float = 4.0  # of what a standard deviation of a reading, or its square, moves the tip
     mark_sd_mm: float = 1e4  # of the marks' place along the line
     clock_sd_s: float = 0.1  # of a clock that nothing gives
@@ -45,12 +45,12 @@ class SilhouetteFitSettings:
     # of the robust loss, one after the other; px of masks 160 wide
     widths_px: tuple[float, ...] = (12.0, 6.0, 3.0, 1.5, 1.0)
     mark_share: float = 0.125  # of that width for marks, which are exact; outlines have correlated errors in a frame
-    max_steps: int = 12  # of Levenberg-Marquardt, at each width; share of the loss
-    tolerance: float = 1e-5
+    max_steps: int = 12  # of Levenberg-Marquardt, at each width
+    tolerance: float = 1e-5  # share of the loss, below which steps end
     damping: float = 1e-2  # at first
-    smooth_damping: float = 1e-4
+    smooth_damping: float = 1e-4  # at first, with smooth outlines
     max_turn_rad: float = 0.15  # of the base in one step
-    max_shift_mm: float = 15.0
+    max_shift_mm: float = 15.0  # of the base in one step
 
 
 RIGID_FIT = SilhouetteFitSettings()

@@ -30,11 +30,11 @@ class SilhouetteModelSettings:
     """Limits of the shape."""
 
     nearest_mm: float = 5.0  # depth at which points are projected at least
-    min_radius_mm: float = 0.3
+    min_radius_mm: float = 0.3  # at any station
     max_length_mm: float = 150.0  # of the line, from the tip
-    min_length_mm: float = 15.0
+    min_length_mm: float = 15.0  # of the line, from the tip
     radius_range_mm: tuple[float, float] = (0.5, 15.0)  # of a first guess
-    default_radius_mm: float = 3.0
+    default_radius_mm: float = 3.0  # where images show none
 
 
 RIGID = SilhouetteModelSettings()

@@ -23,23 +23,23 @@ from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSil
 class SilhouetteSearchSettings:
     """Settings of the search."""
 
-    n_rotations: int = 500  # tried about a rough base, and without one
-    n_uniform: int = 4000
+    n_rotations: int = 500  # tried about a rough base
+    n_uniform: int = 4000  # tried without one
     max_start_cost: float = 2.0  # of robust losses below 1 each, and the prior's
     typical_radius_mm: float = 3.5  # of shafts
     line_sd_rad: float = 0.03  # of a shaft's direction in a mask: jaws open, masks fray
     tip_sd_px: float = 5.0  # of masks: the tip's place moves with the jaws
-    line_sd_px: float = 2.0
-    tip_sd_mm: float = 60.0  # prior distance of the tip from the tracked frame's origin, or as stated
-    stated_tip_sd_mm: float = 5.0
+    line_sd_px: float = 2.0  # of masks: the distance of the tip from the line
+    tip_sd_mm: float = 60.0  # prior distance of the tip from the tracked frame's origin
+    stated_tip_sd_mm: float = 5.0  # prior distance of the tip from where links state it
     sideways_weight: float = 5e-4  # of a line's weight: where motion leaves it open, shafts are viewed from the side
     n_rounds: int = 3  # of robust reweighting
     chunk: int = 500  # rotations tried at once
     min_step_rad: float = 0.004  # to which rotations are narrowed down
-    n_first: int = 40  # candidates kept at first and then, rotations about each, results
-    n_next: int = 20
-    n_around: int = 12
-    n_best: int = 6
+    n_first: int = 40  # candidates kept at first
+    n_next: int = 20  # candidates kept in later rounds
+    n_around: int = 12  # rotations tried about each candidate
+    n_best: int = 6  # results
     distinct_rad: float = 0.05  # between results
     prior_weight: float = 0.02  # of the mean residual: cost of a base one standard deviation off
     far_cost: float = 1e9  # of a base behind the cameras

@@ -27,7 +27,7 @@ class GateSettings:
     gate_width_radii: float = 0.25  # width of that limit
     max_scale_radii: float = 0.6  # standard deviation of what turns, or its far end would swing out behind the joint
     max_gate_mm: float = 1e9  # where the radius is not known: everything is beyond the gate
-    max_gate_width_mm: float = 1e6
+    max_gate_width_mm: float = 1e6  # the same, of the gate's width
 
 
 GATE = GateSettings()

@@ -26,7 +26,7 @@ class HingeSearchSettings:
     gains: tuple[tuple[float, float], tuple[float, float]] = ((0.5, -0.5), (1.0, 0.0))
     small_gain: float = 0.3  # a smaller rotation, which tolerates rough evidence
     min_reading_range: float = 0.05  # rad: a joint that moves less is not searched
-    n_stick_points: int = 16
+    n_stick_points: int = 16  # of a stick, whose evidence is averaged
     n_hinge_angles: int = 36  # axis directions tried over half a turn
     n_hinge_depths: int = 10  # pivots tried along the front half
 

@@ -31,16 +31,16 @@ from neeco.training.session import GaussianSession
 class LinkRegistrationSettings:
     """Priors and settings of the registration."""
 
-    max_frames: int = 30
-    widths: tuple[int, int] = (20, 40)  # cells across the images compared, coarse to fine, and steps at each
-    max_steps: tuple[int, int] = (8, 4)
+    max_frames: int = 30  # compared
+    widths: tuple[int, int] = (20, 40)  # cells across the images compared, coarse to fine
+    max_steps: tuple[int, int] = (8, 4)  # of Levenberg-Marquardt, at each width
     cells_per_observation: float = 10.0  # of the finer images, whose errors are correlated
     evidence_sd: float = 0.3  # of a cell; beyond it, the cost is linear
     # of a residual; less where most frames have evidence, since the tissue's fit absorbed the instrument
     min_weight: float = 0.1
     edge_cells: float = 0.6  # width over which a silhouette fades
-    shaft_length_mm: float = 150.0  # of the shaft from its end; depth from which it is compared
-    nearest_mm: float = 5.0
+    shaft_length_mm: float = 150.0  # of the shaft that is compared, from its end
+    nearest_mm: float = 5.0  # depth from which it is compared
     # rad, mm: standard deviations of the frame's error about and along the shaft
     frame_sd: tuple[float, float] = (0.035, 2.0)
     # of the shape: tilts (rad) and shifts (mm) of the carved shaft, log radii, heading (rad) and log length of end
@@ -48,9 +48,9 @@ class LinkRegistrationSettings:
     shaft_sd: tuple[float, float, float, float] = (0.1, 0.1, 2.0, 2.0)
     log_radius_sd: float = 0.4
     end_sd: tuple[float, float] = (0.15, 0.4)
-    link_radius: float = 0.8  # in carved radii
-    end_radius: float = 0.4
-    end_length: float = 3.0
+    link_radius: float = 0.8  # of links between joints, in carved radii
+    end_radius: float = 0.4  # of end links, in carved radii
+    end_length: float = 3.0  # of end links, in carved radii
     step: float = 0.05  # finite differences, in standard deviations
     model_error: float = 2.0  # of a standard deviation by the evidence: errors of the model are common to all frames
     min_gain: float = 10.0  # of -log likelihood, from which a correction is made

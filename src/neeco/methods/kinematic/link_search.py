@@ -35,12 +35,12 @@ class LinkSearchSettings:
     shaft_share: float = 0.4  # of the seeds
     reach_radii: float = 7.0  # shaft radii beyond its pivot within which an end link is searched
     margin_radii: float = 2.0  # shaft radii about the pivots beyond it within which another link is searched
-    candidates_per_seed: int = 20
+    candidates_per_seed: int = 20  # sampled about a link
     evidence_tolerance: float = 0.03  # by which the evidence of another link may be larger
     # tolerances within which a carved shaft agrees with the line of the links at rest
-    min_cosine: float = 0.85
-    max_offset_radii: float = 1.5
-    max_offset_mm: float = 4.0
+    min_cosine: float = 0.85  # between both directions
+    max_offset_radii: float = 1.5  # of the line from the first pivot, in shaft radii
+    max_offset_mm: float = 4.0  # the same, if larger
     # of the best evidence of a link's points: stated axes may be off, and all points with them
     min_relative_level: float = 0.85
     min_radius_ratio: float = 0.33  # of the shaft's radius to the distance between the first two pivots
@@ -50,15 +50,15 @@ class LinkSearchSettings:
     shaft_length: float = 0.3  # of the distance to the tissue: the shaft that is seeded about its line
     side_tolerance_radii: float = 0.3  # by which a link that is searched on one side of its pivot may lie on the other
     min_visible_share: float = 0.05  # of the frames, that must observe a seed
-    heading_sigma: float = 0.5  # rad; of evidence, by which a stated heading may be less likely
-    heading_weight: float = 0.02
+    heading_sigma: float = 0.5  # rad, of stated headings
+    heading_weight: float = 0.02  # of evidence, by which a heading one such deviation off may be less likely
     # over half way open and straight on: where jaws move, any opening has some evidence
     min_evidence_gain: float = 0.25
     # check of the readings
     check_points: int = 1500  # per link
-    check_reach_radii: float = 4.0  # shaft radii about the pivots within which they lie
-    check_margin_radii: float = 2.0
-    max_check_frames: int = 80
+    check_reach_radii: float = 4.0  # shaft radii about the pivots of end links within which they lie
+    check_margin_radii: float = 2.0  # shaft radii about the pivots of other links within which they lie
+    max_check_frames: int = 80  # evenly spaced
     min_volume_ratio: float = 1.15  # of the volume on evidence with other readings, from which a warning is given
     check_min_visible_share: float = 0.1  # of the frames, that must observe a point
 

@@ -25,18 +25,18 @@ class StatedLinksSettings:
     # standard deviations of the stated kinematics
     axis_sd: float = 0.09  # rad
     pivot_sd: float = 2.0  # mm
-    gain_sd: float = 0.03
+    gain_sd: float = 0.03  # share of a reading's gain
     side_logits: float = 2.0  # per shaft radius by which a Gaussian lies on the wrong side of a joint
     # shaft radii beyond the pivot where sides change, and how much farther at the ends of its axis, since a link
     # holds the next one between its prongs
-    side_start: float = 0.4  # the ends: radii along the axis
-    prongs: float = 0.7
-    prongs_from: float = 0.3
-    prongs_to: float = 0.7
+    side_start: float = 0.4  # shaft radii beyond the pivot where sides change
+    prongs: float = 0.7  # shaft radii by which they change farther out at the ends of the axis
+    prongs_from: float = 0.3  # shaft radii along the axis, where that begins
+    prongs_to: float = 0.7  # shaft radii along the axis, where it is reached
     max_side_logits: float = 4.0  # that count in the penalty
     min_step_mm: float = 1.0  # between two pivots that define a direction
-    shaft_reach: float = 3.0  # shaft radii from the axis behind the first pivot; from any pivot before it
-    end_reach: float = 8.0
+    shaft_reach: float = 3.0  # shaft radii from the axis, behind the first pivot
+    end_reach: float = 8.0  # shaft radii from any pivot, before the first one
     max_wrist_radii: float = 1.5  # behind the first joint within which a found shaft end is accepted
 
 
