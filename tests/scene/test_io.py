@@ -288,3 +288,15 @@ def test_a_scene_remembers_that_its_scope_stood_still(any_scene: GaussianScene, 
     any_scene.recorded = dataclasses.replace(any_scene.recorded, still=True)
     save_scene(any_scene, tmp_path / "scene.safetensors")
     assert load_scene(tmp_path / "scene.safetensors").recorded.still
+
+
+def test_a_scene_remembers_how_large_the_errors_of_its_states_were(any_scene: GaussianScene, tmp_path: Path) -> None:
+    path = tmp_path / "scene.safetensors"
+    any_scene.recorded = dataclasses.replace(any_scene.recorded, error_scale=0.4)
+    save_scene(any_scene, path)
+    assert load_scene(path).recorded.error_scale == 0.4
+    any_scene.recorded = dataclasses.replace(any_scene.recorded, error_scale=0.0)
+    save_scene(any_scene, path)
+    assert load_scene(path).recorded.error_scale == 0.0
+    rewrite(path, lambda header: header["diagnostics"].update(scale_of_state_errors=0.3))  # as version 0.3 has it
+    assert load_scene(path).recorded.error_scale == 0.3

@@ -34,6 +34,7 @@ INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height", "near")  # of a recorde
 # tensors of modules that OLD_SCHEMA lacks
 ADDED = {"shadow_offsets", "shadow_strengths", "shadow_width", "middle", "closed", "radius", "tips"}
 ADDED_SINCE = {"base_corrections", "anchors", "weights", "lengths"}  # that files of SCHEMA may lack: zero
+FORMER_ERROR_SCALE = "scale_of_state_errors"  # where diagnostics of version 0.3 have what is `error_scale` now
 MAX_REASON = 200  # characters of an error's message
 MAX_PIXELS = 2**26  # of a recorded image
 MAX_NUMBER = 1e10  # mm, rad, s (of Unix time, too) or px: larger numbers are damage
@@ -204,10 +205,9 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
         raise ValueError(f"its scale is {scale}, not a share of the images' size")
     still = header.get("still") is True
     lit = share_lamps(cameras) if still else tuple(cameras)
-    return instruments, Recorded(
-        names, splits, tuple(states), lit, lens=lens, scale=scale, still=still,
-        error_scale=_number(header.get("error_scale", 0.0)),
-    )  # fmt: skip
+    errors = _number(header.get("error_scale", header["diagnostics"].get(FORMER_ERROR_SCALE, 0.0)))
+    recorded = Recorded(names, splits, tuple(states), lit, lens=lens, scale=scale, still=still, error_scale=errors)
+    return instruments, recorded
 
 
 def _described(instrument: Instrument) -> dict[str, Any]:

@@ -7,7 +7,6 @@ Biometrika 1971) replace those that were expected where they are clearly larger.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -94,20 +93,19 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
     return states if large or states.inconsistent.any() else None
 
 
-def register_states(views: TrainingViews, refinement: Refinement, instruments: Sequence[Instrument]) -> bool:
+def register_states(views: TrainingViews, refinement: Refinement, instrument: Instrument) -> bool:
     """Refit the states of training frames that contradict the others, or exclude them; return whether there are any.
 
-    Only those of a single instrument, with stated links and all readings recorded, before pinholes of one size.
+    `instrument` is the only one. Without stated links, with unrecorded readings, or before other cameras than pinholes
+    of one size, nothing is done.
     """
-    frames = views.frames
-    tree = instruments[0].kinematics
+    frames, tree = views.frames, instrument.kinematics
     sizes = {(frame.camera.width, frame.camera.height) for frame in frames}
     count = len(refinement.frames_of_instant)
-    if len(instruments) != 1 or not all(frame.camera.is_pinhole for frame in frames):
+    if tree is None or instrument.unrecorded or len(sizes) > 1 or count < STATES.min_states:
         return False
-    if tree is None or instruments[0].unrecorded or len(sizes) > 1 or count < STATES.min_states:
+    if not all(frame.camera.is_pinhole for frame in frames):
         return False
-    (instrument,) = instruments
     scale = min(1.0, STATES.width_px / frames[0].camera.width)
     small = views if scale == 1.0 else views.scaled(scale)
     cameras = [frame.camera for frame in small.frames]

@@ -40,9 +40,9 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     if isinstance(articulated, BreathingTissue) and articulated.may_breathe and session.timed:
         tissue = _learn_breathing(session, articulated, tissue)
     evidence = tissue_evidence(scene, session.views, session.config, tissue)
-    stated = all(isinstance(articulation, StatedLinks) for articulation in articulated.articulations)
-    corrects = stated and session.config.refine.frame_poses
-    if corrects and register_states(session.views, session.refinement, scene.instruments):
+    alone = len(scene.instruments) == 1 and isinstance(articulated.articulations[0], StatedLinks)
+    corrects = alone and session.config.refine.frame_poses
+    if corrects and register_states(session.views, session.refinement, scene.instruments[0]):
         evidence = _corrected_evidence(session, evidence)
     scene.canonical = _with_instruments(session, articulated, evidence)
 
