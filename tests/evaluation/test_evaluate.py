@@ -9,6 +9,7 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.capture.images import write_labels
 from neeco.cli import main
+from neeco.evaluation import evaluate, image_metrics
 from neeco.evaluation.evaluate import evaluate_run
 
 
@@ -142,6 +143,39 @@ def test_an_unknown_split_is_refused_naming_those_there_are(world, tmp_path):
         evaluated(only_training)
 
 
+def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_path, monkeypatch):
+    seen = {}
+
+    def noting(where, function):
+        def call(*arguments, **options):
+            seen[where] = torch.get_num_threads()
+            return function(*arguments, **options)
+
+        return call
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        network = image_metrics.Lpips((image_metrics.Convolution(1, 1, 0, None, True),), one_by_one_filter())
+        monkeypatch.setattr(image_metrics, "find_lpips", lambda folder: {"alexnet": network})
+        monkeypatch.setattr(evaluate, "draw", noting("draw", evaluate.draw))
+        monkeypatch.setattr(image_metrics, "relu", noting("lpips", image_metrics.relu))
+        run = make_run(world, tmp_path)
+        monkeypatch.setattr("neeco.training.run.load_run", lambda path, device, **_: run)
+        assert main(["evaluate", str(run.path), "--splits", "test"]) == 0
+        assert (seen, torch.get_num_threads()) == ({"draw": 1, "lpips": 3}, 3)
+    finally:
+        torch.set_num_threads(before)
+
+
+def one_by_one_filter():
+    return {
+        "features.0.weight": torch.ones(1, 3, 1, 1),
+        "features.0.bias": torch.zeros(1),
+        "linear.0.weight": torch.ones(1),
+    }
+
+
 @pytest.mark.parametrize("place", ["taken/scores.json", "folder"])
 def test_numbers_that_could_not_be_written_are_told_before_scoring(world, tmp_path, monkeypatch, capsys, place):
     run = make_run(world, tmp_path / "run")
@@ -161,3 +195,10 @@ def test_numbers_are_also_written_where_asked(world, tmp_path, monkeypatch):
     assert main(["evaluate", str(run.path), "--json", str(tmp_path / "new" / "scores.json")]) == 0
     assert (tmp_path / "new" / "scores.json").read_text() == (run.path / "evaluation.json").read_text()
     assert "images it never saw. " in (run.path / "report.html").read_text()
+
+
+def test_the_device_is_waited_for_before_a_clock_is_read(world, tmp_path, monkeypatch):
+    waited = []
+    monkeypatch.setattr(evaluate, "synchronise", waited.append)
+    evaluated(make_run(world, tmp_path), ["test"])
+    assert waited == [torch.device("cpu")] * (evaluate.SETTINGS.timed + 2)

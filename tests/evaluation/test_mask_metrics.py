@@ -36,6 +36,12 @@ def test_parts_of_any_name_are_scored_and_pairs_are_those_that_differ_by_left_an
     assert assignment == {"blades": "swapped"}
 
 
+def test_the_pixels_of_a_part_are_those_of_all_its_ids():
+    tally = PartTally({1: "shaft", 2: "wrist", 3: "shaft"})
+    tally.add(torch.tensor([[1, 3, 2, 0]]), torch.tensor([[1, 1, 2, 3]]))
+    assert tally.result()[0] == {"shaft": 2 / 3, "wrist": 1.0}
+
+
 def test_frames_without_a_part_do_not_count_for_it():
     tally = PartTally(USUAL_NAMES)
     tally.add(torch.tensor([[1, 0]]), torch.tensor([[1, 1]]))

@@ -96,6 +96,9 @@ def test_contours_among_ignored_pixels_are_not_judged():
     counted[12:, 12:] = False
     assert boundary_f(mask, truth) < 1.0
     assert boundary_f(mask, truth, counted) == 1.0
+    assert math.isnan(boundary_f(mask, mask, ~mask))
+    assert math.isnan(boundary_f(mask, truth, ~mask))
+    assert boundary_f(mask, truth & ~mask, mask) == 0.0
 
 
 def test_numbers_worked_out_by_hand(tmp_path):
@@ -114,6 +117,21 @@ def test_numbers_worked_out_by_hand(tmp_path):
     assert scores["classes"]["challenge_iou"] == pytest.approx((0.5 + 1.0) / 2)
     assert scores["parts"]["jaw_right"]["iou"] is None
     assert [row["name"] for row in scores["per_image"]] == ["a", "b", "c"]
+
+
+def test_a_part_only_among_ignored_pixels_has_no_score(tmp_path):
+    scores = score_masks(folder(tmp_path / "drawn", seen=strip(1, 2, 3, 4)), world_capture(tmp_path))
+    assert scores["parts"]["jaw_right"] == {"iou": None, "dice": None, "boundary_f": None, "images": 0}
+    assert scores["parts"]["jaw_left"]["boundary_f"] == 1.0
+
+
+def test_a_part_may_be_called_instrument(tmp_path):
+    truth = folder(tmp_path / "truth", a=strip(1, 1, 2, 0), b=strip(0, 2, 2, 0))
+    predicted = folder(tmp_path / "predicted", a=strip(1, 2, 2, 0), b=strip(1, 2, 2, 0))
+    names = {1: "instrument", 2: "tip"}
+    scores = score_masks(predicted, truth, classes=names, truth_classes=names)
+    assert scores["instrument"]["challenge_iou"] == pytest.approx((1 + 2 / 3) / 2)
+    assert scores["classes"]["challenge_iou"] == pytest.approx((0.5 + 1.0) / 2)
 
 
 def test_jaws_are_named_once_for_the_whole_folder(tmp_path):

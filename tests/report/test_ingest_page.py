@@ -338,7 +338,14 @@ def without_instruments(document):
         (
             bare,
             {"clocks": {}, "shapes": {}, "dropped": (), "notes": ()},
-            ("do not meet", "camera_from_base", "nothing can be overlaid", "No joint was read", "Nothing: every video"),
+            (
+                "do not meet",
+                "camera_from_base",
+                "nothing can be overlaid",
+                "No joint was read",
+                "proportions only",
+                "Nothing: every video frame",
+            ),
         ),
         (
             without_instruments,

@@ -24,6 +24,7 @@ from worker_tasks import seen_gpu
 from neeco.base import workers
 from neeco.base.errors import NeecoError
 from neeco.base.settings import with_fields
+from neeco.capture import read_capture
 from neeco.scene.training_session import UNLIMITED
 from neeco.studies import study
 from neeco.studies import training_job as module
@@ -329,6 +330,31 @@ def test_tasks_here_see_a_gpu_each_or_share_them_where_they_are_small(shared, vi
     assert set(found) == seen
 
 
+@pytest.mark.parametrize(
+    ("device", "address", "asked"),
+    [
+        ("cpu", "", [False, False]),
+        ("cuda", "", [False, True]),
+        ("cpu", "head:6379", [False, True]),  # whose machines may have GPUs that this one lacks
+    ],
+)
+def test_gpus_are_asked_for_where_jobs_compute_on_them(device, address, asked, make_job, monkeypatch) -> None:
+    given: list[bool] = []
+
+    def tasks(function, shared, jobs, how):
+        given.append(how.gpu)
+        yield from (workers.TaskEvent(index, "started") for index in range(len(jobs)))
+        yield from (workers.TaskEvent(index, "done", {"splits": {}}) for index in range(len(jobs)))
+
+    monkeypatch.setattr(study, "run_tasks", tasks)
+    monkeypatch.setattr(study, "check_workers", lambda *_: None)
+    monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device(device))
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    for word in ("cpu", "auto"):
+        run_jobs([replace(make_job(), device=word)], workers=2)
+    assert given == asked
+
+
 def test_workers_share_the_cores(monkeypatch) -> None:
     monkeypatch.setattr(study, "usable_cores", lambda: 8)
     assert [threads_per_worker(workers) for workers in (1, 2, 3, 16)] == [8, 4, 2, 1]
@@ -412,6 +438,14 @@ def kill_when(file: Path, processes: Callable[[], list[int]], killed: list[int])
             os.kill(number, signal.SIGKILL)
             killed.append(number)
         time.sleep(0.05)
+
+
+def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:
+    made = read_capture(capture)
+    gaussians, field = (Curve(capture / "curve.jsonl", made, ("train",), field=kind) for kind in (False, True))
+    assert len(field.frames["train"]) < len(gaussians.frames["train"])
+    assert len(field.shares) < len(gaussians.shares)
+    assert field.shares[-1] == gaussians.shares[-1] == 1  # both end with the finished scene
 
 
 def test_the_late_part_of_phase_1_counts(tmp_path: Path) -> None:

@@ -170,7 +170,14 @@ def test_compare_and_ablate_write_the_same_files(capture: Path, tmp_path: Path) 
     assert (schedule["published_steps"], schedule["earliest"]) == (20_000, 8_000)
     assert configs["nps"]["initial_points"] == 30  # the command line comes last
     page = (ablated / "report.html").read_text()
-    assert page.index("22.26") < page.index("28.31")
+    published = re.findall(r'<td class="name">(off|on)\b[^<]*</td>\s*<td[^>]*>([^<]*)</td>', page)
+    assert published == [("off", "22.26"), ("on", "28.31")]
+
+
+def test_a_length_of_zero_is_refused_in_place_of_the_studys() -> None:
+    study = Study(configurations={"a": Configuration(method="3dgs")}, iterations=5)
+    with pytest.raises(NeecoError, match="minutes: 0 is no time to train"):
+        study.prepared(SweepRequest(capture=Path("c"), output=Path("o"), minutes=0))
 
 
 def test_the_papers_tables_have_the_papers_rows_and_numbers() -> None:
@@ -255,6 +262,7 @@ def test_directions_agree_when_the_signs_do(ours: float | None, published: float
         ("configurations: {a: {}}", "configurations.a.method: none is given"),
         ("configurations: {a: {method: 3dgz}}", "configurations.a: method: '3dgz' is unknown"),
         ("configurations: {a/b: {method: 3dgs}}", "configurations: 'a/b' names no folder"),
+        ("configurations: {.x: {method: 3dgs}}", "configurations: '.x' names no folder; .* a dot at its start"),
         ('title: "a\\ud800"\nconfigurations: {a: {method: 3dgs}}', "half a character; write"),
         ("configurations: {a: {method: 3dgs, settings: [foo]}}", "configurations.a.settings: 'foo' is not NAME"),
         (

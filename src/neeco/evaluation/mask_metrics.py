@@ -88,7 +88,10 @@ class PartTally:
 
     def add(self, parts: Pixels, truth: Pixels, counted: Pixels | None = None) -> None:
         """Add one image: `parts` and `truth` [H, W] uint8, both in the truth's numbers."""
-        ours, theirs = ({part: ids == number for number, part in self.names.items()} for ids in (parts, truth))
+        ours, theirs = dict[str, Pixels](), dict[str, Pixels]()
+        for masks, ids in ((ours, parts), (theirs, truth)):
+            for number, part in self.names.items():  # a part may have several ids
+                masks[part] = (ids == number) | masks.get(part, False)
         compared = [(part, part) for part in part_scores(self.names)]
         for pair, (left, right) in pairs_of(self.names.values()).items():
             for masks in (ours, theirs):
@@ -113,7 +116,8 @@ class PartTally:
         return swap, assignment
 
     def mean(self, ours: str, theirs: str, score: int = 0) -> float:
-        """Return the mean of a score over the images that show the part; NaN where none does."""
+        """Return the mean of a score of part `ours` against the truth's part `theirs`, over the images where either is
+        shown; NaN where none is."""
         return mean_of([row[ours, theirs][score] for row in self.rows])
 
     def result(self) -> tuple[dict[str, float], dict[str, str]]:
@@ -144,16 +148,17 @@ def boundary_f(
     As Perazzi et al., "A benchmark dataset and evaluation methodology for video object segmentation", CVPR 2016, 4.1.
 
     mask, truth [H, W] bool; near: at most ceil(tolerance * diagonal) pixels apart, centre to centre. counted [H, W]:
-    contour pixels outside it need no counterpart, but may be one. NaN when neither mask has a pixel; 1 when there are
-    pixels but neither has a contour (both fill the image), 0 when only one has.
+    contour pixels outside it need no counterpart, but may be one. NaN when neither mask has a pixel that counts; 1 when
+    there are pixels but neither has a contour (both fill the image), 0 when only one has.
     """
-    if not (mask.any() or truth.any()):
+    everywhere = np.ones(mask.shape, bool) if counted is None else counted
+    shown = [bool((image & everywhere).any()) for image in (mask, truth)]
+    if not any(shown):
         return math.nan
     contours = boundary_pixels(mask), boundary_pixels(truth)
-    everywhere = np.ones(mask.shape, bool) if counted is None else counted
     judged = [int((contour & everywhere).sum()) for contour in contours]
     if not judged[0] or not judged[1]:
-        return float(judged[0] == judged[1] and mask.any() == truth.any())
+        return float(judged[0] == judged[1] and shown[0] == shown[1])
     radius = math.ceil(tolerance * math.hypot(*mask.shape))
     either = contours[0] | contours[1]
     (window,) = ndimage.find_objects(either.astype(np.uint8))  # distances outside it are never needed

@@ -56,7 +56,7 @@ def score_masks(
     tables = [_table(names, numbers) for names in (ours, theirs)]
     whole = PartTally({1: "instrument"}, tuple(SCORES.values()))
     parts = PartTally({number: part for part, number in numbers.items()}, tuple(SCORES.values()))
-    visible: list[list[str]] = []  # parts in the truth of each image
+    shown, visible = list[list[str]](), list[list[str]]()  # of each image: whether its truth has the whole, the parts
     for index, name in enumerate(sorted(truths.files)):
         ids, counted = truths.load(name), truths.counted(name)
         guess = predictions.load(name) if name in predictions.files else np.zeros_like(ids)
@@ -66,9 +66,10 @@ def score_masks(
             raise NeecoError(f"{predictions.files[name]}: {problem}")
         whole.add((guess > 0).astype(np.uint8), (ids > 0).astype(np.uint8), counted)
         parts.add(tables[0][guess], tables[1][ids], counted)
-        counting = ids.ravel() if counted is None else ids[counted]
-        present = {*tables[1][counting].tolist()}
-        visible.append([*(["instrument"] if counting.any() else []), *(p for p, n in numbers.items() if n in present)])
+        counting = ids if counted is None else ids[counted]
+        present = np.unique(tables[1][counting])
+        shown.append(["instrument"] if counting.any() else [])
+        visible.append([part for part, number in numbers.items() if number in present])
         if progress is not None:
             progress(index + 1, len(truths.files))
     swap, assignment = parts.swapped()
@@ -94,7 +95,7 @@ def score_masks(
             "truth": str(truths.path),
             "splits": list(dict.fromkeys(frame.split for frame in truths.frames.values())) or None,
             "images": len(truths.files),
-            "instrument": instrument | {"challenge_iou": _challenge(whole, visible, {})},
+            "instrument": instrument | {"challenge_iou": _challenge(whole, shown, {})},
             "parts": rows if theirs else None,
             "classes": {"challenge_iou": _challenge(parts, visible, swap)} if theirs else None,
             "pair_assignment": assignment,
@@ -142,10 +143,9 @@ def _means(tally: PartTally, ours: str, theirs: str) -> dict[str, Any]:
 
 def _challenge(tally: PartTally, visible: Sequence[Sequence[str]], swap: Mapping[str, str]) -> float:
     """Return the Challenge IoU (see `score_masks`) over the parts of the tally that the truth of each image shows."""
-    names = {*tally.names.values()}
     return mean_of(
         [
-            mean_of([row[swap.get(part, part), part][0] for part in parts if part in names])
+            mean_of([row[swap.get(part, part), part][0] for part in parts])
             for row, parts in zip(tally.rows, visible, strict=True)
         ]
     )

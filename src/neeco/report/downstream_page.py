@@ -116,9 +116,8 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
     key = "iou" if model["predicts"] == "masks" else "box_iou"
     predictions, scores = [], []
     for condition, real in shown:
-        folder = plan.settings.job_folder(model["name"], condition, real, 0)
-        predictions.append(read_predictions(folder, test))
-        wanted = (model["name"], condition, real, 0)
+        wanted = (model["name"], condition, real, plan.settings.kept_fold)
+        predictions.append(read_predictions(plan.settings.job_folder(*wanted), test))
         jobs = [job for job in experiment["jobs"] if tuple(job[name] for name in JOB_KEYS) == wanted]
         frames = jobs[0]["splits"].get(test, {}).get("per_frame", ()) if jobs else ()
         scores.append({frame["frame"]: frame[key] for frame in frames if frame[key] is not None})

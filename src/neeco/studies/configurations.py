@@ -133,7 +133,7 @@ class Study:
         NeecoError naming the field that cannot be used."""
         study = self if request.seeds is None else replace(self, seeds=request.seeds)
         alone = {name: study.unfolded(name) for name in study.configurations}
-        if any(request.lengths.values()):
+        if any(value is not None for value in request.lengths.values()):
             alone = {name: replace(item, iterations=None) for name, item in alone.items()}
             study = replace(study, **request.lengths)
         everybody = {name: TableRow() for name in alone}
@@ -152,8 +152,8 @@ class Study:
         for name in self.configurations:
             plain = name.isprintable() and name == name.strip() and not name.startswith(".")
             if not plain or not 0 < len(name.encode()) <= MAX_NAME_BYTES or {*name} & {"/", "\\"}:
-                problem = f"{name[:40]!r} names no folder; give a short name in one line without / and \\"
-                raise NeecoError(f"configurations: {problem}")
+                problem = "names no folder; give a short name in one line without /, \\ and a dot at its start"
+                raise NeecoError(f"configurations: {name[:40]!r} {problem}")
             self.length_of(name)
         if self.seeds < 1:
             raise NeecoError(f"seeds: {self.seeds} is none at all; give at least 1")

@@ -37,6 +37,8 @@ GO_ON = "run the same command again to go on, nothing finished is lost"
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], what is going on
 Result = dict[str, Any]  # what a job returns and writes; of a failed one its identity, "error" and empty "splits"
+Reporter = Callable[[int, str, float, str], None]  # `JobProgress` of the job at an index
+Finisher = Callable[[int, Result], None]  # gets the result of the job at an index
 
 
 class Job(Protocol):
@@ -119,23 +121,24 @@ def run_jobs(
     check_workers(workers, device, light)
     known = dict(finished)
 
-    def report(index: int, stage: str, share: float = 0.0, text: str = "", result: Result | None = None) -> None:
-        if result is not None:
-            known[index] = result
-            text = result.get("error", "")
-            stage, share = "failed" if text else "done", 1.0
-            if record:
-                record([known[index] for index in sorted(known)])
+    def report(index: int, stage: str, share: float, text: str, result: Result | None = None) -> None:
         if progress:
             event = JobEvent(
                 index=index, total=len(jobs), job=jobs[index], stage=stage, share=share, text=text, result=result
             )
             progress(event)
 
+    def finish(index: int, result: Result) -> None:
+        known[index] = result
+        failure = result.get("error", "")
+        if record:
+            record([known[index] for index in sorted(known)])
+        report(index, "failed" if failure else "done", 1.0, failure, result)
+
     for job in jobs:
         job.check()
     if workers > 1 or address():
-        return _run_in_workers(jobs, workers, device, report, light)
+        return _run_in_workers(jobs, workers, device, report, finish, light=light)
     results = []
     for index, job in enumerate(jobs):
         try:
@@ -144,7 +147,7 @@ def run_jobs(
             moment = " ".join(map(str, interrupt.args)).split(";")[0]
             place = f"job {index + 1} of {len(jobs)} ({job.title}){', ' + moment if moment else ''}"
             raise KeyboardInterrupt(f"{place}; {GO_ON}") from None
-        report(index, "done", result=results[-1])
+        finish(index, results[-1])
     return results
 
 
@@ -191,13 +194,13 @@ def _failed(job: Job, error: str) -> Result:
 
 
 def _run_in_workers(
-    jobs: Sequence[Job], workers: int, device: torch.device, report: Callable[..., None], light: bool
+    jobs: Sequence[Job], workers: int, device: torch.device, report: Reporter, finish: Finisher, *, light: bool
 ) -> list[Result]:
     """`run_jobs` with `workers` jobs at once, each in a process of its own; light ones one after another in it.
 
     With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
-    device is opened in its worker, who sees one GPU, that no other has: on a cluster of machines other than this one,
-    it is one unless the jobs ask for the CPU.
+    device is opened in its worker, who sees one GPU, that no other has. On a cluster, whose machines may have GPUs that
+    this one lacks, each worker is given a GPU unless the jobs ask for the CPU.
     """
     folders = [job.folder.absolute().parent for job in jobs]
     how = Workers(
@@ -219,12 +222,12 @@ def _run_in_workers(
                 running.add(index)
                 if event.stage in ("started", "died"):
                     text = f"its worker died ({reason}); it goes on from its checkpoint" if reason else ""
-                    report(index, "training", text=text)
+                    report(index, "training", 0.0, text)
                     continue
                 running.remove(index)
                 failure = f"its worker died: {reason}"
                 results[index] = reason if event.stage == "done" else _failed(jobs[index], failure)
-                report(index, "done", result=results[index])
+                finish(index, results[index])
     except KeyboardInterrupt:
         names = "; ".join(jobs[index].title for index in sorted(running))
         raise KeyboardInterrupt(f"while running {names}; {GO_ON}") from None

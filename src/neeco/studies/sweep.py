@@ -32,8 +32,8 @@ SWEEP_FILE = "sweep.json"
 RESULTS_FILE = "results.csv"
 COLUMNS = ("configuration", "method", "seed", "split", "frames", *MEASURES, "error")
 SHARED = {"seed": "seeds", "iterations": "iterations", "minutes": "minutes", "transforms": "--transforms"}
-Numbers = Mapping[str, Mapping[str, Any]]  # `study.spread` by configuration and measure, of one split
 PRIMARY = "test"  # the split that published numbers are compared with, where there is one
+Numbers = Mapping[str, Mapping[str, Any]]  # `study.spread` by configuration and measure, of one split
 Rows = Sequence[Mapping[str, Any]]  # of the tidy table: one for each configuration, seed and split, by COLUMNS
 
 

@@ -36,11 +36,7 @@ if TYPE_CHECKING:
 JOB_SCHEMA = "neeco-job/2"
 JOB_FILE = "job.json"  # the result of a finished job
 CURVE_FILE = "curve.jsonl"  # held-out PSNR over the training
-CHECKPOINTS = {
-    "psnr_at_20": 0.2,
-    "psnr_at_40": 0.4,
-    "psnr_at_60": 0.6,
-}  # shares of the run: the paper's 4k, 8k, 12k steps
+CHECKPOINTS = {"psnr_at_20": 0.2, "psnr_at_40": 0.4, "psnr_at_60": 0.6}  # of the run: the paper's 4k, 8k, 12k steps
 CLOCKS: dict[str, Callable[[], float]] = {"wall": time.monotonic, "processor": time.process_time}
 ANEW = f"{REMEDY}, or remove that run's folder"
 SPLIT_SCORES = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou", "mask_dice", "frames")
@@ -58,6 +54,10 @@ class CurveSettings:
     shares: tuple[float, ...] = tuple(step / 10 for step in range(1, 11))  # of the run, at which frames are rendered
     frames: int = 4  # of each split, evenly spaced: the whole split is scored at the end
     late: float = 0.75  # share of phase 1 after which its training PSNR counts
+
+
+CURVE = CurveSettings()
+FIELD_CURVE = CurveSettings(shares=(0.2, 0.6, 1.0), frames=2)  # a field takes seconds for an image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +189,7 @@ def phase_1_psnr(folder: Path) -> float | None:
     """
     rows = read_rows(folder / "metrics.jsonl", {"iteration": int, "phase": int, "psnr": float})
     rows = [row for row in rows if row["phase"] == 1]
-    late = [row["psnr"] for row in rows if row["iteration"] > CurveSettings.late * rows[-1]["iteration"]]
+    late = [row["psnr"] for row in rows if row["iteration"] > CURVE.late * rows[-1]["iteration"]]
     return round(sum(late) / len(late), 4) if late else None
 
 
@@ -208,7 +208,7 @@ class Curve:
 
     def __init__(self, file: Path, capture: Capture, splits: Sequence[str], *, field: bool = False) -> None:
         self.file = file
-        settings = CurveSettings((0.2, 0.6, 1.0), 2) if field else CurveSettings()  # a field takes seconds for an image
+        settings = FIELD_CURVE if field else CURVE
         self.shares = settings.shares
         self.rows: list[dict[str, Any]] | None = None  # None before the first step of this start
         self.frames: dict[str, list[tuple[Frame, Tensor, Tensor | None]]] = {}

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
+from neeco.studies.downstream import experiment
 from neeco.studies.downstream import model as models_module
 from neeco.studies.downstream.experiment import (
     JOB_SCHEMA,
@@ -27,7 +28,7 @@ from neeco.studies.downstream.experiment import (
     read_predictions,
     run_downstream,
 )
-from neeco.studies.downstream.results import Detections, tables_of
+from neeco.studies.downstream.results import Detections, failed_jobs, tables_of
 from neeco.studies.downstream.samples import ImageSet
 
 TIMES = ("seconds", "machine")
@@ -160,9 +161,12 @@ def test_every_condition_and_model_of_a_fold_has_the_same_labelled_frames(spec: 
     )
     chosen: dict[int, set] = {}
     for job in plan.jobs:
-        learned = tuple(sample.name for sample in job.task(plan.capture).batches.sources[0])
+        sources = job.task(plan.capture).batches.sources
+        learned = tuple(sample.name for sample in sources[0])
         assert len(learned) == 6
         assert {"006", "007", "012"}.isdisjoint(learned)
+        assert list(learned) == [sample.name for sample in job.labelled(plan.capture)]
+        assert len(sources) == 1 + len(job.condition.sets)
         chosen.setdefault(job.fold, set()).add(learned)
     assert [len(chosen[fold]) for fold in range(3)] == [1, 1, 1]
     assert len(set.union(*chosen.values())) == 3
@@ -272,6 +276,32 @@ def test_interrupted_it_goes_on_to_the_same_numbers(
     result = trained(spec)
     for key in ("jobs", "summary", "findings", "notes", "sets", "models"):
         assert without_times(result[key]) == without_times(expected[key])
+
+
+@pytest.mark.parametrize("failing", [0, 2, "all"])
+def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    fit, fits = Pixels.fit, [-1]
+
+    def sometimes(self, task):
+        fits[0] += 1
+        if failing in (fits[0], "all"):
+            raise NeecoError("pixels: its loss is not finite at step 3;\n  begin anew")
+        return fit(self, task)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Pixels, "fit", sometimes)
+        result = trained(replace(spec, num_real=("0", "6")))
+    failed = [index for index, job in enumerate(result["jobs"]) if "error" in job]
+    assert failed == (list(range(6)) if failing == "all" else [failing])
+    job = result["jobs"][failed[0]]
+    assert job["error"] == "pixels: its loss is not finite at step 3; begin anew"
+    assert job["splits"] == {}
+    assert len(failed_jobs(result)) == len(failed)
+    reasons = {row.failed for table in tables_of(result) for row in table.rows}
+    assert reasons == {job["error"] if failing == "all" else None}  # the arm's other fold is there
+    again = trained(replace(spec, num_real=("0", "6")))
+    assert not failed_jobs(again)
+    assert again["complete"]
 
 
 def test_a_folder_of_other_jobs_is_refused_before_the_work(
@@ -469,6 +499,11 @@ def test_tables_hold_the_numbers(spec: DownstreamSettings) -> None:
     with (spec.output / "downstream.csv").open(newline="") as stream:
         lines = list(csv.DictReader(stream))
     assert [float(line["iou"]) for line in lines] == [row["iou"] for row in result["summary"]]
+
+
+def test_jobs_are_handed_the_capture(spec: DownstreamSettings, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(experiment, "read_capture", lambda *_: pytest.fail("read again"))
+    assert trained(replace(spec, capture=capture, conditions=("kin",), folds=1))["complete"]
 
 
 def test_two_workers_give_the_same_numbers(spec: DownstreamSettings, tmp_path: Path, monkeypatch) -> None:

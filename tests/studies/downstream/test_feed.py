@@ -74,7 +74,7 @@ def test_the_seed_decides_the_order_whatever_the_batches() -> None:
 
 def test_images_are_read_once_unless_they_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     def reads(limit: int) -> list[int]:
-        monkeypatch.setattr(training_data, "CACHE", Cache(limit))
+        monkeypatch.setattr(training_data, "IMAGES", Cache(limit))
         source = [Held(sample.example, sample.name, []) for sample in squares(4, 0, 16)]
         for _ in range(3):
             for sample in source:

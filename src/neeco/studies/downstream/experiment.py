@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -95,7 +95,7 @@ class DownstreamSettings:
     transforms: str = "transforms.json"
     device: str = "auto"
     default_counts: tuple[int, ...] = (5, 10, 20, 50)  # of labelled frames, besides all
-    kept_fold: int = 0  # whose weights and predictions are kept
+    kept_fold: ClassVar[int] = 0  # whose weights and predictions are kept
     write_every_s: float = 30.0  # results so far are written no more often: they are thousands of frames' scores
     parts_steps: float = 2.5  # times as many steps to learn parts as one class: more of them do not help
 

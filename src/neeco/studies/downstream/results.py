@@ -185,13 +185,20 @@ class Scores:
                 self.jobs.setdefault(arm, {})[job["fold"]] = job
         self._resampled: dict[Any, np.ndarray] = {}
 
+    def by_fold(self, arm: Arm, test: str, metric: str) -> dict[int, float]:
+        """Return the score of every fold that has it."""
+        scores = {fold: job["splits"].get(test, {}).get(metric) for fold, job in self.jobs.get(arm, {}).items()}
+        return {fold: score for fold, score in sorted(scores.items()) if score is not None}
+
+    def mean(self, arm: Arm, test: str, metric: str) -> float | None:
+        """Return the mean over folds, without its interval; None where no fold has the score."""
+        values = self.by_fold(arm, test, metric)
+        return float(np.mean(list(values.values()))) if values else None
+
     def estimate(self, arm: Arm, test: str, metric: str, against: Arm | None = None) -> Estimate | None:
         """Return the mean of an arm's score over folds, or of its difference to another's over the folds that both
         finished; None where there is no such fold."""
-        values = []
-        for one in (arm,) if against is None else (arm, against):
-            scores = {fold: job["splits"].get(test, {}).get(metric) for fold, job in self.jobs.get(one, {}).items()}
-            values.append({fold: score for fold, score in sorted(scores.items()) if score is not None})
+        values = [self.by_fold(one, test, metric) for one in ((arm,) if against is None else (arm, against))]
         folds = tuple(fold for fold in values[0] if fold in values[-1])
         if not folds:
             return None
@@ -226,10 +233,8 @@ class Scores:
 def seed_weights(seeds: int) -> np.ndarray:
     """[R, seeds]: how often each seed is drawn, in all one time fewer than there are seeds: as often would make
     the variance of few too small (Rao and Wu, "Resampling inference with complex survey data", 1988)."""
-    times = max(seeds - 1, 1)
-    return (
-        np.random.default_rng(1).multinomial(times, np.full(seeds, 1 / seeds), INTERVALS.resamples).astype(np.float64)
-    )
+    times, rng = max(seeds - 1, 1), np.random.default_rng(1)
+    return rng.multinomial(times, np.full(seeds, 1 / seeds), INTERVALS.resamples).astype(np.float64)
 
 
 @cache
@@ -280,10 +285,9 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
         main = MAIN[models[arm.model]]
         metrics = metrics_of([job for job in jobs if job["model"] == arm.model], models[arm.model])
         for test in tests:
-            means = {metric: scores.estimate(arm, test, metric) for metric in metrics}
-            score = means[main] or Estimate(0, math.nan, None, None)
+            score = scores.estimate(arm, test, main) or Estimate(0, math.nan, None, None)
             row: dict[str, Any] = {**arm._asdict(), "test": test, "folds": score.folds}
-            row |= {metric: mean and mean.mean for metric, mean in means.items()}
+            row |= {metric: scores.mean(arm, test, metric) for metric in metrics}
             row |= {"low": score.low, "high": score.high}
             reference = _reference(arm, test, scores, main)
             if reference is not None and (gain := scores.estimate(arm, test, main, reference)) is not None:
@@ -306,9 +310,9 @@ def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
     elif REAL not in words:
         real = max((other.real for other in others if set(other.words) in baselines), default=0)
     rivals = [
-        (score.mean, other)
+        (mean, other)
         for other in others
-        if set(other.words) in wanted and other.real == real and (score := scores.estimate(other, test, metric))
+        if set(other.words) in wanted and other.real == real and (mean := scores.mean(other, test, metric)) is not None
     ]
     return max(rivals)[1] if rivals else None
 

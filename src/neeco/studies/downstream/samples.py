@@ -110,7 +110,7 @@ class Sample(Protocol):
 class Cache:
     """Decoded images by key, of at most `limit` bytes in all; those that were not used for longest go first."""
 
-    def __init__(self, limit: int = 2 << 30) -> None:
+    def __init__(self, limit: int = 1 << 30) -> None:
         self.limit, self.used = limit, 0
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
@@ -130,7 +130,7 @@ class Cache:
         return self.get(sample.key, sample.load)
 
 
-CACHE = Cache()
+CACHE = Cache()  # of examples
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,13 @@ from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.capture.images import image_files, read_image_bytes
-from neeco.studies.downstream.samples import CACHE, Example, RecordedSample, Sample
+from neeco.studies.downstream.samples import CACHE, Cache, Example, RecordedSample, Sample
 from neeco.synthesis.augmentation import Outline, augment, moved
 
 RESERVED = REAL, STRONG, PASTE, PERMUTED = "real", "strong", "paste", "permuted"
 BASELINES = (REAL, f"{REAL}+{STRONG}")  # without synthetic images: the better of them is the reference
 GOLDEN_RATIO = (5**0.5 - 1) / 2
+IMAGES = Cache()  # of training images; in one with the examples, which are larger, they would be evicted
 
 
 @dataclass(frozen=True)
@@ -250,7 +251,7 @@ class Batch:
 
 def training_image(sample: Sample, size: tuple[int, int], classes: int, outlines: bool = False) -> TrainingImage:
     """The sample at this size (width, height), kept for as long as there is room. outlines: with them, for boxes."""
-    return CACHE.get((sample.key, size, classes, outlines), lambda: shrink(sample.load(), size, classes, outlines))
+    return IMAGES.get((sample.key, size, classes, outlines), lambda: shrink(sample.load(), size, classes, outlines))
 
 
 def shrink(example: Example, size: tuple[int, int], classes: int, outlines: bool = False) -> TrainingImage:
