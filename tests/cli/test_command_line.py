@@ -213,7 +213,7 @@ def test_what_an_option_needs_is_said_where_it_is_missing(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ([], "--video: give the video"),
+        ([], "no source; give recording.yaml (`neeco ingest --init` drafts it) or --video FILE"),
         (["left.mp4"], "--video left.mp4"),
         (["my left.AVI", "--output", "made"], "--video 'my left.AVI'"),
         (["--init", "nope.bag"], "nope.bag: no such file"),

@@ -80,7 +80,7 @@ def test_a_trackers_frame_has_no_cameras_axes(tmp_path):
 def test_a_transform_may_lead_to_the_camera_in_other_axes(tmp_path):
     base = _recording(tmp_path, {"transform": MILLIMETRES, "axes": "ecm"})[0].base
     assert np.array_equal(base.matrix, np.diag([-1, -1, 1, 1]) @ MILLIMETRES)
-    with pytest.raises(NeecoError, match=r"axes: 'left' is none of them; write one of camera, opencv, .*ecm"):
+    with pytest.raises(NeecoError, match=r"axes: 'left' is not known here; write one of camera, opencv, .*ecm"):
         _recording(tmp_path, {"transform": MILLIMETRES, "axes": "left"})
 
 

@@ -109,7 +109,7 @@ def test_the_frame_that_a_recording_states(tmp_path, frame, place):
     path.write_text(f"video: video.mp4\ninstruments: [{{name: tip, poses: {{file: tip.csv, frame: {frame}}}}}]\n")
     assert_seen(read_pose_log(read_recording(path).instruments[0].poses))
     path.write_text(path.read_text().replace(frame, "sideways"))
-    with pytest.raises(NeecoError, match=r"poses\.frame: 'sideways' is none of them; write one of camera, .*ecm"):
+    with pytest.raises(NeecoError, match=r"poses\.frame: 'sideways' is not known here; write one of camera, .*ecm"):
         read_recording(path)
 
 

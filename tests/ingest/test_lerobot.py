@@ -6,6 +6,7 @@ import importlib.util
 import json
 import re
 import shutil
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,16 @@ def test_images_in_parquet_are_read_as_they_are(tmp_path, version):
     assert (video.size, len(video.times)) == ((64, 48), LENGTHS[1])
     shown = list(video.read([29, 3]))
     assert [(index, left_edge(pixels), int(pixels[2, 2, 0])) for index, pixels in shown] == [(3, 3, 35), (29, 29, 35)]
+
+
+def test_a_cell_without_an_image_says_how_to_write_the_data_set(tmp_path):
+    path = data_set(tmp_path, version="v2.1", embedded=True)
+    cells = pyarrow.parquet.read_table(path / "data/chunk-000/episode_000001.parquet")[CAMERA].to_pylist()
+    cells[7]["bytes"] = None
+    with_column(path, "data/*/episode_000001.parquet", CAMERA, cells)
+    video = format_of(path).open_images(path, f"episode 1/{CAMERA}")
+    with pytest.raises(NeecoError, match="row 7 of episode 1: has no image in it; write the data set with its images"):
+        list(video.read([7]))
 
 
 @pytest.mark.parametrize(
@@ -488,7 +499,8 @@ def test_parquet_of_other_columns(tmp_path):
     no_numbers = f"{STATE}: holds .*, no numbers, as many in each row"
     for other, message in [
         (table.drop_columns([STATE]), f"has no column '{STATE}'; its columns are action, timestamp"),
-        (table.set_column(0, STATE, pyarrow.array(["x"] * rows)), no_numbers),
+        *((table.set_column(0, STATE, pyarrow.array([cell] * rows)), no_numbers)
+          for cell in ("x", "1.5", b"1.5", Decimal("1.5"), ["1.5"] * len(DVRK))),
         (table.set_column(0, STATE, pyarrow.array([[1.0] * (1 + row % 2) for row in range(rows)])), no_numbers),
         (table.set_column(0, STATE, pyarrow.array([[1.0]] * rows)), f"{STATE}: has 1 numbers a row, not 16"),
         (table.set_column(2, "timestamp", pyarrow.array([[]] * rows, pyarrow.list_(pyarrow.float64()))),
@@ -497,6 +509,28 @@ def test_parquet_of_other_columns(tmp_path):
     ]:  # fmt: skip
         pyarrow.parquet.write_table(other, file)
         assert re.search(message, refusal(path))
+
+
+def test_lists_where_the_length_of_an_episode_stands_are_refused(tmp_path: Path) -> None:
+    path = data_set(tmp_path, version="v3.0")
+    for file in path.glob("meta/episodes/**/*.parquet"):
+        table = pyarrow.parquet.read_table(file)
+        lists = pyarrow.array([[]] * len(table), pyarrow.list_(pyarrow.float64()))
+        pyarrow.parquet.write_table(table.set_column(table.schema.get_field_index("length"), "length", lists), file)
+    assert "length: has 0 numbers a row, not 1" in refusal(path)
+
+
+def test_numbers_come_of_every_arrow_type_that_holds_them(tmp_path: Path) -> None:
+    path = data_set(tmp_path, version="v2.1")
+    file, values = path / "data/chunk-000/episode_000001.parquet", EPISODES[1][STATE].astype(np.float64)
+    table, width = pyarrow.parquet.read_table(file), values.shape[1]
+    flat = pyarrow.array(values.ravel())
+    fixed = pyarrow.FixedSizeListArray.from_arrays(flat, width)
+    nested = pyarrow.FixedSizeListArray.from_arrays(pyarrow.FixedSizeListArray.from_arrays(flat, 4), width // 4)
+    tensor = pyarrow.ExtensionArray.from_storage(pyarrow.fixed_shape_tensor(pyarrow.float64(), (width,)), fixed)
+    for column in (fixed, nested, tensor, fixed.cast(pyarrow.large_list(pyarrow.float64()))):
+        pyarrow.parquet.write_table(table.set_column(0, STATE, column), file)
+        np.testing.assert_array_equal(read(path, f"episode 1/{STATE}").rows[:, 1:], values)
 
 
 def test_lines_of_episodes_that_are_none(tmp_path):

@@ -6,10 +6,14 @@ import importlib
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.ingest.pipeline import ingest
+from neeco.ingest.readers import format_of, read_table
+from neeco.ingest.readers.interpolate import poses_at, readings_at
+from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.registration import hand_eye
 
@@ -37,6 +41,27 @@ def sets(recorded, written):
         (recorded.folder / name).parent.mkdir(parents=True, exist_ok=True)
         (recorded.folder / name).write_bytes(content)
     return module
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_states_and_images_read_back(recorded, sets, version):
+    original = read_recording(recorded.folder / "recording.yaml")
+    film, instrument = original.source.open(), original.instruments[0]
+    path = recorded.folder / "lerobot" / version / "set"
+    poses, _ = poses_at(read_pose_log(instrument.poses), film.times + CLOCKS["em"])
+    jaw, _ = readings_at(read_reading_log(instrument.joints["jaw_angle"]), film.times + CLOCKS["jaw_angle"])
+    pictures = [pixels for _, pixels in film.read(range(recorded.frames))]
+    for episode, count in ((0, recorded.frames), (1, recorded.frames // 2)):
+        rows = read_table(path, f"episode {episode}/{sets.STATE}").rows
+        np.testing.assert_allclose(1000 * rows[:, 1:4], poses[:count, :3, 3], atol=1e-4)  # float32
+        off = Rotation.from_quat(rows[:, 4:8]).inv() * Rotation.from_matrix(poses[:count, :3, :3])
+        assert off.magnitude().max() < 1e-6
+        np.testing.assert_allclose(rows[:, -1], jaw[:count], atol=1e-6)
+        video = format_of(path).open_images(path, f"episode {episode}/{sets.CAMERA}")
+        np.testing.assert_allclose(video.times, film.times[:count], atol=1e-5)
+        shown = np.stack([pixels for _, pixels in video.read(range(count))]).astype(float)
+        errors = [[np.abs(one - other).mean() for other in pictures] for one in shown]
+        assert np.argmin(errors, axis=1).tolist() == list(range(count))
 
 
 def test_the_same_capture_comes_of_it(recorded, sets, tmp_path):

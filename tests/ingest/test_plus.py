@@ -156,7 +156,7 @@ def changed(path, old, new):
         (b"NumberOfChannels = 3", b"NumberOfChannels = 4", "has 4 channels"),
         (b"MET_UCHAR", b"MET_FLOAT", "ElementType: is 'MET_FLOAT', and met_uchar is read"),
         (b"BinaryData = True", b"BinaryData = False", "BinaryData: is 'False'"),
-        (b"= LOCAL", b"= ../../etc/passwd", "is no file next to"),
+        (b"= LOCAL", b"= ../../etc/passwd", "is no file next to a.igs.mha; put there what was written with it"),
         (b"= LOCAL", b"= LIST", "'LIST' is no file next to"),
         (b"domain list", b"list domain", "kinds: are not domain ... list"),
         (b"ObjectType =", b"ObjectType ", "is no `Name = value`"),
@@ -179,6 +179,7 @@ def test_truncated_and_damaged_images_are_refused(world, transforms):
         data.write_bytes(whole[:-700])
         with pytest.raises(NeecoError, match=r"states|end early") as caught:
             list(format_of(path).open_images(path).read(range(COUNT)))
+        assert str(caught.value).startswith(f"{data}: ")
         assert len(str(caught.value).splitlines()) == 1
         if name not in ("whole.igs.mha", "whole.nrrd", "beside.mhd"):
             content = bytearray(whole)
@@ -209,7 +210,7 @@ def test_a_file_without_transforms_says_so(world):
     ):
         read_pose_log(PoseColumns(path))
     volume = sequence(world.folder / "ct.mha", [], film())
-    with pytest.raises(NeecoError, match="no PLUS sequence"):
+    with pytest.raises(NeecoError, match="no PLUS sequence; give one, or another file"):
         read_pose_log(PoseColumns(volume))
 
 

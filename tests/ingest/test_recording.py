@@ -273,6 +273,7 @@ def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder)
         ("[qw, qx, qy, qz]", "[a, b, c, d]", "the names do not say the order"),
         ("quaternion: [qw, qx, qy, qz]", "euler: [qx, qy, qz]", r"euler_convention: missing"),
         ("quaternion: [qw, qx, qy, qz]", "euler: [qx, qy, qz], euler_convention: XXY", r"'XXY' is none"),
+        ("quaternion:", "euler_convention: XXY, quaternion:", r"'XXY' is none"),
         ("quaternion:", "rotation_vector: [a, b, c], quaternion:", "keep one of them"),
         ("millimetres", "inches", r"units\.length: 'inches' is no unit of length; use mm, cm, m"),
         ("[0, 1.5]", "[1.5, 0]", r"joints\.jaw\.limits: 1\.5 is not below 0"),
@@ -304,6 +305,7 @@ def test_mistakes_are_told_with_their_key(world, folder, old, new, message):
     [
         ({"clocks": {"em": 0.5, "jaw_angle": 2}}, {"em": 0.5, "jaw_angle": 2.0}),
         ({"em_minus_video_s": 1.0}, {"em": 1.0}),
+        ({"clocks": None, "em_minus_video_s": 1.0}, {"em": 1.0}),
         ({"jaw_angle_minus_video_s": 1.0, "note": "x"}, {"jaw_angle": 1.0}),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,10 +13,21 @@ from bag_world import KINDS, BagWriter
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers import IMAGES, OTHER, POSES, READINGS, RecordingFormat, VideoSource, format_of, read_table
+from neeco.ingest.readers import (
+    IMAGES,
+    OTHER,
+    POSES,
+    READINGS,
+    RecordingFormat,
+    VideoSource,
+    _bagfile,
+    format_of,
+    read_table,
+)
 from neeco.ingest.readers.columns import BASE, CAMERA, JointColumns, PoseColumns
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog, read_pose_log, read_reading_log
+from neeco.ingest.readers.rosbag import RosBag
 
 ARM, JAW, LEFT = "/PSM1/measured_cp", "/PSM1/jaw/measured_js", "/stereo/left/image_raw"
 STEP = 0.025  # s
@@ -135,6 +147,13 @@ def test_streams_say_what_there_is(tmp_path: Path, kind: str) -> None:
     assert found[ARM].rate_hz == pytest.approx(1 / STEP)
 
 
+@pytest.mark.parametrize(("frame", "meant"), [("ECM", CAMERA), ("/ecm", CAMERA), ("PSM1_base", BASE), ("", BASE)])
+def test_poses_in_a_cameras_frame_are_known_as_such(tmp_path: Path, frame: str, meant: str) -> None:
+    path = whole(tmp_path, frame=frame)  # its images are of `camera`
+    assert poses(path).frame == meant
+    assert read_pose_log(PoseColumns(path, stream=ARM, frame=BASE)).frame == BASE
+
+
 def test_a_dvrks_poses_in_the_images_own_frame_have_either_axes_and_are_asked_for(tmp_path: Path) -> None:
     path = whole(tmp_path, frame="camera")  # as its images
     message = refusal(lambda: poses(path))
@@ -238,6 +257,24 @@ def test_joints_go_by_their_names(tmp_path: Path) -> None:
     assert isinstance(table.rows, np.ndarray)
     assert np.isnan(table.rows[0, column])
     assert table.rows[1, column] == 0.2
+
+
+def test_the_limit_of_joints_leaves_poses_whole_and_a_joint_named_twice_counts_once(tmp_path: Path) -> None:
+    with BagWriter(tmp_path, "recording.bag") as bag:
+        write_arm(bag)
+    narrow = RosBag()
+    narrow.limits = _bagfile.BagLimits(joints=2)
+    assert np.shape(narrow.read(bag.path, ARM).rows) == (40, 8)
+    joints = narrow.read(bag.path, "/PSM1/measured_js")
+    assert joints.header == ("t_s", "outer_insertion_m", "outer_wrist_pitch_rad")
+    np.testing.assert_allclose(joints.rows[:, 2], TICKS, atol=1e-15)
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=0), frame_id="")
+    message = SimpleNamespace(name=["a", "b", "a"], position=np.array([1.0, 2.0, 3.0]), header=header)
+    samples = _bagfile.Samples(_bagfile.JOINTS, _bagfile.BagLimits())
+    for received in (1, 2):
+        samples.add(received, message)
+    np.testing.assert_array_equal(samples.table(), [[1, 2], [1, 2]])
+    assert (len(samples.arrived), len(samples.numbers)) == (0, 0)  # of images alone
 
 
 def test_joints_without_names_are_numbered_or_the_dvrks(tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def test_a_still_capture_stays_one_when_it_is_written_again(
     ("changes", "words"),
     [
         ({"intrinsics": None}, "recording.yaml: intrinsics: missing; images of a scope that stands still"),
-        ({"camera": "fixed"}, "camera: 'fixed' is none of them; write one of still, moving"),
+        ({"camera": "fixed"}, "camera: 'fixed' is not known here; write one of still, moving"),
         ({"stereo": {"video": "right"}}, "stereo.calibration: missing"),
         ({"stereo": {"calibration": "stereo.yaml"}}, "stereo.video: missing or twice"),
         ({"camera": "moving"}, "instruments: bar: poses in the camera's frame need a scope that stands still"),

@@ -7,7 +7,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from neeco.base.errors import visible
+from neeco.base.errors import NeecoError, visible
 from neeco.cli._output import JsonTarget, whole_lines
 from neeco.ingest.request import IngestRequest
 
@@ -44,6 +44,9 @@ def run(args: Ingest) -> int:
     folder, recordings = sources_of(args, args.output)
     output = Path(os.path.normpath(args.output or ""))  # a/../b is b, whatever a is
     if folder is not None:
+        if args.strict or args.json is not None:  # they are of a verdict, and what is converted has none
+            option = "--strict" if args.strict else "--json"
+            raise NeecoError(f"{folder}: {option} would be ignored with it; leave it out")
         for sentence in convert_folder(folder, output):
             print(f"note: {visible(sentence)}")
         print(f"capture: {output}  (next: neeco check {shlex.quote(str(output))})")

@@ -238,11 +238,9 @@ def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kin
     if wanted is None:
         what = f"holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream` in the recording: {listed}"
         raise NeecoError(f"{path}: {what}")
-    what = (
-        f"{printable(wanted)} is {found[0].type}, not {' or '.join(kinds)}"
-        if found
-        else f"holds no {printable(wanted)}"
-    )
+    what = f"holds no {printable(wanted)}"
+    if found:
+        what = f"{printable(wanted)} is {found[0].type}, not {' or '.join(kinds)}"
     raise NeecoError(f"{path}: stream: {what}; name one of {listed}")
 
 

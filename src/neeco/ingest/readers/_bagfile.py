@@ -276,7 +276,8 @@ class Samples:
 
     def add(self, received: int, message: Any) -> None:
         """Add a message (None: a damaged one)."""
-        self.arrived.append(received)
+        if self.type in IMAGE:
+            self.arrived.append(received)
         try:
             values = self._values(message)
         except _UnusableError as error:
@@ -284,11 +285,15 @@ class Samples:
             return
         count = len(self.stamps)
         for name, value in values:
-            if name in self.columns or len(self.columns) < self.limits.joints:
-                column = self.columns.setdefault(name, array("d"))
+            column = self.columns.get(name)
+            if column is None:
+                if self.type == JOINTS and len(self.columns) >= self.limits.joints:
+                    continue
+                column = self.columns[name] = array("d")
+            if len(column) < count:
                 column.extend([np.nan] * (count - len(column)))
-                column.extend([value] * (len(column) == count))  # of a joint named twice, the first
-        self.numbers.append(len(self.arrived) - 1)
+            if len(column) == count:  # of a joint named twice, the first
+                column.append(value)
         self.stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
         self.received.append(received)
         self.frames.add(plain(message.header.frame_id).lstrip("/"))
@@ -303,6 +308,7 @@ class Samples:
             if not 0 < size[0] * size[1] <= self.limits.pixels:
                 raise _UnusableError(f"has {size[0]}x{size[1]} pixels")
             self.sizes[size] = self.encodings[encoding] = None
+            self.numbers.append(len(self.arrived) - 1)
             return ()
         if self.type == JOINTS:
             values = message.position.tolist()
@@ -398,11 +404,15 @@ class Survey:
             for item in [] if message is None else message.transforms:
                 name = f"tf:{plain(item.child_frame_id).lstrip('/')}"
                 if name in self.poses or len(self.poses) < self.limits.bodies:
-                    static = topic.endswith("tf_static")
-                    self.poses.setdefault(name, Samples(kind, self.limits, static)).add(received, item)
+                    self._log(self.poses, name, kind, topic.endswith("tf_static")).add(received, item)
         else:
             streams = self.images if kind in IMAGE else self.poses if kind in POSE else self.joints
-            streams.setdefault(topic, Samples(kind, self.limits)).add(received, message)
+            self._log(streams, topic, kind).add(received, message)
+
+    def _log(self, logs: dict[str, Samples], name: str, kind: str, static: bool = False) -> Samples:
+        if name not in logs:
+            logs[name] = Samples(kind, self.limits, static)
+        return logs[name]
 
     def seconds(self, log: Samples) -> np.ndarray:
         """Return times [N] s from the origin: the stamps or, where those are 0, the times of receipt, ns."""

@@ -249,8 +249,10 @@ class _Stored(VideoSource):
 
     def _decoded(self, row: int, cell: bytes | None) -> np.ndarray:
         where = f"{self.path}: {self.key}: row {row} of episode {self.episode}"
+        if cell is None:
+            raise NeecoError(f"{where}: has no image in it; write the data set with its images")
         try:
-            with Image.open(BytesIO(cell or b""), formats=FORMATS) as image:
+            with Image.open(BytesIO(cell), formats=FORMATS) as image:
                 if image.size[0] * image.size[1] > self.limits.pixels:
                     raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
                 pixels = np.array(image.convert("RGB"))

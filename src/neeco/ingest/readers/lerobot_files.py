@@ -246,9 +246,8 @@ def read_columns(
     parts = [part for part in batches(path, list(widths), limits, episode) if len(part)]
     table = {}
     for name, width in widths.items():
-        rows = [row for part in parts for row in part.column(name).to_pylist()]
         try:
-            values = np.array(rows, np.float64).reshape(len(rows), -1 if rows else width)
+            values = np.concatenate([_numbers(part.column(name)) for part in parts] or [np.zeros((0, width))])
         except (ValueError, TypeError):
             kind = parts[0].column(name).type
             raise NeecoError(f"{path}: {name}: holds {kind}, no numbers, as many in each row; name another") from None
@@ -257,6 +256,23 @@ def read_columns(
             raise NeecoError(f"{path}: {name}: {problem}; download the data set again")
         table[name] = values
     return table
+
+
+def _numbers(column: Any) -> np.ndarray:
+    """Return [R, C] of numbers or of lists of them, all of one length; NaN of what is null. Raises ValueError."""
+    from pyarrow import ExtensionArray, FixedSizeListArray, LargeListArray, ListArray, compute, types
+
+    count = len(column)
+    while isinstance(column, ExtensionArray | ListArray | LargeListArray | FixedSizeListArray):
+        if isinstance(column, ExtensionArray):
+            column = column.storage
+        elif len(compute.list_value_length(column).unique()) > 1:
+            raise ValueError("ragged")
+        else:
+            column = column.flatten()
+    if not any(is_kind(column.type) for is_kind in (types.is_floating, types.is_integer, types.is_boolean)):
+        raise ValueError("no numbers")
+    return np.asarray(column.to_numpy(zero_copy_only=False), np.float64).reshape(count, -1)
 
 
 def batches(

@@ -305,9 +305,8 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     """
     table = read_table(path)
     names = [name for name in table.header if name]
-    angle_names = [
-        name for name in names if named.split_unit(name, "angle")[1] or named.split_unit(name, "angle")[0] == "angle"
-    ]
+    split = [(name, *named.split_unit(name, "angle")) for name in names]
+    angle_names = [name for name, word, unit in split if unit or word == "angle"]
     if len(names) < 2 or (len(names) > 2 and len(angle_names) != 1):
         raise NeecoError(f"{path}: header: expected two columns, counts and angle_rad (or angle_deg); repair the table")
     angle_name = angle_names[0] if len(angle_names) == 1 else names[1]

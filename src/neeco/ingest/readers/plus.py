@@ -147,12 +147,14 @@ class _Header:
             raise self.fault(f"{name}: expected whole numbers, found {printable(' '.join(words) or 'nothing')}")
         return [int(word) for word in words]
 
-    def fault(self, what: str) -> NeecoError:
-        return NeecoError(f"{self.path}: {what}; copy or export the sequence again")
+    def fault(self, what: str, file: Path | None = None) -> NeecoError:
+        return NeecoError(f"{file or self.path}: {what}; copy or export the sequence again")
 
 
-def read_sequence(path: Path) -> FrameSequence:
-    """The header of a sequence. Raises NeecoError where it is none, is damaged, or says what the file does not hold."""
+@lru_cache(maxsize=4)
+def read_sequence(path: Path, state: tuple[object, ...]) -> FrameSequence:
+    """The header of a sequence; `state` of the file distinguishes it from another of its name. Raises NeecoError where
+    it is none, is damaged, or says what the file does not hold."""
     is_nrrd = path.suffix.lower() in NRRD
     try:
         with open_file(path, "a sequence") as stream:
@@ -160,7 +162,8 @@ def read_sequence(path: Path) -> FrameSequence:
     except OSError as error:
         raise NeecoError(f"{path}: cannot read: {error.strerror or error}; correct the path") from None
     if not header.frames:
-        raise header.fault("holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence")
+        what = "holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence"
+        raise NeecoError(f"{path}: {what}; give one, or another file")
     plain, sizes = header.plain, header.integers("sizes" if is_nrrd else "DimSize")
     usual = "" if is_nrrd else " ".join(["domain"] * (len(sizes) - 1) + ["list"])
     size, count, channels = _dimensions(header, sizes, plain.get("kinds", usual).lower().split())
@@ -177,7 +180,8 @@ def read_sequence(path: Path) -> FrameSequence:
     if name.upper() != "LOCAL":
         file, start = path.parent / name, 0
         if Path(name).name != name or not file.is_file():
-            raise header.fault(f"{printable(name)} is no file next to {path.name}")
+            what = f"{printable(name)} is no file next to {path.name}"
+            raise NeecoError(f"{path}: {what}; put there what was written with it")
     packed = plain.get("encoding", "raw").lower() != "raw" or plain.get("compresseddata", "").lower() == "true"
     sequence = FrameSequence(
         path=path, size=size, count=count, channels=channels, fields=header.frames, data=(file, start), packed=packed
@@ -187,11 +191,11 @@ def read_sequence(path: Path) -> FrameSequence:
         held, promised = file.stat().st_size - start, sequence.frame_bytes * count
         stored = plain.get("compresseddatasize", "")
         if not packed and held != promised:
-            raise header.fault(f"holds {held / sequence.frame_bytes:.4g} images, its header states {count}")
+            raise header.fault(f"holds {held / sequence.frame_bytes:.4g} images, its header states {count}", file)
         if packed and re.fullmatch(r"\d{1,18}", stored) and held < int(stored):
-            raise header.fault(f"holds {held} bytes of compressed images, its header states {stored}")
+            raise header.fault(f"holds {held} bytes of compressed images, its header states {stored}", file)
         if packed and promised > LIMITS.zlib_ratio * (held + 64):
-            raise header.fault(f"holds {held} bytes, of which no {count} images of {size} can come")
+            raise header.fault(f"holds {held} bytes, of which no {count} images of {size} can come", file)
     return sequence
 
 
@@ -277,7 +281,7 @@ def _packed_frames(stream: BinaryIO, start: int, length: int) -> Iterator[bytes]
             packed = machine.unused_data
             machine = zlib.decompressobj(zlib.MAX_WBITS | 32)
         while len(unpacked) >= length:
-            yield bytes(unpacked[:length])
+            yield bytes(memoryview(unpacked)[:length])
             del unpacked[:length]
     if unpacked:
         yield bytes(unpacked)
@@ -324,9 +328,8 @@ class PlusSequence(RecordingFormat):
     def read(self, path: Path, stream: str | None = None) -> Table:
         sequence = _sequence_of(path)
         if not sequence.transforms:
-            raise NeecoError(
-                f"{path}: holds no transforms (Seq_Frame0000_StylusToTrackerTransform); name a log of poses"
-            )
+            what = "holds no transforms (Seq_Frame0000_StylusToTrackerTransform)"
+            raise NeecoError(f"{path}: {what}; name a log of poses")
         wanted = None if stream is None else stream.removesuffix(TRANSFORM)
         name = choose_stream(path, self.streams(path), wanted, (POSES,)).name
         statuses, dropped = sequence.statuses(name), dict[str, list[int]]()
@@ -362,12 +365,7 @@ class PlusSequence(RecordingFormat):
 
 def _sequence_of(path: Path) -> FrameSequence:
     require_content(path)
-    return _cached(path, file_state(path))
-
-
-@lru_cache(maxsize=4)
-def _cached(path: Path, state: tuple[object, ...]) -> FrameSequence:
-    return read_sequence(path)
+    return read_sequence(path, file_state(path))
 
 
 def _status_words(name: str, status: str) -> str:

@@ -40,7 +40,8 @@ from neeco.ingest.readers import (
 from neeco.ingest.readers.columns import BASE, CAMERA, PoseColumns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, meaning_of, of_dvrk
 from neeco.ingest.readers.interpolate import poses_at
-from neeco.ingest.readers.logs import SETTINGS, read_pose_log
+from neeco.ingest.readers.logs import SETTINGS as LOGS
+from neeco.ingest.readers.logs import read_pose_log
 
 if TYPE_CHECKING:
     from neeco.ingest.readers._bagfile import BagLimits, Samples, Survey
@@ -67,13 +68,12 @@ class RosBag(RecordingFormat):
     suffixes = (".bag", ".mcap", ".db3")
     package = "rosbags"
     extra = "ros"
+    limits: BagLimits | None = None  # None: the usual ones
 
     def claims(self, path: Path) -> bool:
         if not path.is_dir():
             return super().claims(path)
         return b"rosbag2_bagfile_information" in read_head(path / "metadata.yaml", 4096)
-
-    limits: BagLimits | None = None  # the usual ones
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         return _streams(self._survey(path))
@@ -340,7 +340,7 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
         log = survey.poses[f"tf:{edge}"]
         if log.static:
             values = log.table()[-1]
-            if not (np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < SETTINGS.norm_tolerance):
+            if not (np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < LOGS.norm_tolerance):
                 raise NeecoError(f"{survey.path}: tf:{edge}: is no rotation and translation; record it anew")
             pose = rigid(Rotation.from_quat(values[3:]).as_matrix(), 1000 * values[:3])
             poses = np.tile(pose, (len(seconds), 1, 1))

@@ -72,7 +72,7 @@ class Rows:
 def keep_measured(rows: Rows, source: PoseColumns, recognised: str | None) -> None:
     """Drop the rows whose state does not say that they were measured."""
     table, name = rows.table, source.state or recognised
-    if name is None:
+    if name is None or not len(table.rows):
         return
     states = [str(cell) for cell in table.rows[:, column_index(table, name)]]
     good = {value.lower() for value in source.good}

@@ -66,12 +66,11 @@ class SurgPose(RecordingFormat):
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         arms = _read(path)
-        videos = _videos(path)
         count = max(len(frames) for frames, _ in arms.poses.values())
         # the left camera's are the frames; others are listed
         found = [
             Stream(name, IMAGES, "video", count, FRAMES_PER_SECOND, offered=number == 0)
-            for number, name in enumerate(videos)
+            for number, name in enumerate(_videos(path))
         ]
         for name, (frames, _) in sorted(arms.poses.items()):
             found.append(Stream(name, POSES, "poses", len(frames), FRAMES_PER_SECOND, body=name, hints=(DVRK_HINT,)))

@@ -51,8 +51,8 @@ def require_installed(name: str) -> None:
 
 def open_video(path: Path, fps: float | None = None, part: tuple[float, float] | None = None) -> VideoSource:
     """A video file, or the part of it from one time s to another, without it. Its frames are decoded once to find
-    those that can be, with their own times (`fps`: overrides them), and buffered where they fit into memory. What is
-    damaged is left out and noted; raises NeecoError when nothing can be read."""
+    those that can be, with their own times (`fps`: overrides them), and buffered up to `VideoSettings.buffered_bytes`.
+    What is damaged is left out and noted; raises NeecoError when nothing can be read."""
     path = Path(path)
     require_content(path)
     if not path.is_file():
@@ -135,9 +135,8 @@ def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarr
     missing = int(places[-1]) + 1 - len(files)
     if missing:
         first = files[int(np.flatnonzero(steps != step)[0])].name
-        notes.append(
-            f"{folder.name}: {missing} images are missing by their numbers (first after {first}); a gap in time"
-        )
+        what = f"{missing} images are missing by their numbers (first after {first})"
+        notes.append(f"{folder.name}: {what}; a gap in time")
     return places
 
 
@@ -180,12 +179,8 @@ class _Video(VideoSource):
     numbered: bool
     threads: str
     part: tuple[float, float] | None = None
-    stated_fps: float | None = None
+    own_fps: float | None = None
     buffered: tuple[Any, ...] = ()  # all frames, decoded; empty where they are too large
-
-    @property
-    def own_fps(self) -> float | None:
-        return self.stated_fps
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.stamps[int(index)]: int(index) for index in indices}
@@ -327,7 +322,7 @@ class _Scan:
             times = np.array(order) / stated
         return _Video(
             self.path, self.size, tuple(f"{self.path.name}: {note}" for note in notes), times, stamps=tuple(order),
-            numbered=numbered, threads=self.threads, part=self.part, stated_fps=own, pixel_aspect=self.pixel_aspect,
+            numbered=numbered, threads=self.threads, part=self.part, own_fps=own, pixel_aspect=self.pixel_aspect,
             buffered=tuple(self.buffered) if len(self.buffered) == len(self.stamps) else (),
         )  # fmt: skip
 

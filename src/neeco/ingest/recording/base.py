@@ -116,9 +116,8 @@ def read_dvrk_registration(path: Path) -> StatedBase:
     try:
         document = json.loads(content if whole else "{" + content.rstrip(",") + "}")
     except (ValueError, RecursionError) as error:
-        raise NeecoError(
-            f"{path}: is not {WHAT}; give the file …-registration-open-cv.json, or easy_handeye's YAML"
-        ) from error
+        remedy = "give the file …-registration-open-cv.json, or easy_handeye's YAML"
+        raise NeecoError(f"{path}: is not {WHAT}; {remedy}") from error
     node = Node(document, str(path), "", RaisingReport())
     if isinstance(document, dict) and (key := next((key for key in ("matrix", "transform") if key in document), None)):
         matrix = node.child(key).rigid()
@@ -129,10 +128,7 @@ def read_dvrk_registration(path: Path) -> StatedBase:
             return _stated(Node(usual | document, str(path)))
     frame = node.child("base-frame")
     if not isinstance(frame.value, dict):
-        frame.error(
-            "is missing",
-            f"give {WHAT}, as …-registration-open-cv.json has it, or write {STATED} instead",
-        )
+        frame.error("is missing", f"give {WHAT}, as …-registration-open-cv.json has it, or write {STATED} instead")
     matrix = frame.child("transform").rigid()
     assert matrix is not None
     matrix = matrix.copy()

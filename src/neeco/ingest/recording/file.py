@@ -104,8 +104,8 @@ class PoseColumnsSection:
             raise Fault("quaternion", "the names do not say the order; use quaternion_wxyz or quaternion_xyzw")
         if self.matrix and self.position:
             raise Fault("position", "the 4x4 matrix holds the position already; remove it (or use rotation_matrix)")
-        if self.euler and not _EULER.fullmatch(self.euler_convention or ""):
-            problem = f"{printable(self.euler_convention)} is none" if self.euler_convention else "missing"
+        if (self.euler or self.euler_convention is not None) and not _EULER.fullmatch(self.euler_convention or ""):
+            problem = "missing" if self.euler_convention is None else f"{printable(self.euler_convention)} is none"
             raise Fault("euler_convention", f"{problem}; name three axes in order: ZYX intrinsic, zyx extrinsic")
 
     @property
@@ -393,7 +393,8 @@ def _sync(
     stated = document if isinstance(document, dict) else {}
     others = {key: value for key, value in stated.items() if key.endswith(_OFFSET_SUFFIX)}
     with faults_in(file):
-        return _offsets(Node(document, str(file)), stated if "clocks" in stated else others or None, clocks)
+        stated = stated if isinstance(stated.get("clocks"), dict) else others
+        return _offsets(Node(document, str(file)), stated or None, clocks)
 
 
 def _offsets(node: Node, stated: Any, clocks: tuple[str, ...]) -> tuple[dict[str, float], tuple[str, ...]]:

@@ -49,7 +49,7 @@ def word(*names: str) -> Parser:
 
     def parse(node: Node) -> str:
         if text(node).lower() not in names:
-            raise Fault(node.field, f"{printable(node.value)} is none of them; write one of {', '.join(names)}")
+            raise Fault(node.field, f"{printable(node.value)} is not known here; write one of {', '.join(names)}")
         return text(node).lower()
 
     return parse
