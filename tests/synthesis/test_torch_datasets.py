@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State
-from neeco.labels.annotation import LabelledImage, LabelSettings, draw_labelled
+from neeco.labels.annotation import LABELS, LabelledImage, draw_labelled
 from neeco.raster.native import torch_threads
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import StatesRefused
@@ -223,4 +223,4 @@ def test_a_drawing_of_nothing_in_the_image_has_no_instruments(scene):
 
 
 def test_a_drawing_drops_as_small_components_as_synthesize():
-    assert Settings.min_component == LabelSettings.min_component
+    assert Settings.min_component == LABELS.min_component

@@ -8,6 +8,7 @@ import json
 import shutil
 import subprocess
 import sys
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -27,6 +28,7 @@ from neeco.base.errors import NeecoError
 from neeco.capture.readers import read_capture
 from neeco.cli import main
 from neeco.ingest.posing.posed_capture import read_answers
+from neeco.viewer import posing
 from neeco.viewer.access import Access
 from neeco.viewer.posing import PosingServer
 
@@ -129,8 +131,9 @@ def test_a_run_shows_its_scene_as_a_ghost_that_follows_the_sliders(made: PosingW
         assert shaft[height // 2 - 3 : height // 2 + 3].mean() > 0.9
         beyond = slice(width // 2, None)
         assert np.flatnonzero(opened[:, beyond].any(1)).size > 1.5 * np.flatnonzero(closed[:, beyond].any(1)).size
-        with pytest.raises(urllib.error.HTTPError, match="400"):
+        with pytest.raises(urllib.error.HTTPError, match="400") as refused:
             image(started, "ghost", index=5, roll=1.0, joints={})
+        assert b"in degrees" in refused.value.read()
 
 
 @pytest.mark.parametrize(
@@ -164,9 +167,13 @@ def test_a_picture_that_cannot_be_is_refused_in_a_line(server: PosingServer, fie
     with pytest.raises(urllib.error.HTTPError, match="400") as refused:
         urllib.request.urlopen(address_of(server, "picture", fields), timeout=20)
     assert b"\n" not in refused.value.read().strip()
+    assert refused.value.headers["Content-Type"].startswith("text/plain")  # of a page, scripts in it would run
 
 
-def test_pictures_come_side_by_side(server: PosingServer) -> None:
+def test_pictures_come_side_by_side(server: PosingServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each waits until another one is read, too."""
+    meet, opened = threading.Barrier(2, timeout=20), posing.open_image
+    monkeypatch.setattr(posing, "open_image", lambda path: (meet.wait(), opened(path))[1])
     with ThreadPoolExecutor(6) as pool:
         widths = list(pool.map(lambda k: image(server, "picture", index=k, small=True).width, range(12)))
     assert widths == [server.settings.thumbnail_width] * 12

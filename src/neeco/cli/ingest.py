@@ -41,6 +41,8 @@ def run(args: Ingest) -> int:
     if args.init:
         print(*write_draft(args.source, print), sep="\n")
         return 0
+    if not args.source and args.video is None:
+        raise NeecoError("ingest: no source; give recording.yaml (`neeco ingest --init` drafts it) or --video FILE")
     folder, recordings = sources_of(args, args.output)
     output = Path(os.path.normpath(args.output or ""))  # a/../b is b, whatever a is
     if folder is not None:

@@ -2,11 +2,11 @@
 
     read            recordings  -> Episodes       logs and video on one timeline, with the clocks that are given
     choose frames   Episodes    -> ChosenImages   sharp frames that differ, undistorted, without a dark border
-    find the world  both        -> World          cameras, clocks, bases, instruments, tissue (see below)
+    find the world  both        -> World          cameras, clocks, bases, instruments, tissue (see below, and world.py)
     split           World       -> splits         which frames train, which test
     write           all         -> Capture        and the IngestResult, which reports how good it is
 
-The world of a scope that moves (`world.py`): find cameras by structure from motion, register them to the scope's
+The world of a scope that moves: find cameras by structure from motion, register them to the scope's
 tracker, find the instruments, adjust the cameras without these, register again. The world of a scope that stands still
 is its own frame: find bases, instruments, and the tissue behind them. What a stage learns about clocks, bases and
 instruments is in the `Episodes` that it returns; what it has to report, in `Episodes.notes`.

@@ -138,7 +138,7 @@ class IngestResult:
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictSettings:
-    """Limits above which there is a warning: conventions, not measurements."""
+    """Limits beyond which there is a warning: conventions, not measurements."""
 
     position_mm: float = 1.0  # rms
     rotation_deg: float = 0.5  # rms
@@ -150,7 +150,7 @@ class VerdictSettings:
     severe: float = 3.0  # times the limit
     min_points: int = 100  # of the tissue
     min_overlap: float = 0.85  # of a base's outline with what moves: right bases reach 0.92 to 0.97 (measured once)
-    min_plausible_overlap: float = 0.7
+    min_plausible_overlap: float = 0.7  # the same, below which the base is doubtful
     max_shown: int = 5  # warnings listed by `lines`
     facts: int = 2  # of an assessment
 

@@ -56,7 +56,7 @@ def sources_of(request: IngestRequest, output: Path | None) -> tuple[Path | None
     the option, and where there is no output."""
     folder = _folder_to_convert(request.source)
     if not request.source and request.video is None:
-        raise NeecoError("ingest: no source; give recording.yaml (`neeco ingest --init` drafts it) or --video FILE")
+        raise NeecoError("--video: give the video (or a folder of images), or a recording.yaml")
     if output is None:
         raise NeecoError("--output: give the folder of the capture to write")
     ignored = [option for option in request.options if folder is not None or option != "--frames"]

@@ -30,7 +30,7 @@ OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2  # OUTSIDE: of the image, or the instrument
 MAGNIFICATION = 4  # at which contours along pixel edges are found
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LabelSettings:
     """Limits of the labels of an image."""
 
@@ -39,6 +39,9 @@ class LabelSettings:
     simplify_px: float = 0.8  # the pixels of a straight edge deviate less than this from its line
     max_area_change: float = 0.02  # share by which a simpler polygon may change the area
     min_component: float = 0.01  # of an instrument's largest: smaller ones are not labelled, as by `synthesize`
+
+
+LABELS = LabelSettings()
 
 
 @dataclass(frozen=True)
@@ -163,8 +166,8 @@ def project_keypoints(drawing: LayeredDrawing, instrument: str) -> dict[str, Key
         if not absent and place is not None:
             x, y, z = place
             pixel = int(y), int(x)
-            hidden = any(0 < depth[pixel] < z - LabelSettings.occlusion_mm for depth in others)
-            hidden |= 0 < drawing.layers[instrument].depth[pixel] < z - LabelSettings.self_occlusion_mm
+            hidden = any(0 < depth[pixel] < z - LABELS.occlusion_mm for depth in others)
+            hidden |= 0 < drawing.layers[instrument].depth[pixel] < z - LABELS.self_occlusion_mm
             projected[name] = Keypoint(round(x, 2), round(y, 2), OCCLUDED if hidden else VISIBLE)
     return projected
 
@@ -291,10 +294,10 @@ def _outer_loops(mask: np.ndarray) -> tuple[list[np.ndarray], list[int]]:
 def _simplified(loop: np.ndarray) -> np.ndarray:
     """Return the loop with fewer corners (Douglas and Peucker 1973), its area kept within `max_area_change`."""
     area = signed_area(loop)
-    tolerance = LabelSettings.simplify_px
+    tolerance = LABELS.simplify_px
     while tolerance > 0.1:
         simple = _approximated(loop, tolerance)
-        if len(simple) >= 3 and abs(signed_area(simple) - area) <= LabelSettings.max_area_change * area:
+        if len(simple) >= 3 and abs(signed_area(simple) - area) <= LABELS.max_area_change * area:
             return simple
         tolerance /= 2
     return _approximated(loop, 1e-6)  # removes collinear corners only
@@ -413,6 +416,6 @@ def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bo
         return RGBDImage(rendering.color.clamp(0, 1).cpu(), depth)
     known = require_gaussians(scene, "render labels")
     labeller = CompositedLabels(known)
-    drawing = draw_layers(known, labeller, state, camera, LabelSettings.min_component)
+    drawing = draw_layers(known, labeller, state, camera, LABELS.min_component)
     found = annotate(known, drawing, labeller.names)
     return LabelledImage.from_drawing(drawing, found, labeller.names, keypoint_names(known))

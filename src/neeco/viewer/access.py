@@ -1,7 +1,8 @@
 """Addresses and access of every server of `neeco view`: whoever asks needs the token in the address.
 
-The token is the first part of the path, of the page and of its web socket. Unlike a cookie, it is added to no request
-by the browser itself: a page of another site, which does not know it, gets nothing, by whatever name it calls.
+The token is the first part of the path, of the page, its pictures and its web socket. Unlike a cookie, it is added to
+no request by the browser itself: a page of another site, which does not know it, gets nothing, by whatever name it
+calls.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """`neeco view CAPTURE --annotate`: a small web server with the page on which a person poses frames by hand.
 
-A question is a JSON object {"ask": what, ...}. Over the web socket, objects answer in order. Pictures, which change
-nothing, are requested by GET /picture/{...} and /ghost/{...}, side by side.
+A question is a JSON object {"ask": what, ...}. Over the web socket each is answered by another object, in their order.
+Pictures change nothing: GET /picture/{...} and /ghost/{...} bring them side by side.
 """
 
 from __future__ import annotations
@@ -43,8 +43,9 @@ from neeco.viewer.access import HOST, MAX_MESSAGE, PORT, Access, family_of, quie
 
 RUN_FILE = "config.yaml"  # tells a run from a capture
 STATE = {"index": int, "roll": float, "joints": {str: float}}  # degrees
+# what a page may ask, and its fields: by GET, and over the web socket
 IMAGES: dict[str, dict[str, Any]] = {"picture": {"index": int, "small": bool}, "ghost": STATE}
-FIELDS = IMAGES | {"overview": {}, "frame": {"index": int}, "save": STATE, "undo": {}}  # of what a page may ask
+QUESTIONS: dict[str, dict[str, Any]] = {"overview": {}, "frame": {"index": int}, "save": STATE, "undo": {}}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +70,7 @@ class PosingServer:
 
     def __init__(self, root: Path, host: str = HOST, port: int = PORT) -> None:
         """root: a capture, or a run of one, whose scene then appears as a ghost. port: or the next that is free. Raises
-        NeecoError, too for a capture that cannot be posed or whose answers cannot be read."""
+        NeecoError, also for a capture that cannot be posed or whose answers cannot be read."""
         try:
             from websockets.sync.server import serve
         except ImportError:
@@ -117,31 +118,32 @@ class PosingServer:
             connection.send(json.dumps(answer, allow_nan=False))
 
     def _answer(self, message: Any) -> dict[str, Any]:
-        ask, instrument, question = self._question(message)
+        ask, instrument, question = self._question(message, QUESTIONS)
         if ask == "overview":
             return self.overview(instrument)
         if ask == "frame":
             return self._frame(instrument, question["index"])
         if ask == "undo":
             return self._undo(instrument)
-        if ask == "save":
-            return self.save(instrument, question["index"], question["roll"], question["joints"])
-        raise NeecoError(f"page: ask: {ask!r} is a picture; reload the page")
+        return self.save(instrument, question["index"], question["roll"], question["joints"])
 
     def _respond(self, connection: Any, request: Any) -> Any:
         """The page or a picture; None for the web socket."""
         if "Upgrade" in request.headers:
             return None
         ask, _, fields = request.path.removeprefix("/").partition("/")
-        status, kind = HTTPStatus.OK, "text/html; charset=utf-8"
+        # scripts of a page may run: what is refused, which repeats what was asked, is none
+        status, kind = HTTPStatus.OK, "text/plain; charset=utf-8"
         try:
             if not ask:
-                body = page()
+                body, kind = page(), "text/html; charset=utf-8"
             elif ask in IMAGES:
-                body, kind = self._image(self._question(json.loads(unquote(fields)) | {"ask": ask}))
+                given = json.loads(unquote(fields))
+                asked = given | {"ask": ask} if isinstance(given, dict) else given
+                body, kind = self._image(*self._question(asked, IMAGES))
             else:
                 status, body = HTTPStatus.NOT_FOUND, b"neeco view: no such page\n"
-        except (NeecoError, ValueError, TypeError, RecursionError) as error:
+        except (NeecoError, ValueError, RecursionError) as error:
             status, body = HTTPStatus.BAD_REQUEST, str(error).encode(errors="replace")
         response = connection.respond(status, "")
         response.body = body
@@ -150,13 +152,13 @@ class PosingServer:
             response.headers[name] = value
         return response
 
-    def _question(self, message: Any) -> tuple[str, str, dict[str, Any]]:
-        """Return what is asked, of which instrument, and its fields. Raises NeecoError."""
+    def _question(self, message: Any, known: Mapping[str, dict[str, Any]]) -> tuple[str, str, dict[str, Any]]:
+        """Return what of the `known` is asked, of which instrument, and its fields. Raises NeecoError."""
         remedy = "reload the page"
         ask = require_like(message, {"ask": str}, "page", remedy)["ask"]
-        if ask not in FIELDS:
+        if ask not in known:
             raise NeecoError(f"page: ask: {ask!r} is unknown; {remedy}")
-        question = require_like(message, {"ask": str, "instrument": str, **FIELDS[ask]}, "page", remedy)
+        question = require_like(message, {"ask": str, "instrument": str, **known[ask]}, "page", remedy)
         instrument = question["instrument"] or next(iter(self._posings))
         self._posing(instrument, question.get("index", 0))
         return ask, instrument, question
@@ -228,10 +230,9 @@ class PosingServer:
             raise NeecoError(f"no frame {index}; there are {len(self.posed.frames)}")
         return self._posings[instrument]
 
-    def _image(self, asked: tuple[str, str, dict[str, Any]]) -> tuple[bytes, str]:
+    def _image(self, ask: str, instrument: str, question: Mapping[str, Any]) -> tuple[bytes, str]:
         """A frame along the shaft, which points to the right, or the run's instruments there; and its media type."""
-        ask, instrument, question = asked
-        posing, index, settings = self._posing(instrument, question["index"]), question["index"], self.settings
+        posing, index, settings = self._posings[instrument], question["index"], self.settings
         if ask == "ghost":
             pixels = self._ghost(posing, index, question["roll"], question["joints"])
             width, order, kind = settings.ghost_width, cv2.COLOR_RGBA2BGRA, "png"

@@ -35,7 +35,7 @@ class ViewerSettings:
     settled_s: float = 0.15  # without a request: what is shown stands still and is rendered sharp
     idle_s: float = 0.5  # at most, between two looks for something to render
     moving_px: int = 256  # high, at most
-    sharp_px: int = 720
+    sharp_px: int = 720  # high, at most, of a sharp rendering
     min_px: int = 32  # high, at least
     moving_s: float = 0.15  # that rendering may take while something moves
     sharp_s: float = 0.4  # that a sharp rendering may take
@@ -54,14 +54,14 @@ log = logging.getLogger(__name__)
 
 class AdaptiveResolution:
     """Chooses heights of renderings so that they come in time, from what the last ones took. sharp_px: how high sharp
-    ones are whatever they take; None: as the constants say."""
+    ones are whatever they take; None: as `VIEWER` says."""
 
     def __init__(self, sharp_px: int | None = None) -> None:
         self._sharp_px = sharp_px
         self._per_pixel: deque[float] = deque(maxlen=VIEWER.remembered)  # s
 
     def height(self, sharp: bool, window: int, aspect: float) -> int:
-        """Height in px to render: at most the constants' and the window's, less where that would take too long.
+        """Height in px to render: at most `VIEWER`'s and the window's, less where that would take too long.
         aspect: width of all that is rendered by its height."""
         if sharp and self._sharp_px is not None:
             return max(VIEWER.min_px, min(self._sharp_px, window))

@@ -27,7 +27,7 @@ class CheckSettings:
     # frames
     min_train_frames: int = 4  # fewer: nothing can be learned
     max_still_cameras: int = 2  # cameras of a scope that stands still: one, or the two of a stereo scope
-    compared_width: int = 320  # px, width to which images are reduced before they are compared with each other
+    compared_width: int = 320  # px, width to which images are reduced before they are compared with points and states
     # states
     max_known_roll_deg: float = 45.0  # standard deviation above which a roll counts as unknown
     max_explained: float = 0.98  # share of a reading's variance that the other readings may explain

@@ -154,7 +154,7 @@ def parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty | None:
     if not node.is_object():
         return None
     translation = node.child("translation_mm").numbers(3, "standard deviations in the camera's axes, mm", least=0)
-    rotation = node.child("rotation_deg").numbers(3, "those about the instrument's x, y, z, degrees", least=0)
+    rotation = node.child("rotation_deg").numbers(3, "deviations about the instrument's x, y, z, degrees", least=0)
     named: dict[str, float] = {}
     good = translation is not None and rotation is not None
     if node.has("joints_deg"):

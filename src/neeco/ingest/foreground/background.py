@@ -21,8 +21,7 @@ class BackgroundSettings:
     normal_quartile: float = 0.6745  # standard deviations of a normal distribution, within which its half lies
     noise_floor: float = 11.0  # of 255, of sensor and compression
     max_deviations: float = 4.0  # of a pixel's own spread, within which it shows the background
-    # of the light in a shadow; by which that may differ between colours
-    shadow_share: tuple[float, float] = (0.35, 0.97)
+    shadow_share: tuple[float, float] = (0.35, 0.97)  # of the light, that is left in a shadow
     shadow_tint: float = 0.08  # by which a shadow may change the ratio of two colours
     min_saturation: float = 0.2  # of a background on which a shadow differs from a dark instrument
 

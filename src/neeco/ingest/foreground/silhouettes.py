@@ -16,8 +16,8 @@ class ShaftLineSettings:
     min_elongation: float = 2.0  # length over width of a shaft
     min_area: float = 0.002  # share of the image: smaller pieces of a mask are noise
     edge_px: int = 2  # from the image's border, within which a piece continues beyond it
-    entering: float = 0.5  # share of a piece that its line is fitted to; px long at least
-    min_slices: int = 6
+    entering: float = 0.5  # share of a piece, from the border, that its line is fitted to
+    min_slices: int = 6  # px along the shaft, at least, for that
     line_rounds: int = 4  # of the robust fit of a line
     smooth_px: float = 1.5  # of distances: the steps of a mask's outline would be taken for its shape
 
@@ -113,16 +113,11 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
     points, directions, tips, entries, courses = (np.full((count, 2), np.nan) for _ in range(5))
     hulls: list[np.ndarray] = [np.full((1, 2), np.nan)] * count
     border = np.zeros((height, width), dtype=bool)
-    (
-        border[: SHAFT_LINES.edge_px],
-        border[-SHAFT_LINES.edge_px :],
-        border[:, : SHAFT_LINES.edge_px],
-        border[:, -SHAFT_LINES.edge_px :],
-    ) = True, True, True, True
+    edge = SHAFT_LINES.edge_px
+    border[:edge] = border[-edge:] = True
+    border[:, :edge] = border[:, -edge:] = True
     if hidden is not None:
-        border |= cv2.dilate(hidden.astype(np.uint8), np.ones((2 * SHAFT_LINES.edge_px + 1,) * 2, np.uint8)).astype(
-            bool
-        )
+        border |= cv2.dilate(hidden.astype(np.uint8), np.ones((2 * edge + 1,) * 2, np.uint8)).astype(bool)
     for row, mask in enumerate(masks):
         pieces, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
         if pieces < 2:

@@ -67,8 +67,8 @@ class ArticulatedSettings:
     max_residual_px: float = 2.5  # above, nothing is found
     reversed_share: float = 0.8  # of the cost, from which a joint counts as reversed
     min_exchanged: float = 1.25  # times the cost, with poses of other moments
-    max_sds: float = 3.2  # from its prior, by which a stated length or angle, or the base, may be off
-    max_shift_sds: float = 3.5  # of the base's prior
+    max_sds: float = 3.2  # from its prior, by which a stated length or angle may be off
+    max_shift_sds: float = 3.5  # of the base's prior, by which the base may be off
 
 
 LINKED = ArticulatedSettings()

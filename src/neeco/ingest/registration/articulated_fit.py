@@ -323,11 +323,8 @@ def with_pose_errors(problem: ArticulatedProblem, fit: ArticulatedFit, max_steps
 def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     """Covariance [BASE + P, BASE + P] at a minimum, with outlines' and poses' errors that are correlated within the
     recording's blocks (sandwich estimator); the clock's rows are 0 where it is known."""
-    free, width, noise = (
-        _free(problem),
-        LINKED_FIT.widths_px[-1] * problem.px_scale,
-        LINKED_FIT.noise_px * problem.px_scale,
-    )
+    free, px_scale = _free(problem), problem.px_scale
+    width, noise = LINKED_FIT.widths_px[-1] * px_scale, LINKED_FIT.noise_px * px_scale
     use = _points(problem, fit)
     px = _residuals(problem, fit, use)
     columns = _jacobian(problem, fit, use, free)

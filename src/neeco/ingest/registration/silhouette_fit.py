@@ -170,9 +170,8 @@ class _System:
             offsets.append(off.ravel())
             sds.append(np.broadcast_to(sd, off.shape).ravel())
 
-        add(
-            np.arange(BASE, start), np.zeros(LINE), np.array([RIGID_FIT.line_sd_rad] * 2 + [RIGID_FIT.line_sd_mm] * 2)
-        )  # of a step
+        line_sd = np.array([RIGID_FIT.line_sd_rad] * 2 + [RIGID_FIT.line_sd_mm] * 2)  # of a step
+        add(np.arange(BASE, start), np.zeros(LINE), line_sd)
         prior, given = self.prior, self.prior.world_from_base
         if prior.sd_rad is not None and prior.sd_mm is not None:
             turn = Rotation.from_matrix(fit.world_from_base[:3, :3] @ given[:3, :3].T)

@@ -26,7 +26,7 @@ class ClockSearchSettings:
     min_correlation: float = 0.6  # of two recordings of one motion
     same_motion: float = 0.95  # correlation from which on no other rate is tried: ends are off by less than a lobe
     min_lead: float = 0.08  # by how much the best offset must beat every other, apart from its own lobe
-    lobe_s: float = 0.3
+    lobe_s: float = 0.3  # to either side of a peak of the correlation, that belongs to it
     min_significance: float = 3.5  # sd of chance: the best of tens of offsets in a short recording has 3
     min_overlap: float = 0.6  # of the video, that the log covers
     max_length_s: float = 24 * 3600.0  # of a recording: a longer log or video has stray stamps

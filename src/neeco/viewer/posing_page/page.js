@@ -39,15 +39,20 @@ async function image(what, fields) {
 
 const picture = index => image("picture", { index, small: false });
 
+// pictures come in any order: only the one that was requested last is shown, of the frame that was visited last
+let visits = 0, requests = 0;
+
 async function go(index, reason) {
   stop();
+  const visit = ++visits, request = ++requests;
   const picturing = picture(index);  // side by side
   picturing.catch(() => {});  // reported below
   frame = await ask("frame", { index });
   pose = { roll: frame.roll.value, joints: {} };
   for (const [name, known] of Object.entries(frame.joints)) pose.joints[name] = known.value;
-  displayed = await picturing;
-  shown = index;
+  const pictured = await picturing;
+  if (visit !== visits) return;
+  if (request === requests) [displayed, shown] = [pictured, index];
   $("why").textContent = `frame ${frame.name}` + (reason ? `: ${reason}` : "");
   $("failed").hidden = true;
   sliders();
@@ -183,7 +188,8 @@ function strip() {
   const indices = STRIP.map(step => frame.index + step).filter(index => index >= 0 && index < overview.frames);
   $("strip").replaceChildren(...indices.map(index => {
     const figure = document.createElement("figure"), caption = document.createElement("figcaption");
-    figure.append(Object.assign(new Image(), { src: address("picture", { index, small: true }), alt: `frame ${index}` }));
+    const src = address("picture", { index, small: true });
+    figure.append(Object.assign(new Image(), { src, alt: `frame ${index}`, onerror: () => fail(new Error(GONE)) }));
     const apart = index - frame.index;
     caption.textContent = apart ? (apart > 0 ? `+${apart}` : `${apart}`) : "this frame";
     figure.dataset.index = index;
@@ -202,7 +208,9 @@ function mark() {
 // another frame in the large picture, to look at
 async function show(index) {
   stop();
-  displayed = await picture(index);
+  const request = ++requests, pictured = await picture(index);
+  if (request !== requests) return;
+  displayed = pictured;
   shown = index;
   mark();
   draw();
