@@ -104,7 +104,6 @@ WITHOUT: dict[str, Mechanism] = {
     "shadow": _option("deformation.shadow=false"),
     "breathing": _option("deformation.breathing=false"),
     "label-sharpness": _option("deformation.label_sharpness=0"),
-    "part-sharpness": _option("deformation.part_sharpness=0"),
     "spun-shaft": _option("deformation.shaft_roll=0"),
     "opacity-penalty": _option("deformation.opacity_penalty=0"),
     "extrapolated-tissue": _option("deformation.extrapolate_tissue=false"),

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from capture_files import write_capture
+from capture_files import WRIST_MM, write_capture, write_grasper
 from evidence_world import HINGE_ANGLE, PIVOT_MM, RADIUS_MM, make_evidence
 from torch import Tensor
 
@@ -23,6 +23,7 @@ from neeco.methods.kinematic.hinge_search import find_hinges, search_hinge, unbe
 from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve, shape_around_frame
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
+from neeco.raster.reference import SH_C0
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
 from neeco.training.initial import begin_session, initial_scene
@@ -263,3 +264,23 @@ def test_the_search_makes_every_tensor_where_the_evidence_is() -> None:
     tensors = (again.instrument_from_shaft, again.center_line, again.seeds, around.instrument_from_shaft, around.seeds)
     assert not any(tensor.is_meta for tensor in tensors)
     assert torch.equal(again.seeds, shape.seeds)
+
+
+def test_instruments_of_dark_images_start_where_those_of_bright_ones_do_and_in_their_colours(tmp_path: Path) -> None:
+    """Grey seeds in dark images turned transparent, and a floor of bright ones hid a black shaft: IoU 0.15, now 0.9."""
+    capture, shade = read_capture(write_grasper(tmp_path / "capture")), 0.3
+    frames = capture.split("train")
+    views, points = TrainingViews.read(frames), capture.points
+    assert points is not None
+    dark = replace(capture, points=replace(points, colors=shade * points.colors))
+    darkened = TrainingViews(frames, tuple((shade * image).to(torch.uint8) for image in views.images), views.masks)
+    config = training_config("kinematic", {}, ["deformation.carving.tissue_steps=40"])
+    spans = []
+    for own, seen, brightness in ((capture, views, 1.0), (dark, darkened, shade)):
+        canonical = begin_session(own, seen, config, print).scene.canonical.map(torch.detach)
+        along = canonical.means[canonical.of_instruments, 2]
+        shown = 0.5 + SH_C0 * canonical.sh_dc[canonical.of_instruments, 0].mean(1)
+        assert float(shown[along > WRIST_MM].median()) > 0.5 * brightness  # metal
+        assert float(shown[along < 2 * WRIST_MM].median()) < 0.4 * brightness  # the black shaft
+        spans.append(along.quantile(torch.tensor([0.1, 0.5, 0.9])))
+    assert torch.allclose(spans[1], spans[0], atol=2)  # mm

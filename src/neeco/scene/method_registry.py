@@ -16,7 +16,7 @@ from neeco.scene.method import Method
 
 DEFAULT = "kinematic"
 PACKAGE = "neeco.methods"  # our package, and the entry point group of others
-REMOVED = ("label_shares", "shadow_at")  # settings of methods in scenes and runs of older versions
+REMOVED = ("label_shares", "shadow_at", "part_sharpness")  # settings of methods in scenes and runs of older versions
 REMOVED_IF_OFF = ("gate_mm", "carried_places")  # the same of 0.3 and older; scenes that use them cannot be read
 
 

@@ -136,11 +136,6 @@ class Articulation(nn.Module):
         """Return logits [M, link_count or more] with the prior of the Gaussians' positions [M, 3] mm added."""
         return logits
 
-    def misplaced(self, points: Tensor, weights: Tensor) -> Tensor | None:
-        """Return the penalty [M] >= 0 of Gaussians at points [M, 3] mm with link weights [M, link_count] for links that
-        their positions contradict; None where positions have no prior."""
-        return None
-
     def settled(self, points: Tensor, logits: Tensor) -> Tensor:
         """Return the final logits [M, link_count or more] of Gaussians at points [M, 3] mm, without links that their
         positions rule out."""

@@ -21,11 +21,7 @@ from neeco.capture.model import Frame, Instrument, State
 from neeco.geometry.camera import Camera
 from neeco.methods.breathing import RATES as BREATHING_RATES
 from neeco.methods.breathing import BreathingTissue
-from neeco.methods.kinematic.articulation import (
-    LINK_LOGITS,
-    ArticulatedInstruments,
-    Articulation,
-)
+from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments, Articulation
 from neeco.methods.kinematic.discovery import find_instruments
 from neeco.methods.kinematic.finish import conclude
 from neeco.methods.kinematic.hinge_search import hinge_joints
@@ -76,7 +72,6 @@ class KinematicSettings:
     opacity_penalty_stop: int = 1500  # iteration from which that weight is a tenth
     label_sharpness: float = 0.02  # weight of l (1 - l) on the rendered instrument label
     label_sharpness_start: int = 1000  # iteration from which it is weighed
-    part_sharpness: float = 0.003  # weight of how mixed Gaussians are of parts, while hinges are learned
     hinge_start: int = 600  # iteration from which hinges are learned: before, unformed Gaussians would drag them off
     rate_scale: float = 1.0  # times the learning rates of hinges
     refine_wrists: bool = True  # whether wrists are looked for again at 60 and 80 % of the run
@@ -339,31 +334,17 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return canonical.of_instruments.to(canonical.means.dtype)[:, None]
 
     def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor | None:
-        """Penalise opaque instruments, soft labels and mixed parts."""
+        """Penalise opaque instruments and soft labels, and weigh the priors of stated links."""
         settings, terms = self.settings, []
         if settings.opacity_penalty > 0 and len(canonical.counts) > 1:
             weight = settings.opacity_penalty * (1.0 if iteration < settings.opacity_penalty_stop else 0.1)
             terms.append(weight * torch.sigmoid(canonical.opacity_logits[canonical.counts[0] :]).mean())
-        if settings.part_sharpness > 0 and iteration > self.start_iteration:
-            terms += [settings.part_sharpness * self._part_mixing(canonical, k) for k in range(len(self.instruments))]
-        priors = [articulation.prior() for articulation in self.articulations]
+        priors = (articulation.prior() for articulation in self.articulations)
         terms += [PRIOR_WEIGHT * prior for prior in priors if prior is not None]
         if rendering.channels is not None and iteration > settings.label_sharpness_start:
             label = rendering.channels[..., 0]
             terms.append(settings.label_sharpness * (label * (1 - label)).mean())
         return sum(terms[1:], terms[0]) if terms else None
-
-    def _part_mixing(self, canonical: CanonicalGaussians, index: int) -> Tensor:
-        """Return the penalty of Gaussians that mix several links, or belong to links that their positions contradict, a
-        scalar >= 0."""
-        weights = self.link_weights(canonical, index)
-        rows = canonical.body(index + 1)
-        opacities = torch.sigmoid(canonical.opacity_logits[rows]).detach()
-        mixed = 1 - weights.square().sum(1)
-        misplaced = self.articulations[index].misplaced(canonical.means[rows].detach(), weights)
-        if misplaced is not None:
-            mixed = mixed + misplaced
-        return (opacities * mixed).sum() / opacities.sum().clamp_min(1e-6)
 
     def act(self, training: GaussianTraining, action: str) -> None:
         ACTIONS[action](gaussian_session(training), self)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import evenly_spaced
+from neeco.geometry.projection import project_world
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
 from neeco.methods.kinematic.hinge_search import start_hinges
@@ -17,9 +18,11 @@ from neeco.methods.kinematic.hinges import Hinges
 from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.space_carving import Evidence, carve_along, carved_shape, frame_along, pad_and_stack
+from neeco.methods.space_carving import CARVING, Evidence, carve_along, carved_shape, frame_along, pad_and_stack
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
+from neeco.raster.reference import SH_C0
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
+from neeco.scene.deformation import Deformation
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.states.outline_states import register_states
 from neeco.training.session import GaussianSession
@@ -126,7 +129,34 @@ def _with_instruments(
             )
         chosen = evenly_spaced(len(seeds), session.limits[1])
         bodies.append(seed_instrument(seeds[chosen], shape.radius).with_extras(**{LINK_LOGITS: logits[chosen]}))
-    return join_bodies(bodies)
+    _color_seeds(joined := join_bodies(bodies), session, articulated, evidence)
+    return joined
+
+
+def _color_seeds(
+    canonical: CanonicalGaussians, session: GaussianSession, articulated: ArticulatedInstruments, evidence: Evidence
+) -> None:
+    """Color seeds by slices along each shaft, as images show those with most evidence. Those much brighter than images
+    turn transparent before they take on their colour; those beside an instrument would stay in the colour there."""
+    assert isinstance(articulated, Deformation)
+    pose, numbers = articulated.poser(canonical), {frame.name: k for k, frame in enumerate(session.views.frames)}
+    total = canonical.means.new_zeros(len(canonical), 4)  # of colours, and of weights
+    for place in evenly_spaced(len(evidence.frames), CARVING.color_frames):
+        frame = evidence.frames[place]
+        points, depths = project_world(pose(frame.state).means, frame.camera)
+        column, row = points.nan_to_num().floor().long().unbind(-1)
+        seen = (depths > 0) & (column >= 0) & (column < frame.camera.width) & (row >= 0) & (row < frame.camera.height)
+        pixels = row[seen], column[seen]
+        weights, image = evidence.hits[place][pixels][:, None], session.views.target(numbers[frame.name])
+        total[seen] += torch.cat([weights * image[pixels], weights], 1)
+    for index, articulation in enumerate(articulated.articulations):
+        rows, base = canonical.body(index + 1), articulation.base
+        along = (canonical.means[rows] - base[:3, 3]) @ base[:3, 2]
+        slices = ((along - along.min()) / (CARVING.color_slice * articulation.radius)).floor().long()
+        weighted = total[rows, 3:].square() * total[rows]
+        unseen = CARVING.unseen_share * weighted.sum(0)
+        sums = unseen.repeat(int(slices.max()) + 1, 1).index_add(0, slices, weighted)[slices]
+        canonical.sh_dc[rows, 0] = (sums[:, :3] / sums[:, 3:].clamp_min(1e-9) - 0.5) / SH_C0
 
 
 def _corrected_evidence(session: GaussianSession, evidence: Evidence) -> Evidence:

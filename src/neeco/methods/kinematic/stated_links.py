@@ -33,7 +33,6 @@ class StatedLinksSettings:
     prongs: float = 0.7  # shaft radii by which they change farther out at the ends of the axis
     prongs_from: float = 0.3  # shaft radii along the axis, where that begins
     prongs_to: float = 0.7  # shaft radii along the axis, where it is reached
-    max_side_logits: float = 4.0  # that count in the penalty
     min_step_mm: float = 1.0  # between two pivots that define a direction
     shaft_reach: float = 3.0  # shaft radii from the axis, behind the first pivot
     end_reach: float = 8.0  # shaft radii from any pivot, before the first one
@@ -123,9 +122,6 @@ class StatedLinks(Articulation):
         """Near a joint motion hardly separates links; there a Gaussian rather belongs to the link on whose side of the
         joint it lies, divided by a plane across the links at rest."""
         return nn.functional.pad(self._sides(points), (0, logits.shape[1] - self.link_count)) + logits
-
-    def misplaced(self, points: Tensor, weights: Tensor) -> Tensor:
-        return -(weights * self._sides(points).clamp_min(-STATED.max_side_logits)).sum(1)
 
     def shaft_like(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """The link after the shaft turns about a ball or pin that looks like the shaft's end, or slides out of it."""
