@@ -96,9 +96,7 @@ def test_help_of_train_ends_with_a_table_of_the_chosen_method(capsys: pytest.Cap
 
 
 @pytest.mark.parametrize(("wrong", "right"), [("trian", "train"), ("synthesise", "synthesize"), ("veiw", "view")])
-def test_a_verb_that_is_nearly_one_is_answered_with_that_one(
-    wrong: str, right: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_verb_that_is_nearly_one_is_answered_with_that_one(wrong, right, capsys):
     with pytest.raises(SystemExit) as left:
         cli.main([wrong, "somewhere"])
     assert left.value.code == 2
@@ -113,9 +111,7 @@ def test_a_verb_that_is_nearly_one_is_answered_with_that_one(
         (["synthesize", "run", "--output", "set", "--count", "4", "--vews", "orbit"], "--vews", "--views"),
     ],
 )
-def test_a_misspelt_option_is_answered_with_the_one_that_is_meant(
-    words: list[str], wrong: str, right: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_misspelt_option_is_answered_with_the_one_that_is_meant(words, wrong, right, capsys):
     with pytest.raises(SystemExit) as left:
         cli.main(words)
     assert left.value.code == 2
@@ -202,9 +198,7 @@ def test_wrong_usage_is_one_line_and_exits_2(words: list[str], capsys: pytest.Ca
         (["train", "capture"], "missing --output PATH: Run folder to write"),
     ],
 )
-def test_what_an_option_needs_is_said_where_it_is_missing(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_an_option_needs_is_said_where_it_is_missing(words, told, capsys):
     with pytest.raises(SystemExit):
         cli.main(words)
     assert told in capsys.readouterr().err
@@ -221,9 +215,7 @@ def test_what_an_option_needs_is_said_where_it_is_missing(
         (["--video", "left.mp4"], "--output: "),
     ],
 )
-def test_ingest_asks_for_the_source_that_it_lacks(
-    words: list[str], told: str, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ingest_asks_for_the_source_that_it_lacks(words, told, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert cli.main(["ingest", *words]) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -232,9 +224,7 @@ def test_ingest_asks_for_the_source_that_it_lacks(
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)
-def test_bad_path_is_one_line_and_exit_1(
-    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_path_is_one_line_and_exit_1(verb, tmp_path, monkeypatch, capsys):
     (tmp_path / "taken").write_text("a file, not a folder")
     monkeypatch.chdir(tmp_path)
     assert cli.main([verb, *WITH_BAD_PATH[verb]]) == 1
@@ -246,9 +236,7 @@ def test_bad_path_is_one_line_and_exit_1(
         assert (MISSING if verb != "demo" else "taken") in told.err
 
 
-def test_an_error_of_many_lines_is_told_in_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_of_many_lines_is_told_in_one(monkeypatch, capsys):
     monkeypatch.setattr(cli, "_dispatch", raising(NeecoError("file: field:\n  wrong;\n  mend it")))
     assert cli.main([]) == 1
     assert capsys.readouterr().err == "neeco: error: file: field: wrong; mend it\n"
@@ -261,9 +249,7 @@ def test_ctrl_c_is_one_line_and_exit_130(monkeypatch: pytest.MonkeyPatch, capsys
 
 
 @pytest.mark.parametrize("error", [NeecoError("a\x1b[31mb\nc: \r is wrong"), OSError(2, "gone", "a\x1b[2Jb")])
-def test_names_in_damaged_files_do_not_reach_the_terminal_as_commands(
-    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_in_damaged_files_do_not_reach_the_terminal_as_commands(error, monkeypatch, capsys):
     monkeypatch.setattr(cli, "_dispatch", raising(error))
     assert cli.main([]) == 1
     told = capsys.readouterr().err
@@ -308,9 +294,7 @@ def raising(error: BaseException):
         (["train", "x", "--output", "y", "--bogus"], "neeco train --help"),
     ],
 )
-def test_usage_errors_are_about_the_word_and_name_the_verbs_help(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_usage_errors_are_about_the_word_and_name_the_verbs_help(words, told, capsys):
     with pytest.raises(SystemExit) as left:
         cli.main(words)
     assert left.value.code == 2
@@ -343,9 +327,7 @@ def test_help_is_a_verb_and_a_file_is_no_capture(tmp_path: Path, capsys: pytest.
         ("nothing", "no such "),
     ],
 )
-def test_a_folder_of_another_kind_is_called_what_it_is(
-    verb: str, holds: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_another_kind_is_called_what_it_is(verb, holds, told, tmp_path, capsys):
     if (verb, holds) in (("evaluate", "config.yaml"), ("check", "transforms.json")):
         return  # what is asked for
     given = tmp_path / "raw"
@@ -369,9 +351,7 @@ def test_a_folder_of_another_kind_is_called_what_it_is(
         ["train", "capture", "--joints", "--output", "run"],
     ],
 )
-def test_an_option_of_several_values_without_one_is_refused(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_option_of_several_values_without_one_is_refused(words, capsys):
     option = next(word for word in words if word in ("--class-names", "--formats", "--splits", "--joints"))
     assert cli.main(words) == 1
     assert capsys.readouterr().err == f"neeco: error: {option}: no value follows; give one or more, or leave it out\n"

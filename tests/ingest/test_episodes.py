@@ -117,9 +117,7 @@ def test_another_tissue_is_refused_by_name(tmp_path: Path) -> None:
         ({"tissue": "bowel"}, "tissue: a capture has one tissue; leave the key out, or make one capture"),
     ],
 )  # fmt: skip
-def test_what_one_capture_cannot_hold_is_refused_in_one_line(
-    tmp_path: Path, changes: dict[str, object], words: str
-) -> None:
+def test_what_one_capture_cannot_hold_is_refused_in_one_line(tmp_path, changes, words):
     paths = still_recordings(tmp_path, (1, 1))
     change(paths[1], **changes)
     with pytest.raises(NeecoError) as error:

@@ -114,9 +114,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize("names", [NEW, OLD])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_dvrks_bag_becomes_a_recording_by_one_command(
-    tmp_path: Path, kind: str, names: tuple[str, str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dvrks_bag_becomes_a_recording_by_one_command(tmp_path, kind, names, capsys):
     with BagWriter(tmp_path, kind) as bag:
         write_dvrk(bag, names)
     assert main(["ingest", "--init", str(bag.path)]) == 0
@@ -213,9 +211,7 @@ def test_names_in_a_bag_are_names_and_no_more(tmp_path: Path) -> None:
 # --- what cannot be read
 
 
-def test_a_bag_in_the_place_of_a_recording_says_what_to_do(
-    bags: dict[str, Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_bag_in_the_place_of_a_recording_says_what_to_do(bags, capsys, tmp_path):
     for path in bags.values():
         assert main(["ingest", str(path), "--output", str(tmp_path / "out")]) == 1
         assert capsys.readouterr().err.rstrip().endswith(f"neeco ingest --init {path}")
@@ -226,9 +222,7 @@ def test_a_bag_in_the_place_of_a_recording_says_what_to_do(
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.97])
-def test_a_truncated_bag_is_refused_with_what_repairs_it(
-    tmp_path: Path, bags: dict[str, Path], kind: str, share: float
-) -> None:
+def test_a_truncated_bag_is_refused_with_what_repairs_it(tmp_path, bags, kind, share):
     path = _copy(bags[kind], tmp_path)
     file = _messages(path)
     file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
@@ -349,9 +343,7 @@ def _only_ours() -> bool:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_whatever_happens_to_its_bytes_a_bag_is_read_or_refused_in_one_line(
-    tmp_path: Path, bags: dict[str, Path], kind: str
-) -> None:
+def test_whatever_happens_to_its_bytes_a_bag_is_read_or_refused_in_one_line(tmp_path, bags, kind):
     path = _copy(bags[kind], tmp_path)
     bag = known(path)
     reads: list[Callable[[], object]] = [

@@ -115,9 +115,7 @@ def test_the_numbers_of_a_capture_that_changed_are_not_given_again(finished_job)
         job.run()
 
 
-def test_other_splits_are_scored_without_training_again(
-    finished_job, make_job, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_splits_are_scored_without_training_again(finished_job, make_job, monkeypatch):
     first = result_of(finished_job)
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
     again = make_job(splits=("unseen",)).run()
@@ -127,9 +125,7 @@ def test_other_splits_are_scored_without_training_again(
 
 
 @pytest.mark.parametrize("stop", [1, 7, 12])
-def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
-    stop: int, trained_job, make_job, tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(stop, trained_job, make_job, tmp_path, monkeypatch):
     whole, cut = trained_job, make_job(folder=tmp_path / "cut")
     step = GaussianSession.step
 
@@ -161,9 +157,7 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
         ("job.json", {"seconds": []}, "seconds: is not as neeco writes it"),
     ],
 )
-def test_damaged_files_of_a_job_are_reported_by_file_and_field(
-    name: str, change: dict, reported: str, finished_job
-) -> None:
+def test_damaged_files_of_a_job_are_reported_by_file_and_field(name, change, reported, finished_job):
     file = finished_job.folder / name
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     with pytest.raises(NeecoError, match=f"{name}: {reported}.*remove that run's folder"):

@@ -211,13 +211,7 @@ def test_a_frame_that_is_not_trusted_is_listed_and_not_written(made: Path) -> No
     assert "http" not in page.replace("http://www.w3.org/", "")
 
 
-def test_files_are_numbered_anew_and_the_card_and_the_command_say_so(
-    made: Path,
-    recorded: RecordedRun,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_files_are_numbered_anew_and_the_card_and_the_command_say_so(made, recorded, tmp_path, monkeypatch, capsys):
     words = " ".join((made / "README.md").read_text().split())
     assert "Files are numbered anew: the field `frame` of `states.jsonl` has the name" in words
     trusted = SimpleNamespace(**vars(recorded), capture=recorded.capture, require_trusted=lambda verb: None)
@@ -230,9 +224,7 @@ def test_files_are_numbered_anew_and_the_card_and_the_command_say_so(
     ]
 
 
-def test_the_same_again_gives_the_same_bytes_and_so_does_going_on(
-    made: Path, recorded: RecordedRun, tmp_path: Path
-) -> None:
+def test_the_same_again_gives_the_same_bytes_and_so_does_going_on(made, recorded, tmp_path):
     def stop(done: int, total: int) -> None:
         if done == 4:
             raise KeyboardInterrupt
@@ -282,9 +274,7 @@ def test_a_recording_that_changed_is_not_gone_on_with(made: Path, recorded: Reco
         annotate_capture(changed, begun, resume=True)
 
 
-def test_recorded_images_and_labels_are_written_as_large_as_asked_and_through_the_lens(
-    recorded: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recorded_images_and_labels_are_written_as_large_as_asked_and_through_the_lens(recorded, tmp_path, monkeypatch):
     few = replace(recorded, recording=replace(recorded.recording, frames=recorded.recording.frames[2:4]))
     lens = Lens(50.0, 50.0, 32.0, 24.0, (-0.3, 0.1, 0.0, 0.0), (64, 48), border=(32.0, 24.0, 31.0))
     monkeypatch.setattr(few.scene, "recorded", replace(few.scene.recorded, lens=lens))

@@ -35,14 +35,7 @@ def hidden_files(folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize(("whole_files", "named"), [(0, "config.yaml"), (2, "session.safetensors")])
-def test_a_full_disk_is_one_line_and_leaves_no_half_file(
-    whole_files: int,
-    named: str,
-    capture: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(whole_files, named, capture, tmp_path, monkeypatch, capsys):
     whole = train(capture, tmp_path / "whole", CONFIG)
     words = ["train", str(capture), "--output", str(tmp_path / "cut"), "--method", "3dgs", "--iterations", "60"]
     words += [word for setting in SHORT for word in ("--set", setting)]
@@ -79,9 +72,7 @@ def test_metrics_that_cannot_be_written_are_told_with_their_file(capture: Path, 
         train(capture, tmp_path / "run", CONFIG, progress=block)
 
 
-def test_a_loss_that_becomes_no_number_keeps_the_last_checkpoint(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loss_that_becomes_no_number_keeps_the_last_checkpoint(capture, tmp_path, monkeypatch):
     real, calls = neeco.training.session.photometric_loss, iter(range(100))
 
     def breaking(*args: object, **options: object) -> torch.Tensor:
@@ -158,9 +149,7 @@ def test_a_run_is_read_from_its_own_folder_alone(capture: Path, tmp_path: Path) 
         (tmp_path / name).rename(run / name)
 
 
-def test_a_frame_that_becomes_unreadable_after_the_check_is_named(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_frame_that_becomes_unreadable_after_the_check_is_named(capture, tmp_path, monkeypatch, capsys):
     real = training.read_checked
 
     def check_then_break(*args: object, **options: object):
@@ -214,9 +203,7 @@ def test_what_a_loss_mask_hides_teaches_nothing(seen: bool, tmp_path: Path) -> N
     assert (scenes[0] != scenes[1]) is seen
 
 
-def test_a_run_whose_capture_is_gone_says_where_to_write_its_new_place(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_whose_capture_is_gone_says_where_to_write_its_new_place(capture, tmp_path, capsys):
     run = train(capture, tmp_path / "run", CONFIG)
     moved = capture.rename(tmp_path / "moved")
     for words in (["evaluate", str(run)], ["render", str(run), "--output", str(tmp_path / "drawn")]):
@@ -230,9 +217,7 @@ def test_a_run_whose_capture_is_gone_says_where_to_write_its_new_place(
     assert main(["render", str(run), "--output", str(tmp_path / "drawn"), "--split", "train"]) == 0
 
 
-def test_a_capture_that_changed_is_not_trained_on(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_capture_that_changed_is_not_trained_on(capture, tmp_path, capsys, monkeypatch):
     words = ["train", str(capture), "--output", str(tmp_path / "run"), "--method", "3dgs", "--iterations", "60"]
     with monkeypatch.context() as patched:
         patched.setattr(neeco.training.session.GaussianSession, "finish", lambda self: 1 / 0)
@@ -259,9 +244,7 @@ def test_a_run_killed_before_its_first_whole_file_begins_again(capture: Path, tm
     assert hidden_files(run) == []
 
 
-def test_where_nothing_was_begun_nothing_is_resumed(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_where_nothing_was_begun_nothing_is_resumed(capture, tmp_path, capsys):
     output = tmp_path / "runs" / "none"
     assert main(["train", str(capture), "--output", str(output), "--resume"]) == 1
     remedy = "leave out --resume, or correct the path"
@@ -281,9 +264,7 @@ def test_where_nothing_was_begun_nothing_is_resumed(
         ("scene", '{"a": 1}'),
     ],
 )
-def test_a_checkpoint_whose_fields_do_not_fit_is_refused(
-    field: str, value: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_checkpoint_whose_fields_do_not_fit_is_refused(field, value, capture, tmp_path, monkeypatch):
     monkeypatch.setattr(neeco.training.session.GaussianSession, "finish", lambda self: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         train(capture, tmp_path / "run", CONFIG)

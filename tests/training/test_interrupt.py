@@ -41,9 +41,7 @@ def signalling(stop: int, *signals: int):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("stop", [1, 37])
-def test_a_stopped_run_keeps_its_last_step_and_ends_in_the_same_bytes(
-    number: int, stop: int, capture: Path, tmp_path: Path
-) -> None:
+def test_a_stopped_run_keeps_its_last_step_and_ends_in_the_same_bytes(number, stop, capture, tmp_path):
     whole = train(capture, tmp_path / "whole", CONFIG)
     handlers = signal.getsignal(signal.SIGINT), signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -101,9 +99,7 @@ def test_ctrl_c_while_finishing_loses_no_step(capture: Path, tmp_path: Path, mon
     assert (tmp_path / "cut" / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
 
 
-def test_ctrl_c_before_the_first_step_leaves_nothing(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ctrl_c_before_the_first_step_leaves_nothing(capture, tmp_path, monkeypatch, capsys):
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 

@@ -65,9 +65,7 @@ def test_an_interrupted_run_ends_in_the_same_bytes(capture: Path, tmp_path: Path
     assert (resumed / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
 
 
-def test_frequencies_open_over_the_stated_share_and_the_field_learns_all_its_parts(
-    capture: Path, tmp_path: Path
-) -> None:
+def test_frequencies_open_over_the_stated_share_and_the_field_learns_all_its_parts(capture, tmp_path):
     opened: dict[int, float] = {}
     first: dict[str, torch.Tensor] = {}
 

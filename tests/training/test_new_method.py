@@ -133,9 +133,7 @@ def test_a_field_that_the_method_does_not_have_is_refused_by_name() -> None:
         training_config("drift", {"iterations": 12}, ["deformation.raech=3"])
 
 
-def test_extras_with_a_rate_are_learned_and_others_hold_still(
-    drift: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_extras_with_a_rate_are_learned_and_others_hold_still(drift, tmp_path, monkeypatch):
     class Shared(drift):
         extra_rates: ClassVar[Mapping[str, float]] = {"share": 1e-2}
 

@@ -95,9 +95,7 @@ def test_a_wrong_setting_is_refused_by_name(assignment: str, named: str) -> None
         ("speed", 1, "has no such field"),
     ],
 )
-def test_a_field_of_a_deformation_is_refused_by_name_when_it_does_not_fit(
-    field: str, value: object, named: str
-) -> None:
+def test_a_field_of_a_deformation_is_refused_by_name_when_it_does_not_fit(field, value, named):
     with pytest.raises(NeecoError, match=f"deformation.{field}: .*{named}"):
         method_settings("nps", {field: value})
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from capture_files import write_capture
 
@@ -15,9 +13,7 @@ from neeco.training.train import train
 
 
 @pytest.mark.parametrize("batch_size", [1, 3])
-def test_an_event_comes_once_by_share_or_by_iteration_in_the_order_of_the_schedule(
-    batch_size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_event_comes_once_by_share_or_by_iteration_in_the_order_of_the_schedule(batch_size, tmp_path, monkeypatch):
     """However many iterations a step has."""
     acted: list[str] = []
     monkeypatch.setattr(Kinematic, "act", lambda self, training, action: acted.append(action))

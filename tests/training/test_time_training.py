@@ -71,9 +71,7 @@ def test_with_instruments_what_moves_is_labelled_at_the_end(tmp_path: Path) -> N
     assert float(spread[labels[:, 0] == 1].min()) >= float(spread[labels[:, 0] == 0].max()) * 0.99
 
 
-def test_training_disturbs_the_time_until_half_of_the_run_and_drawing_never_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_disturbs_the_time_until_half_of_the_run_and_drawing_never_does(tmp_path, monkeypatch):
     asked: list[tuple[bool, float]] = []
     real = TimeMLP.pose
 

@@ -75,9 +75,7 @@ def test_watching_a_run_neither_changes_it_nor_costs_it_time(capture: Path, tmp_
 
 
 @pytest.mark.parametrize(("iterations", "ends"), [(20, [8, 16, 20]), (16, [8, 16]), (7, [])])
-def test_the_last_row_is_of_the_runs_end_unless_it_is_shorter_than_a_row(
-    iterations: int, ends: list[int], capture: Path, tmp_path: Path
-) -> None:
+def test_the_last_row_is_of_the_runs_end_unless_it_is_shorter_than_a_row(iterations, ends, capture, tmp_path):
     shown: list[int] = []
     config = training_config("3dgs", {"iterations": iterations}, ["log_interval=8"])
     run = train(capture, tmp_path / "run", config, progress=lambda row: shown.append(row.iteration))
@@ -121,9 +119,7 @@ def test_a_full_folder_is_left_alone(capture: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("measure", ["photometric_loss", "mse_loss"])
-def test_a_loss_that_is_no_number_ends_the_run(
-    measure: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loss_that_is_no_number_ends_the_run(measure, capture, tmp_path, monkeypatch):
     real = getattr(neeco.training.session, measure)
     monkeypatch.setattr(neeco.training.session, measure, lambda *a, **k: real(*a, **k) * float("nan"))
     with pytest.raises(NeecoError, match="the loss became nan at iteration 1, frame 0000"):

@@ -56,9 +56,7 @@ def gradients(session: GaussianSession, monkeypatch: pytest.MonkeyPatch, steps: 
     return seen
 
 
-def test_gradients_are_the_mean_of_single_ones_and_density_counts_every_frame(
-    capture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gradients_are_the_mean_of_single_ones_and_density_counts_every_frame(capture, monkeypatch):
     still = ("schedule.compensation=off", "schedule.frame_order=off", "density_start=50", "refine.frame_poses=true")
     one, two = (begun(capture, config_of(views, assignments=still)) for views in (1, 2))
     torch.nn.init.normal_(one.scene.deformation.head.weight, std=0.1)

@@ -127,9 +127,7 @@ def test_only_the_pages_own_files_are_served(shared: ViewerServer, path: bytes, 
     assert not [record for record in caplog.records if record.exc_info]
 
 
-def test_a_request_with_a_body_or_without_an_end_is_a_line_in_the_log_and_no_trouble(
-    shared: ViewerServer, caplog, capfd
-) -> None:
+def test_a_request_with_a_body_or_without_an_end_is_a_line_in_the_log_and_no_trouble(shared, caplog, capfd):
     port = port_of(shared)
     host = f"Host: 127.0.0.1:{port}".encode()
     assert b"200" not in answer(port, b"GET / HTTP/1.1", host, b"Content-Length: 5")
@@ -156,9 +154,7 @@ def test_a_request_with_a_body_or_without_an_end_is_a_line_in_the_log_and_no_tro
         b"\x00" * (MAX_MESSAGE + 1),
     ],
 )
-def test_what_is_not_understood_ends_that_connection_alone(
-    shared: ViewerServer, message: str | bytes, caplog, capfd
-) -> None:
+def test_what_is_not_understood_ends_that_connection_alone(shared, message, caplog, capfd):
     with opened(shared) as other:
         looks(other)
         with opened(shared) as connection:
@@ -304,9 +300,7 @@ ODD_SCENES: dict[str, Callable[[dict[str, Any], dict[str, torch.Tensor]], Any]] 
 
 
 @pytest.mark.parametrize("change", ODD_SCENES.values(), ids=ODD_SCENES.keys())
-def test_a_scene_that_cannot_be_is_refused_in_one_short_line(
-    made_run: Path, tmp_path: Path, change: Callable[..., Any]
-) -> None:
+def test_a_scene_that_cannot_be_is_refused_in_one_short_line(made_run, tmp_path, change):
     run = rewritten(made_run, tmp_path, change)
     with pytest.raises(NeecoError) as refused:
         ViewerServer(run)

@@ -195,9 +195,7 @@ def test_another_recording_is_tested_on_all_its_frames(spec: DownstreamSettings,
     assert any(table.title.startswith("pixels, far") for table in tables_of(result))
 
 
-def test_a_recording_is_added_to_a_study_and_another_by_its_name_is_refused(
-    spec: DownstreamSettings, capture: Path, recorded: Path
-) -> None:
+def test_a_recording_is_added_to_a_study_and_another_by_its_name_is_refused(spec, capture, recorded):
     small = replace(spec, conditions=("kin",), folds=1)
     one = trained(small)["jobs"][0]
     both = trained(replace(small, tests={"far": capture}))["jobs"][0]
@@ -246,9 +244,7 @@ def test_more_folds_sets_conditions_models_and_frames_are_added(spec: Downstream
 
 
 @pytest.mark.parametrize("stopped", [0, 3])
-def test_interrupted_it_goes_on_to_the_same_numbers(
-    stopped: int, spec: DownstreamSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_it_goes_on_to_the_same_numbers(stopped, spec, tmp_path, monkeypatch):
     expected = trained(replace(spec, output=tmp_path / "whole"))
     loss, fits = Pixels.loss, [-1]
     fit = Pixels.fit
@@ -304,9 +300,7 @@ def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSettings, m
     assert again["complete"]
 
 
-def test_a_folder_of_other_jobs_is_refused_before_the_work(
-    spec: DownstreamSettings, tmp_path: Path, monkeypatch
-) -> None:
+def test_a_folder_of_other_jobs_is_refused_before_the_work(spec, tmp_path, monkeypatch):
     small = replace(spec, conditions=("kin",), folds=1)
     trained(small)
     monkeypatch.setattr(Pixels, "fit", lambda *_: pytest.fail("taught"))
@@ -383,9 +377,7 @@ def test_what_cannot_be_done_is_refused(spec: DownstreamSettings, change, told: 
 
 
 @pytest.mark.parametrize("name", ["real", "paste", "a+b", "", "../up"])
-def test_names_that_mean_something_or_stand_twice_are_refused(
-    name: str, spec: DownstreamSettings, capture: Path
-) -> None:
+def test_names_that_mean_something_or_stand_twice_are_refused(name, spec, capture):
     data = replace(spec.sets[0], name=name)
     with refused(f"--sets {name}: conditions and folders go by this name"):
         plan_downstream(replace(replace(spec, conditions=None), sets=(data,)))
@@ -419,9 +411,7 @@ def test_sets_alone_need_no_labelled_frame(spec: DownstreamSettings, capture: Pa
         plan_downstream(replace(alone, conditions=("kin+real",)))
 
 
-def test_labels_of_ones_own_are_taught_and_the_truth_is_tested(
-    spec: DownstreamSettings, tmp_path: Path, recorded: Path
-) -> None:
+def test_labels_of_ones_own_are_taught_and_the_truth_is_tested(spec, tmp_path, recorded):
     labels = tmp_path / "labels"
     for name in ("001", "004"):
         save_grey(labels / f"{name}.png", 255 - (read_grey(recorded / "truth" / "masks" / f"{name}.png") > 0) * 255)
@@ -441,9 +431,7 @@ def test_a_model_that_lacks_something_or_sees_too_little_is_refused(spec, monkey
         plan_downstream(spec)
 
 
-def test_boxes_of_instruments_that_labels_do_not_tell_apart_are_refused(
-    spec: DownstreamSettings, capture: Path
-) -> None:
+def test_boxes_of_instruments_that_labels_do_not_tell_apart_are_refused(spec, capture):
     file = capture / "transforms.json"
     stated = json.loads(file.read_text())
     stated["instruments"].append({"name": "second"})
