@@ -8,7 +8,6 @@ from capture_files import write_capture
 from neeco.base.errors import NeecoError
 from neeco.methods.kinematic.deformation import Kinematic
 from neeco.training.config import method_defaults, training_config
-from neeco.training.schedule import Event
 from neeco.training.train import train
 
 
@@ -44,4 +43,3 @@ def test_an_event_that_no_run_can_have_is_refused(method: str, events: str, mess
 def test_all_that_a_method_does_between_steps_is_an_event_it_has_by_default() -> None:
     default = method_defaults("kinematic").schedule.events
     assert {event.action for event in default} == set(Kinematic.actions)
-    assert all(isinstance(event, Event) for event in default)
