@@ -134,7 +134,7 @@ def test_what_one_capture_cannot_hold_is_refused_in_one_line(tmp_path, changes, 
         ({"test": [3]}, "splits: test and unseen count one video's frames"),
     ],
 )
-def test_splits_name_what_there_is(tmp_path: Path, splits: dict[str, object], words: str) -> None:
+def test_splits_name_what_there_is(tmp_path, splits, words):
     with pytest.raises(NeecoError, match=words):
         read_episodes([read_recording(path) for path in still_recordings(tmp_path, (1, 1), splits=splits)])
 
