@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from folder_contents import contents
 from PIL import Image
 from rod_world import CAMERA, FakeRun, make_scene, rod_state
 
@@ -80,10 +81,6 @@ def made(recorded: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 def layers(scene: GaussianScene, state: State) -> LayeredDrawing:
     return draw_layers(scene, CompositedLabels(scene), state, CAMERA, 0.01, tissue_image=True)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def test_an_image_supports_a_right_label_and_not_a_wrong_one(scene: GaussianScene) -> None:

