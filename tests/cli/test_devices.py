@@ -53,7 +53,6 @@ def trained(world, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path
 @pytest.fixture
 def made(trained: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """By verb, what it takes: a capture or a run. The working folder is one of its own."""
-    monkeypatch.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
     monkeypatch.chdir(tmp_path)
     run = shutil.copytree(trained[1], tmp_path / "run")
     return dict.fromkeys(OF_A_RUN, str(run)) | dict.fromkeys(OF_A_CAPTURE, str(trained[0]))

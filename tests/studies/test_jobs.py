@@ -282,7 +282,6 @@ def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, monkeypatc
 )
 def test_workers_have_a_gpu_each(workers: int, device: str, reported: str, monkeypatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     check_workers(workers, torch.device("cpu"))
     check_workers(1, torch.device(device))
     with pytest.raises(NeecoError, match=reported) if reported else contextlib.nullcontext():
@@ -307,7 +306,6 @@ def test_a_task_on_a_node_sees_the_gpu_it_was_given(monkeypatch) -> None:
 
 @pytest.mark.parametrize(("shared", "visible", "seen"), [(None, "4,5", {"4", "5"}), (2, "", {"0", "1"})])
 def test_tasks_here_see_a_gpu_each_or_share_them_where_they_are_small(shared, visible, seen, monkeypatch) -> None:
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     count = 3 if shared else 2
@@ -378,8 +376,7 @@ def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(where, make_jo
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="a worker's checkpoint is waited for")
-def test_interrupted_workers_leave_their_checkpoints(make_job, tmp_path, monkeypatch) -> None:
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+def test_interrupted_workers_leave_their_checkpoints(make_job, tmp_path) -> None:
     values = {"checkpoint_interval": 10**6, "iterations": 5000}
     jobs = [make_job(seed=seed, values=values, folder=tmp_path / str(seed)) for seed in (0, 1)]
 

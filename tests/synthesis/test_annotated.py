@@ -271,10 +271,11 @@ def test_a_recording_that_changed_is_not_gone_on_with(made: Path, recorded: Reco
         annotate_capture(changed, begun, resume=True)
 
 
-def test_recorded_images_and_labels_are_written_as_large_as_asked_and_through_the_lens(recorded, tmp_path, monkeypatch):
-    few = replace(recorded, recording=replace(recorded.recording, frames=recorded.recording.frames[2:4]))
+def test_recorded_images_and_labels_are_written_as_large_as_asked_and_through_the_lens(recorded, tmp_path):
+    scene, recording = copy(recorded.scene), replace(recorded.recording, frames=recorded.recording.frames[2:4])
     lens = Lens(50.0, 50.0, 32.0, 24.0, (-0.3, 0.1, 0.0, 0.0), (64, 48), border=(32.0, 24.0, 31.0))
-    monkeypatch.setattr(few.scene, "recorded", replace(few.scene.recorded, lens=lens))
+    scene.recorded = replace(scene.recorded, lens=lens)
+    few = replace(recorded, scene=scene, recording=recording)
     annotate_capture(few, tmp_path / "large", images=ImageSettings(scale=2.0, image_format="jpg"), formats=())
     annotate_capture(few, tmp_path / "bent", images=ImageSettings(lens=True), formats=())
     pixels = read_image(tmp_path / "large/images/000000.jpg").permute(2, 0, 1)
