@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
-from bag_world import KINDS, BagWriter
+from bag_world import KINDS, BagWriter, known, refusal
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
@@ -18,10 +17,8 @@ from neeco.ingest.readers import (
     OTHER,
     POSES,
     READINGS,
-    RecordingFormat,
     VideoSource,
     _bagfile,
-    format_of,
     read_table,
 )
 from neeco.ingest.readers.columns import BASE, CAMERA, JointColumns, PoseColumns
@@ -78,21 +75,8 @@ def poses(path: Path, stream: str = ARM) -> PoseLog:
     return read_pose_log(PoseColumns(path, stream=stream))
 
 
-def known(path: Path) -> RecordingFormat:
-    found = format_of(path)
-    assert found is not None
-    return found
-
-
 def images(path: Path, stream: str | None = None) -> VideoSource:
     return known(path).open_images(path, stream)
-
-
-def refusal(action: Callable[[], object]) -> str:
-    with pytest.raises(NeecoError) as caught:
-        action()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.fixture(params=KINDS)

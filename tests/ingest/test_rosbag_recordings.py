@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from bag_world import KINDS, BagWriter
+from bag_world import KINDS, BagWriter, known, refusal
 from damaged_files import refusals
 from ingest.still_world import HEIGHT, RATE, WIDTH, Theatre
 from scipy.spatial.transform import Rotation
 
-from neeco.base.errors import NeecoError, install_hint
+from neeco.base.errors import install_hint
 from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.ingest.cameras.still_scene import read_right_camera
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.readers import RecordingFormat, _bagfile, format_of, read_table
+from neeco.ingest.readers import _bagfile, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.readers.rosbag import RosBag
@@ -70,21 +70,8 @@ def write_dvrk(bag: BagWriter, names: tuple[str, str, str] = NEW, frame: str = "
     bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, FOCAL)
 
 
-def refusal(action: Callable[[], object]) -> str:
-    with pytest.raises(NeecoError) as caught:
-        action()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
 def read_arm(path: Path) -> object:
     return read_pose_log(PoseColumns(path, stream="/dvrk/PSM1/measured_cp"))
-
-
-def known(path: Path) -> RecordingFormat:
-    found = format_of(path)
-    assert found is not None
-    return found
 
 
 def write_tool(bag: BagWriter, topics: Sequence[str] = ("/tool/pose",), frame: str = "tracker") -> None:
