@@ -20,6 +20,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 # pytest-xdist's workers and the processes that tests start fill the cores already. Tests of threads ask for their own.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+# What the machine is set up with decides no test: weights, a cluster, the terminal's width.
+for name in ("NEECO_LPIPS_WEIGHTS", "RAY_ADDRESS", "COLUMNS"):
+    os.environ.pop(name, None)
+
 os.fsync = lambda descriptor: None  # no test's files need to outlast a power cut, and a sync takes milliseconds
 
 WORLDS = Path(__file__).resolve().parent / "evaluation" / "worlds.py"

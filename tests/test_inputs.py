@@ -247,9 +247,7 @@ def test_init_names_a_pipe_and_goes_on(tmp_path: Path, name: str, capsys: pytest
     ids=lambda words: "-".join(words[:2]),
 )
 @pytest.mark.parametrize("suffix", ["", ".mcap"])
-def test_no_verb_waits_for_a_pipe(
-    tmp_path: Path, words: list[str], suffix: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_verb_waits_for_a_pipe(tmp_path, words, suffix, monkeypatch, capsys):
     os.mkfifo(tmp_path / f"pipe{suffix}")
     monkeypatch.chdir(tmp_path)
     with at_most(20):

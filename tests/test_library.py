@@ -176,9 +176,7 @@ def test_what_a_notebook_shows_of_an_object_is_one_short_line(folder: Path) -> N
     assert repr(neeco.State({}, 1.5)) == "State(time=1.5 s)"
 
 
-def test_errors_name_arguments_in_python_and_options_on_the_command_line(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_errors_name_arguments_in_python_and_options_on_the_command_line(folder, capsys):
     run, output = folder / "runs" / "sample", folder / "refused"
     wrong: list[tuple[Callable[[], object], str]] = [
         (lambda: neeco.train(SAMPLE, output, iterations=0), "iterations: 0 is not a positive number"),
@@ -205,9 +203,7 @@ def test_errors_name_arguments_in_python_and_options_on_the_command_line(
     assert "neeco: error: --min-trust: 2.0 is not a share" in capsys.readouterr().err
 
 
-def test_the_recipe_for_the_next_operation_runs_as_the_page_says(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_recipe_for_the_next_operation_runs_as_the_page_says(folder, tmp_path, monkeypatch):
     """The commands and the Python of docs/does-it-help.md, tiny: 14 frames of liver-mini are both recordings."""
     pytest.importorskip("transformers")
     page = (ROOT / "docs" / "does-it-help.md").read_text(encoding="utf-8").partition("## What to do")[2]

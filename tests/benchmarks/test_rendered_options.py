@@ -87,9 +87,7 @@ def test_a_slowed_recording_ends_where_the_planned_one_does(world: dict) -> None
     assert slow.at(slow_last).opening == pytest.approx(planned.at(last * 107 / 108).opening)
 
 
-def test_test_frames_lie_midway_between_training_frames_of_every_thinned_list(
-    world: dict, benchmarks: ModuleType, tmp_path: Path
-) -> None:
+def test_test_frames_lie_midway_between_training_frames_of_every_thinned_list(world, benchmarks, tmp_path):
     from rendered.motion import slowed
     from rendered.writing import write_thinned
 

@@ -83,9 +83,7 @@ def test_a_field_of_the_header_counts(tmp_path: Path) -> None:
     assert line.endswith("header.neeco.recorded.0.time: 0.1 before, 0.2 after")
 
 
-def test_nothing_to_compare_is_not_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_to_compare_is_not_the_same(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["same_bits.py", str(tmp_path), str(tmp_path)])
     assert main() == 1
     make_run(tmp_path / "run")

@@ -111,9 +111,7 @@ def test_a_mirrored_state_looks_alike_from_afar(state_errors: ModuleType) -> Non
         assert np.abs(depths[0] - depths[1]).max() > 1  # mm: it is another state
 
 
-def test_outliers_are_named_and_nothing_else_changes(
-    state_errors: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_outliers_are_named_and_nothing_else_changes(state_errors, tmp_path, monkeypatch):
     folder = write_folder(tmp_path / "capture")
     document = folder.document
     (folder.root / "truth").mkdir()

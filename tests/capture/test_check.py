@@ -15,7 +15,6 @@ from PIL import Image
 
 from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture
-from neeco.capture.checks import read_checked
 from neeco.capture.points import read_ply, write_ply
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.cli import check as check_verb
@@ -338,14 +337,6 @@ def test_the_verb_says_what_labels_few_frames_give(folder, capsys):
     assert "labels to expect" not in capsys.readouterr().out
     check_verb.run(check_verb.Arguments(SAMPLE))  # 72 training frames
     assert "labels to expect" not in capsys.readouterr().out
-
-
-def test_a_capture_is_parsed_once_to_be_checked_and_handed_on(folder, monkeypatch):
-    parsed = []
-    real = json.loads
-    monkeypatch.setattr(json, "loads", lambda text, **words: parsed.append(text) or real(text, **words))
-    assert len(read_checked(folder.root).frames) == 8
-    assert len(parsed) == 1
 
 
 def test_frames_that_are_all_left_out_are_an_error(folder):

@@ -26,7 +26,6 @@ def test_a_progress_bar_says_nothing_before_there_is_news(capsys):
 
 def test_a_file_gets_a_line_at_intervals_with_what_how_far_and_how_long_still(capsys, monkeypatch):
     monkeypatch.setattr("neeco.cli._progress.LINE_INTERVAL_S", 0.02)
-    monkeypatch.delenv("COLUMNS", raising=False)
     row = ProgressRow(
         iteration=1234, loss=0.1, psnr=30.04, num_gaussians=23456, phase=1, progress=0.25, seconds=0.4, prepared=0.1
     )

@@ -54,32 +54,26 @@ def test_help_names_every_verb_with_a_line() -> None:
         assert line.split()[0] in shown.stdout
 
 
-def test_help_waits_for_no_numerical_library() -> None:
+def test_help_waits_for_no_large_library() -> None:
     program = (
         "import sys; from neeco.cli import main\n"
+        "LARGE = {'cv2', 'jinja2', 'matplotlib', 'numpy', 'scipy', 'torch'}\n"
         "try: main(['--help'])\n"
-        "except SystemExit: print('imported:', *sorted({'cv2', 'numpy', 'scipy', 'torch'} & set(sys.modules)))"
+        "except SystemExit: print('imported:', *sorted(LARGE & set(sys.modules)))"
     )
     shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert shown.stdout.splitlines()[-1].strip() == "imported:"
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)
-def test_every_verb_has_help_with_hyphenated_options(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_verb_has_help_with_hyphenated_options_and_what_holds_where_one_is_left_out(verb, capsys):
     with pytest.raises(SystemExit) as left:
         cli.main([verb, "--help"])
     shown = capsys.readouterr().out
     assert left.value.code == 0
     assert f"neeco {verb}" in shown
-    options = [word for word in shown.split() if word.startswith("--")]
-    assert not [word for word in options if "_" in word]
-
-
-@pytest.mark.parametrize("verb", cli.VERBS)
-def test_help_states_what_holds_where_an_option_is_left_out(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        cli.main([verb, "--help"])
-    options = capsys.readouterr().out.partition("settings of method")[0]
+    assert not [word for word in shown.split() if word.startswith("--") and "_" in word]
+    options = shown.partition("settings of method")[0]
     assert "None" not in options
     assert "(default: )" not in options
 
@@ -93,35 +87,6 @@ def test_help_of_train_ends_with_a_table_of_the_chosen_method(capsys: pytest.Cap
         assert "--output" in options
         assert [setting, default] in [line.replace("│", " ").split()[:2] for line in table.splitlines()]
         assert len(table) < 7000
-
-
-@pytest.mark.parametrize(("wrong", "right"), [("trian", "train"), ("synthesise", "synthesize"), ("veiw", "view")])
-def test_a_verb_that_is_nearly_one_is_answered_with_that_one(
-    wrong: str, right: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as left:
-        cli.main([wrong, "somewhere"])
-    assert left.value.code == 2
-    assert f"{wrong}: no such verb; did you mean {right}?" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "wrong", "right"),
-    [
-        (["train", "somewhere", "--ouptut", "run"], "--ouptut", "--output"),
-        (["synthesize", "run", "--output", "set", "--cuont=4"], "--cuont", "--count"),
-        (["synthesize", "run", "--output", "set", "--count", "4", "--vews", "orbit"], "--vews", "--views"),
-    ],
-)
-def test_a_misspelt_option_is_answered_with_the_one_that_is_meant(
-    words: list[str], wrong: str, right: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as left:
-        cli.main(words)
-    assert left.value.code == 2
-    printed = capsys.readouterr().err
-    assert f"neeco: error: {wrong}: no such option of {words[0]}; did you mean {right}?" in printed
-    assert "{None}" not in printed
 
 
 def test_options_next_to_a_misspelt_one_are_left_alone(capsys: pytest.CaptureFixture[str]) -> None:
@@ -151,15 +116,6 @@ def test_completion_knows_the_options_of_every_verb(capsys: pytest.CaptureFixtur
         assert option in script
 
 
-def test_overview_loads_nothing_large() -> None:
-    program = (
-        "import sys; from neeco.cli import main\n"
-        "try: main(['--help'])\n"
-        "except SystemExit: sys.exit(not sys.modules.keys().isdisjoint(('torch', 'matplotlib', 'jinja2')))"
-    )
-    assert subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode == 0
-
-
 def test_overview_answers_at_once() -> None:
     fastest = float("inf")
     for _ in range(3):
@@ -174,40 +130,50 @@ def test_version_is_the_package_version(capsys: pytest.CaptureFixture[str]) -> N
     assert capsys.readouterr().out == f"neeco {__version__}\n"
 
 
+MEANT = r"neeco: error: {}: no such option of .*; did you mean {}\?"
+
+
 @pytest.mark.parametrize(
-    "words",
+    ("words", "told"),
     [
-        [], ["synthesise"], ["--bogus"], ["train"], ["synthesize", "run"], ["train", "one", "two", "--output", "run"],
-        ["view", "run", "--export"], ["ingest", "--intrinsics", "1", "2"],
-        ["synthesize", "run", "--output", "set", "--count", "4", "--views", "orb"],
-        *([verb, "--no-such-option"] for verb in cli.VERBS),
+        ([], ""),
+        (["--bogus"], ""),
+        (["train"], "missing"),
+        (["train", "capture"], "missing --output PATH: Run folder to write"),
+        (["synthesize", "run"], ""),
+        (["train", "one", "two", "--output", "run"], ""),
+        (["view", "run", "--export"], "--export page.html"),
+        (["ingest", "--intrinsics", "1", "2"], "FX FY CX CY"),
+        (["synthesize", "run", "--output", "set", "--count", "4", "--views", "orb"], ""),
+        *(([verb, "--no-such-option"], f"neeco {verb} --help|did you mean") for verb in cli.VERBS),
+        *(
+            ([wrong, "somewhere"], rf"{wrong}: no such verb; did you mean {right}\?")
+            for wrong, right in [("trian", "train"), ("synthesise", "synthesize"), ("veiw", "view")]
+        ),
+        (["train", "somewhere", "--ouptut", "run"], MEANT.format("--ouptut", "--output")),
+        (["synthesize", "run", "--output", "set", "--cuont=4"], MEANT.format("--cuont", "--count")),
+        (
+            ["synthesize", "run", "--output", "set", "--count", "4", "--vews", "orbit"],
+            MEANT.format("--vews", "--views"),
+        ),
+        (["train", "x", "--output", "y", "--minutes", "abc"], "'abc' is not a number.*neeco train --help"),
+        (
+            ["synthesize", "x", "--output", "y", "--count", "1.5"],
+            "'1.5' is not a whole number.*neeco synthesize --help",
+        ),
+        (["ingest", "--intrinsics", "1", "2", "a", "3"], "'a' is not a number.*neeco ingest --help"),
+        (["train", "x", "--output", "y", "--bogus"], "neeco train --help"),
     ],
-)  # fmt: skip
-def test_wrong_usage_is_one_line_and_exits_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+)
+def test_wrong_usage_is_one_line_about_the_word_and_exits_2(words, told, capsys):
     with pytest.raises(SystemExit) as left:
         cli.main(words)
     assert left.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("neeco: error: ")
     assert re.search(r"`neeco( [a-z-]+)? --help`|did you mean", line)
-    assert "│" not in line
-    assert "(required)" not in line
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["view", "run", "--export"], "--export page.html"),
-        (["ingest", "--intrinsics", "1", "2"], "FX FY CX CY"),
-        (["train", "capture"], "missing --output PATH: Run folder to write"),
-    ],
-)
-def test_what_an_option_needs_is_said_where_it_is_missing(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(words)
-    assert told in capsys.readouterr().err
+    assert re.search(told, line)
+    assert not [word for word in ("│", "(required)", "{None}", "NoneType") if word in line]
 
 
 @pytest.mark.parametrize(
@@ -221,9 +187,7 @@ def test_what_an_option_needs_is_said_where_it_is_missing(
         (["--video", "left.mp4"], "--output: "),
     ],
 )
-def test_ingest_asks_for_the_source_that_it_lacks(
-    words: list[str], told: str, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ingest_asks_for_the_source_that_it_lacks(words, told, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert cli.main(["ingest", *words]) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -232,9 +196,7 @@ def test_ingest_asks_for_the_source_that_it_lacks(
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)
-def test_bad_path_is_one_line_and_exit_1(
-    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_path_is_one_line_and_exit_1(verb, tmp_path, monkeypatch, capsys):
     (tmp_path / "taken").write_text("a file, not a folder")
     monkeypatch.chdir(tmp_path)
     assert cli.main([verb, *WITH_BAD_PATH[verb]]) == 1
@@ -246,30 +208,24 @@ def test_bad_path_is_one_line_and_exit_1(
         assert (MISSING if verb != "demo" else "taken") in told.err
 
 
-def test_an_error_of_many_lines_is_told_in_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(cli, "_dispatch", raising(NeecoError("file: field:\n  wrong;\n  mend it")))
-    assert cli.main([]) == 1
-    assert capsys.readouterr().err == "neeco: error: file: field: wrong; mend it\n"
+@pytest.mark.parametrize(
+    ("error", "status", "told"),
+    [
+        (NeecoError("file: field:\n  wrong;\n  mend it"), 1, "neeco: error: file: field: wrong; mend it"),
+        (NeecoError("a\x1b[31mb\nc: \r is wrong"), 1, r"a\x1b["),  # names in damaged files command no terminal
+        (OSError(2, "gone", "a\x1b[2Jb"), 1, r"a\x1b["),
+        (KeyboardInterrupt(), 130, "neeco: interrupted: "),
+    ],
+)
+def test_an_error_is_told_in_one_printable_line(error, status, told, monkeypatch, capsys):
+    def fail(words: list[str]) -> int:
+        raise error
 
-
-def test_ctrl_c_is_one_line_and_exit_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(cli, "_dispatch", raising(KeyboardInterrupt()))
-    assert cli.main([]) == 130
-    assert len(capsys.readouterr().err.strip().splitlines()) == 1
-
-
-@pytest.mark.parametrize("error", [NeecoError("a\x1b[31mb\nc: \r is wrong"), OSError(2, "gone", "a\x1b[2Jb")])
-def test_names_in_damaged_files_do_not_reach_the_terminal_as_commands(
-    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(cli, "_dispatch", raising(error))
-    assert cli.main([]) == 1
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert told.strip().isprintable()
-    assert "a\\x1b[" in told
+    monkeypatch.setattr(cli, "_dispatch", fail)
+    assert cli.main([]) == status
+    line = capsys.readouterr().err.strip()  # Ctrl-C ends the terminal's own line first
+    assert told in line
+    assert line.isprintable()
 
 
 def test_a_reader_that_goes_away_makes_no_noise() -> None:
@@ -288,36 +244,6 @@ def test_a_reader_that_goes_away_makes_no_noise() -> None:
     assert process.stderr.read() == b""
     process.stderr.close()
     assert process.wait(timeout=60) == cli.PIPE_CLOSED
-
-
-def raising(error: BaseException):
-    """A function that raises `error` whatever it is given."""
-
-    def call(*_: object) -> int:
-        raise error
-
-    return call
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["train", "x", "--output", "y", "--minutes", "abc"], "'abc' is not a number"),
-        (["synthesize", "x", "--output", "y", "--count", "1.5"], "'1.5' is not a whole number"),
-        (["ingest", "--intrinsics", "1", "2", "a", "3"], "'a' is not a number"),
-        (["train", "x", "--output", "y", "--bogus"], "neeco train --help"),
-    ],
-)
-def test_usage_errors_are_about_the_word_and_name_the_verbs_help(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as left:
-        cli.main(words)
-    assert left.value.code == 2
-    printed = capsys.readouterr().err
-    assert told in printed
-    assert f"neeco {words[0]} --help" in printed
-    assert "NoneType" not in printed
 
 
 def test_help_is_a_verb_and_a_file_is_no_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -343,9 +269,7 @@ def test_help_is_a_verb_and_a_file_is_no_capture(tmp_path: Path, capsys: pytest.
         ("nothing", "no such "),
     ],
 )
-def test_a_folder_of_another_kind_is_called_what_it_is(
-    verb: str, holds: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_another_kind_is_called_what_it_is(verb, holds, told, tmp_path, capsys):
     if (verb, holds) in (("evaluate", "config.yaml"), ("check", "transforms.json")):
         return  # what is asked for
     given = tmp_path / "raw"
@@ -369,9 +293,7 @@ def test_a_folder_of_another_kind_is_called_what_it_is(
         ["train", "capture", "--joints", "--output", "run"],
     ],
 )
-def test_an_option_of_several_values_without_one_is_refused(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_option_of_several_values_without_one_is_refused(words, capsys):
     option = next(word for word in words if word in ("--class-names", "--formats", "--splits", "--joints"))
     assert cli.main(words) == 1
     assert capsys.readouterr().err == f"neeco: error: {option}: no value follows; give one or more, or leave it out\n"

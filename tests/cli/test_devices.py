@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -40,38 +41,48 @@ OF_A_CAPTURE = {
 }
 
 
-@pytest.fixture
-def made(world, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """By verb, what it takes: a capture or a run of five steps. The working folder is one of its own."""
-    monkeypatch.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
-    root, work = tmp_path / "capture", tmp_path / "work"
+@pytest.fixture(scope="module")
+def trained(world, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A capture, and a run of five steps."""
+    folder = tmp_path_factory.mktemp("trained")
+    root = folder / "capture"
     write_capture(world.make_capture(root, world.TinyScene(), ("train",) * 4 + ("test",)), root)
-    run = train(root, tmp_path / "run", training_config("3dgs", {"iterations": 5}))
-    work.mkdir()
-    monkeypatch.chdir(work)
-    return dict.fromkeys(OF_A_RUN, str(run)) | dict.fromkeys(OF_A_CAPTURE, str(root))
+    return root, train(root, folder / "run", training_config("3dgs", {"iterations": 5}))
+
+
+@pytest.fixture
+def made(trained: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """By verb, what it takes: a capture or a run. The working folder is one of its own."""
+    monkeypatch.chdir(tmp_path)
+    run = shutil.copytree(trained[1], tmp_path / "run")
+    return dict.fromkeys(OF_A_RUN, str(run)) | dict.fromkeys(OF_A_CAPTURE, str(trained[0]))
 
 
 def command(verb: str, made: dict[str, str], device: str) -> list[str]:
     return [verb, made[verb], *(OF_A_RUN | OF_A_CAPTURE)[verb], "--device", device]
 
 
-@pytest.mark.parametrize("verb", [*OF_A_RUN, *OF_A_CAPTURE])
 @pytest.mark.parametrize(
-    ("device", "told"),
-    [("cuda", "PyTorch finds no CUDA device"), ("cuda:3", "PyTorch finds no CUDA"), ("tpu", "'tpu' is unknown")],
+    ("verb", "device", "told"),
+    [
+        *((verb, "cuda", "PyTorch finds no CUDA device") for verb in [*OF_A_RUN, *OF_A_CAPTURE]),
+        ("train", "cuda:3", "PyTorch finds no CUDA"),
+        ("render", "tpu", "'tpu' is unknown"),
+    ],
 )
 def test_a_device_that_is_not_there_is_one_line_and_nothing_is_written(
-    verb: str, device: str, told: str, made, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    verb, device, told, made, trained, tmp_path, monkeypatch, capsys
+):
+    def there() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for root in (tmp_path, trained[0]) for path in root.rglob("*")}
+
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    before = there()
     assert main(command(verb, made, device)) == 1
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("neeco: error: --device: ")
-    assert told in lines[0]
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("neeco: error: --device: ")
+    assert told in line
+    assert there() == before
 
 
 @pytest.mark.parametrize("verb", ["evaluate", "render"])

@@ -268,9 +268,7 @@ def serves(words: list[str], folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", COMMANDS)
-def test_a_command_of_the_pages_runs_to_its_end(
-    line: str, documented: DocumentedWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_command_of_the_pages_runs_to_its_end(line, documented, tmp_path, monkeypatch):
     if line.startswith("downstream"):
         pytest.importorskip("transformers")
     if "--help" in line.split():
@@ -293,9 +291,7 @@ def test_a_command_of_the_pages_runs_to_its_end(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["index", "recipes"])
-def test_the_python_of_a_page_runs(
-    page: str, documented: DocumentedWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_python_of_a_page_runs(page, documented, tmp_path, monkeypatch):
     """README's and getting-started's are run by tests/test_library.py, adding-a-method's by tests/training; blocks that
     begin with packages of others need these."""
     monkeypatch.chdir(tmp_path)

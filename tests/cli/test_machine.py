@@ -77,9 +77,7 @@ def test_letters_that_a_terminal_cannot_show_are_escaped(monkeypatch: pytest.Mon
     assert told.buffer.getvalue().startswith(rb"neeco: error: f\xfcr/transforms.json")  # type: ignore[attr-defined]
 
 
-def test_a_name_that_is_not_utf8_is_refused_before_anything_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_that_is_not_utf8_is_refused_before_anything_is_written(tmp_path, monkeypatch, capsys):
     folder = tmp_path / NOT_UTF8
     for words in (["check", str(folder)], ["train", str(tmp_path), "--output", str(folder / "run")]):
         assert cli.main(words) == 1
@@ -113,9 +111,7 @@ def too_large() -> MemoryError:
         (MemoryError(), ""),
     ],
 )
-def test_too_little_memory_is_one_line_that_says_how_much_and_what_to_do(
-    error: Exception, asked: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_too_little_memory_is_one_line_that_says_how_much_and_what_to_do(error, asked, monkeypatch, capsys):
     def fail(words: list[str]) -> int:
         raise error
 

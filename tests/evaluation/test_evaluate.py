@@ -13,11 +13,6 @@ from neeco.evaluation import evaluate, image_metrics
 from neeco.evaluation.evaluate import evaluate_run
 
 
-@pytest.fixture(autouse=True)
-def _no_weights(monkeypatch):
-    monkeypatch.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
-
-
 def make_run(world, folder, splits=("train", "train", "test", "unseen"), **options):
     capture = world.make_capture(folder / "capture", world.TinyScene(), splits, truth=options.pop("truth", True))
     return world.TinyRun(folder, world.TinyScene(**options), capture)

@@ -54,7 +54,6 @@ def test_a_full_mask_changes_nothing_and_ignored_pixels_do_not_count():
 
 
 def test_no_folder_means_no_networks_but_a_wrong_folder_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
     assert find_lpips(None) == {}
     with pytest.raises(NeecoError, match="no such folder"):
         find_lpips(tmp_path / "nowhere")

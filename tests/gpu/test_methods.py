@@ -123,9 +123,7 @@ def config_of(method: str) -> TrainConfig:
 
 @slowly
 @pytest.mark.parametrize("method", methods())
-def test_a_method_learns_there_as_well_as_here(
-    method: str, device: torch.device, capture: Path, tmp_path: Path
-) -> None:
+def test_a_method_learns_there_as_well_as_here(method, device, capture, tmp_path):
     here = psnr_of(train(capture, tmp_path / "here", config_of(method)))
     there = psnr_of(train(capture, tmp_path / "there", config_of(method), device=device))
     untrained = training_config(method, {"iterations": 1, "max_tissue_gaussians": 1000}, SMALL.get(method, []))

@@ -41,7 +41,6 @@ def run(capture: str, tmp_path: Path) -> str:
 def verb(word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
     """Has a verb do its work on the device; files go into a folder of the test's own."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
 
     def call(*words: str, here: bool = True) -> None:
         if word == "cuda":

@@ -102,26 +102,6 @@ def test_a_wrong_base_ends_in_one_line(tmp_path, base, message):
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('{"name": "PSM1", "measured_cp": []}', "base-frame.*: is missing"),
-        ('{"x": 1}', r"base-frame.*: is missing; .* or write \{transform: 4 rows, mm, sd_mm: 8, sd_deg: 5\}"),
-        ('{"matrix": [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]]}', "matrix.*: in metres"),
-        ('{"matrix": [[1, 0, 0, 100]]}', "matrix"),
-        (
-            '{"matrix": [[1, 0, 0, 100], [0, 1, 0, 0], [0, 0, 1, 200], [0, 0, 0, 1]], "unit": "m"}',
-            "unit: it has no",
-        ),
-        ("transform", "is not a camera registration"),
-    ],
-)
-def test_another_file_than_a_registration_ends_in_one_line(tmp_path, text, message):
-    (tmp_path / "reg.json").write_text(text)
-    with pytest.raises(NeecoError, match=message):
-        read_dvrk_registration(tmp_path / "reg.json")
-
-
 @pytest.mark.parametrize("key", ["matrix", "transform"])
 @pytest.mark.parametrize("deviations", [{}, {"sd_mm": 3.0, "sd_deg": 2.0}])
 def test_a_file_may_state_what_recording_yaml_states(tmp_path, key, deviations):
@@ -146,25 +126,37 @@ def test_the_yaml_of_easy_handeye_is_inverted(tmp_path, second):
     assert np.allclose(_recording(tmp_path, "eye.yaml")[0].base.matrix, MILLIMETRES)
 
 
+METRES = [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]]
+ON_BASE = {"parameters": {"eye_on_hand": False}}
+TRACKER = {"parameters": {"eye_on_hand": False, "tracking_base_frame": "camera_link"}}
+
+
 @pytest.mark.parametrize(
-    ("document", "message"),
+    ("name", "document", "message"),
     [
-        ({"parameters": {"eye_on_hand": True}, "transformation": PLACE | QUATERNION}, "eye_on_hand: false"),
-        ({"transformation": PLACE | QUATERNION}, "eye_on_hand: false"),
-        ({"parameters": {"eye_on_hand": False}, "transformation": PLACE}, "qx"),
-        ({"parameters": {"eye_on_hand": False}, "transformation": None}, "is missing"),
-        (
-            {
-                "parameters": {"eye_on_hand": False, "tracking_base_frame": "camera_link"},
-                "transformation": PLACE | QUATERNION,
-            },
-            "tracking_base_frame: is 'camera_link', and nothing says",
-        ),
-        (None, "expected an object"),
-        (3, "expected an object"),
+        ("reg.json", {"name": "PSM1", "measured_cp": []}, "base-frame.*: is missing"),
+        ("reg.json", {"x": 1}, r"base-frame.*: is missing; .* or write \{transform: 4 rows, mm, sd_mm: 8, sd_deg: 5\}"),
+        ("reg.json", {"matrix": METRES}, "matrix.*: in metres"),
+        ("reg.json", {"matrix": METRES[:1]}, "matrix"),
+        ("reg.json", {"matrix": MILLIMETRES, "unit": "m"}, "unit: it has no"),
+        ("reg.json", "transform", "is not a camera registration"),
+        ("eye.yaml", {"parameters": {"eye_on_hand": True}, "transformation": PLACE | QUATERNION}, "eye_on_hand: false"),
+        ("eye.yaml", {"transformation": PLACE | QUATERNION}, "eye_on_hand: false"),
+        ("eye.yaml", ON_BASE | {"transformation": PLACE}, "qx"),
+        ("eye.yaml", ON_BASE | {"transformation": None}, "is missing"),
+        ("eye.yaml", TRACKER | {"transformation": PLACE | QUATERNION}, "_frame: is 'camera_link', and nothing says"),
+        ("eye.yaml", None, "expected an object"),
+        ("eye.yaml", 3, "expected an object"),
     ],
 )
-def test_other_yaml_than_of_easy_handeye_ends_in_one_line(tmp_path, document, message):
-    (tmp_path / "eye.yaml").write_text(json.dumps(document))
-    with pytest.raises(NeecoError, match=message):
-        read_dvrk_registration(tmp_path / "eye.yaml")
+def test_another_file_than_a_registration_ends_in_one_line(tmp_path, name, document, message):
+    (tmp_path / name).write_text(json.dumps(document))
+    with pytest.raises(NeecoError, match=message) as raised:
+        read_dvrk_registration(tmp_path / name)
+    assert "\n" not in str(raised.value)
+
+
+def test_text_is_no_registration(tmp_path):
+    (tmp_path / "reg.json").write_text("transform")
+    with pytest.raises(NeecoError, match="is not a camera registration"):
+        read_dvrk_registration(tmp_path / "reg.json")

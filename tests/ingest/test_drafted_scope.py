@@ -89,9 +89,7 @@ def test_a_folder_with_a_stereo_calibration_gives_both_videos(tmp_path: Path) ->
     assert document["stereo"] == {"images": {"folder": "right", "fps": 25}, "calibration": "stereo.yaml"}
 
 
-def test_what_is_still_open_is_asked_by_line_and_refused_at_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_still_open_is_asked_by_line_and_refused_at_once(tmp_path, capsys):
     _, text = drafted(write_bag(tmp_path))
     asked = re.findall(r"^(\d)\. .*recording\.yaml:(\d+): ", capsys.readouterr().out, re.MULTILINE)
     assert [number for number, _ in asked] == ["1", "2", "3"]

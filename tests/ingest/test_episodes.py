@@ -117,9 +117,7 @@ def test_another_tissue_is_refused_by_name(tmp_path: Path) -> None:
         ({"tissue": "bowel"}, "tissue: a capture has one tissue; leave the key out, or make one capture"),
     ],
 )  # fmt: skip
-def test_what_one_capture_cannot_hold_is_refused_in_one_line(
-    tmp_path: Path, changes: dict[str, object], words: str
-) -> None:
+def test_what_one_capture_cannot_hold_is_refused_in_one_line(tmp_path, changes, words):
     paths = still_recordings(tmp_path, (1, 1))
     change(paths[1], **changes)
     with pytest.raises(NeecoError) as error:
@@ -136,7 +134,7 @@ def test_what_one_capture_cannot_hold_is_refused_in_one_line(
         ({"test": [3]}, "splits: test and unseen count one video's frames"),
     ],
 )
-def test_splits_name_what_there_is(tmp_path: Path, splits: dict[str, object], words: str) -> None:
+def test_splits_name_what_there_is(tmp_path, splits, words):
     with pytest.raises(NeecoError, match=words):
         read_episodes([read_recording(path) for path in still_recordings(tmp_path, (1, 1), splits=splits)])
 

@@ -177,15 +177,15 @@ def test_a_field_of_view_is_a_focal_length(world):
         ("a.yaml", "K: [300, 0, 0, 0, 300, 0, 160, 120, 1]", "camera_matrix: stands column by column"),
         ("a.yaml", "distortion_coefficients: [0, 0, 0, 0]", "camera_matrix: missing"),
         ("a.yaml", OPENCV.replace("300.5", "-300.5"), "two positive focal lengths"),
-        ("a.yaml", OPENCV.replace("0.1, ", ""), "has 4 coefficients"),
+        ("a.yaml", OPENCV.replace("0.1, 0.001, ", ""), "has 3 coefficients"),
         ("a.yaml", OPENCV.replace("-0.3", ".nan"), "nan is not a usable number"),
         ("a.yaml", OPENCV.replace("300.5", "[{}]"), "camera_matrix: "),
         ("a.yaml", OPENCV.replace("300.5", "wide"), "'wide' is not a usable number"),
         ("a.yaml", OPENCV.replace("300.5", "1" + "0" * 400), "is not a usable number"),
         ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "a fisheye lens has 4 coefficients, not 5"),
         ("a.json", "{}", "fl_x: missing"),
-        *(("a.json", text, "expected an object with fl_x") for text in ("null", "3", '"fl_x"', "[1, 2]", "true")),
-        *(("a.yaml", text, "no keys; expected") for text in ("null", "3", "fl_x", "[1, 2]", "true")),
+        *(("a.json", text, "expected an object with fl_x") for text in ("null", "3", '"fl_x"', "[]", "[null]", "true")),
+        *(("a.yaml", text, "no keys; expected") for text in ("null", "3", "fl_x", "[]", "[null]", "true")),
         ("a.txt", "300 0 160\n0 300 120\n0 0 2", "no keys; expected camera_matrix"),
         ("a.json", '{"fl_x": "x", "cx": 1, "cy": 1}', "'x' is not a usable number"),
         ("a.json", json.dumps(FISHEYE | {"fl_x": 90, "fl_y": 90}), "covers more than 80 degrees off its axis"),
@@ -194,9 +194,6 @@ def test_a_field_of_view_is_a_focal_length(world):
     ],
 )
 def test_calibrations_that_are_none(world, name, text, message):
-    if "4 coefficients" in message:
-        text = OPENCV.replace("0.1, 0.001, ", "")
-        message = "has 3 coefficients"
     with pytest.raises(NeecoError, match=rf"{name}: .*{message}") as caught:
         read_lens(world.text(text, name))
     assert "\n" not in str(caught.value)
@@ -253,15 +250,6 @@ def test_a_pinhole_changes_nothing():
 def test_distortion_that_folds_the_image_is_refused():
     with pytest.raises(NeecoError, match="folds the image over"):
         Lens(300, 300, 160, 120, (-9.0, -40.0, 0.0, 0.0)).pinhole((320, 240))
-
-
-@pytest.mark.parametrize("text", ["null", "3", '"x"', "[]", "[null]", "true"])
-@pytest.mark.parametrize("suffix", [".json", ".yaml"])
-def test_a_file_that_holds_no_object_ends_in_one_line(tmp_path, text, suffix):
-    path = tmp_path / f"lens{suffix}"
-    path.write_text(text)
-    with pytest.raises(NeecoError, match="expected"):
-        read_lens(path)
 
 
 @pytest.mark.parametrize(

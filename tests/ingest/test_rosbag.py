@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
-from bag_world import KINDS, BagWriter
+from bag_world import KINDS, BagWriter, known, refusal
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
@@ -18,10 +17,8 @@ from neeco.ingest.readers import (
     OTHER,
     POSES,
     READINGS,
-    RecordingFormat,
     VideoSource,
     _bagfile,
-    format_of,
     read_table,
 )
 from neeco.ingest.readers.columns import BASE, CAMERA, JointColumns, PoseColumns
@@ -78,21 +75,8 @@ def poses(path: Path, stream: str = ARM) -> PoseLog:
     return read_pose_log(PoseColumns(path, stream=stream))
 
 
-def known(path: Path) -> RecordingFormat:
-    found = format_of(path)
-    assert found is not None
-    return found
-
-
 def images(path: Path, stream: str | None = None) -> VideoSource:
     return known(path).open_images(path, stream)
-
-
-def refusal(action: Callable[[], object]) -> str:
-    with pytest.raises(NeecoError) as caught:
-        action()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.fixture(params=KINDS)
@@ -417,9 +401,7 @@ def write_stereo(folder: Path, kind: str = "recording.bag", baseline: float = 0.
 
 
 @pytest.mark.parametrize("rectified", [False, True])
-def test_the_right_cameras_camera_info_gives_its_pose_to_the_left_one(
-    tmp_path: Path, kind: str, rectified: bool
-) -> None:
+def test_the_right_cameras_camera_info_gives_its_pose_to_the_left_one(tmp_path, kind, rectified):
     path, name = write_stereo(tmp_path, kind), "image_rect_color" if rectified else "image_raw"
     found = known(path).stereo(path, f"/stereo/left/{name}", f"/stereo/right/{name}")
     assert found is not None
@@ -453,9 +435,7 @@ def test_another_recordings_bag_gives_its_only_pair_of_cameras(tmp_path: Path) -
         (0.5, "left", "right", "/stereo/right/camera_info: T: 0.5 long, which is no stereo scope's"),
     ],
 )
-def test_a_calibration_of_no_stereo_scope_is_refused(
-    tmp_path: Path, baseline: float, left: str, right: str, words: str
-) -> None:
+def test_a_calibration_of_no_stereo_scope_is_refused(tmp_path, baseline, left, right, words):
     path = write_stereo(tmp_path, baseline=baseline)
     with pytest.raises(NeecoError) as caught:
         known(path).stereo(path, f"/stereo/{left}/image_raw", f"/stereo/{right}/image_raw")
@@ -480,9 +460,7 @@ def of_other_encoding(content: bytearray) -> None:
 
 
 @pytest.mark.parametrize("change", [without_profile, of_other_encoding])
-def test_an_mcap_file_need_not_name_a_profile_and_other_messages_are_called_what_they_are(
-    tmp_path: Path, change: Callable[[bytearray], None]
-) -> None:
+def test_an_mcap_file_need_not_name_a_profile_and_other_messages_are_called_what_they_are(tmp_path, change):
     with BagWriter(tmp_path, "recording-mcap") as bag:
         for index in range(5):
             bag.pose("/psm1", index / 25, (0.01 * index, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0), "PSM1_base")

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from bag_world import KINDS, BagWriter
+from bag_world import KINDS, BagWriter, known, refusal
 from damaged_files import refusals
 from ingest.still_world import HEIGHT, RATE, WIDTH, Theatre
 from scipy.spatial.transform import Rotation
 
-from neeco.base.errors import NeecoError, install_hint
+from neeco.base.errors import install_hint
 from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.ingest.cameras.still_scene import read_right_camera
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.readers import RecordingFormat, _bagfile, format_of, read_table
+from neeco.ingest.readers import _bagfile, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.readers.rosbag import RosBag
@@ -70,21 +70,8 @@ def write_dvrk(bag: BagWriter, names: tuple[str, str, str] = NEW, frame: str = "
     bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, FOCAL)
 
 
-def refusal(action: Callable[[], object]) -> str:
-    with pytest.raises(NeecoError) as caught:
-        action()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
 def read_arm(path: Path) -> object:
     return read_pose_log(PoseColumns(path, stream="/dvrk/PSM1/measured_cp"))
-
-
-def known(path: Path) -> RecordingFormat:
-    found = format_of(path)
-    assert found is not None
-    return found
 
 
 def write_tool(bag: BagWriter, topics: Sequence[str] = ("/tool/pose",), frame: str = "tracker") -> None:
@@ -114,9 +101,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize("names", [NEW, OLD])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_dvrks_bag_becomes_a_recording_by_one_command(
-    tmp_path: Path, kind: str, names: tuple[str, str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dvrks_bag_becomes_a_recording_by_one_command(tmp_path, kind, names, capsys):
     with BagWriter(tmp_path, kind) as bag:
         write_dvrk(bag, names)
     assert main(["ingest", "--init", str(bag.path)]) == 0
@@ -213,9 +198,7 @@ def test_names_in_a_bag_are_names_and_no_more(tmp_path: Path) -> None:
 # --- what cannot be read
 
 
-def test_a_bag_in_the_place_of_a_recording_says_what_to_do(
-    bags: dict[str, Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_bag_in_the_place_of_a_recording_says_what_to_do(bags, capsys, tmp_path):
     for path in bags.values():
         assert main(["ingest", str(path), "--output", str(tmp_path / "out")]) == 1
         assert capsys.readouterr().err.rstrip().endswith(f"neeco ingest --init {path}")
@@ -226,9 +209,7 @@ def test_a_bag_in_the_place_of_a_recording_says_what_to_do(
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.97])
-def test_a_truncated_bag_is_refused_with_what_repairs_it(
-    tmp_path: Path, bags: dict[str, Path], kind: str, share: float
-) -> None:
+def test_a_truncated_bag_is_refused_with_what_repairs_it(tmp_path, bags, kind, share):
     path = _copy(bags[kind], tmp_path)
     file = _messages(path)
     file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
@@ -349,9 +330,7 @@ def _only_ours() -> bool:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_whatever_happens_to_its_bytes_a_bag_is_read_or_refused_in_one_line(
-    tmp_path: Path, bags: dict[str, Path], kind: str
-) -> None:
+def test_whatever_happens_to_its_bytes_a_bag_is_read_or_refused_in_one_line(tmp_path, bags, kind):
     path = _copy(bags[kind], tmp_path)
     bag = known(path)
     reads: list[Callable[[], object]] = [

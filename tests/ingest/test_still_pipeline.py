@@ -35,9 +35,7 @@ def ingested(tmp_path_factory: pytest.TempPathFactory) -> tuple[Theatre, IngestR
 STEREO = {"images": {"folder": "right", "fps": RATE}, "calibration": "stereo.yaml"}
 
 
-def test_a_still_scopes_frame_is_the_world_and_poses_in_it_stay_as_they_are(
-    ingested: tuple[Theatre, IngestResult],
-) -> None:
+def test_a_still_scopes_frame_is_the_world_and_poses_in_it_stay_as_they_are(ingested):
     theatre, result = ingested
     capture = read_capture(result.capture)
     assert capture.still
@@ -50,9 +48,7 @@ def test_a_still_scopes_frame_is_the_world_and_poses_in_it_stay_as_they_are(
     assert not [problem for problem in inspect_capture(result.capture).problems if problem.severity == "error"]
 
 
-def test_the_tissue_lies_behind_every_place_of_the_instrument_and_shows_none_of_it(
-    ingested: tuple[Theatre, IngestResult],
-) -> None:
+def test_the_tissue_lies_behind_every_place_of_the_instrument_and_shows_none_of_it(ingested):
     theatre, result = ingested
     points = read_capture(result.capture).points
     assert points.positions[:, 2].min() > BAR
@@ -85,9 +81,7 @@ def test_a_still_scope_is_noticed_and_the_instruments_clock_found_from_its_motio
 
 
 @pytest.mark.slow
-def test_a_log_that_states_the_cameras_frame_itself_needs_no_word_in_the_recording(
-    theatre: Theatre, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_that_states_the_cameras_frame_itself_needs_no_word_in_the_recording(theatre, monkeypatch):
     monkeypatch.setattr(reading, "read_pose_log", lambda source: replace(read_pose_log(source), frame="camera"))
     with pytest.raises(NeecoError, match="need a scope that stands still"):
         theatre.ingest(instruments=[{"name": "bar", "poses": "bar.csv"}], camera="moving")
@@ -102,9 +96,7 @@ def test_poses_in_an_unknown_frame_stay_unregistered_and_the_notes_say_so(theatr
     assert "100 mm" in str(result.depth_source)
 
 
-def test_a_still_capture_has_few_cameras_and_check_says_so(
-    ingested: tuple[Theatre, IngestResult], tmp_path: Path
-) -> None:
+def test_a_still_capture_has_few_cameras_and_check_says_so(ingested, tmp_path):
     root = Path(shutil.copytree(ingested[1].capture, tmp_path / "capture"))
     assert inspect_capture(root).summary.still
     document = json.loads((root / "transforms.json").read_text())
@@ -116,9 +108,7 @@ def test_a_still_capture_has_few_cameras_and_check_says_so(
     assert "camera_motion: is 'still', but the frames have" in wrong[0]
 
 
-def test_a_still_capture_stays_one_when_it_is_written_again(
-    ingested: tuple[Theatre, IngestResult], tmp_path: Path
-) -> None:
+def test_a_still_capture_stays_one_when_it_is_written_again(ingested, tmp_path):
     write_capture(read_capture(ingested[1].capture), tmp_path / "again")
     assert read_capture(tmp_path / "again").still
 
@@ -133,9 +123,7 @@ def test_a_still_capture_stays_one_when_it_is_written_again(
         ({"camera": "moving"}, "instruments: bar: poses in the camera's frame need a scope that stands still"),
     ],
 )
-def test_what_does_not_go_together_is_refused_in_one_line(
-    theatre: Theatre, changes: dict[str, object], words: str
-) -> None:
+def test_what_does_not_go_together_is_refused_in_one_line(theatre, changes, words):
     with pytest.raises(NeecoError) as error:
         theatre.ingest(**changes)
     assert words in str(error.value)

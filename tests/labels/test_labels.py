@@ -1,3 +1,5 @@
+from copy import copy
+
 import numpy as np
 import pytest
 import torch
@@ -108,10 +110,10 @@ def test_an_instrument_behind_the_tissue_is_not_seen_at_all(scene, state, camera
     assert {point.visibility for name, point in label.keypoints.items() if name != "shaft_far"} == {1}
 
 
-def test_an_instrument_of_which_the_scene_has_nothing_has_no_keypoints(scene, state, camera, monkeypatch):
-    faint = scene.canonical.map(torch.clone)
-    faint.opacity_logits[faint.body(1)] = -8.0
-    monkeypatch.setattr(scene, "canonical", faint)
+def test_an_instrument_of_which_the_scene_has_nothing_has_no_keypoints(scene, state, camera):
+    scene = copy(scene)
+    scene.canonical = scene.canonical.map(torch.clone)
+    scene.canonical.opacity_logits[scene.canonical.body(1)] = -8.0
     _, label = labelled(scene, state(), camera)
     assert label.shape is None
     assert {(point.x, point.y, point.visibility) for point in label.keypoints.values()} == {(0, 0, 0)}
@@ -212,11 +214,11 @@ def test_what_the_tissue_hides_has_no_share(scene, state, camera):
     assert not drawing.ignored.any()
 
 
-def test_a_dropped_component_is_in_neither_parts_nor_share_nor_band(scene, state, camera, monkeypatch):
+def test_a_dropped_component_is_in_neither_parts_nor_share_nor_band(scene, state, camera):
     whole = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.1)
-    strayed = scene.canonical.map(torch.clone)
-    strayed.means[scene.canonical.counts[0] + 30] = torch.tensor([25.0, -5.0, 0.0])  # one of the shaft's
-    monkeypatch.setattr(scene, "canonical", strayed)
+    scene = copy(scene)
+    scene.canonical = scene.canonical.map(torch.clone)
+    scene.canonical.means[scene.canonical.counts[0] + 30] = torch.tensor([25.0, -5.0, 0.0])  # one of the shaft's
     with_component = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.0)
     cleaned = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.1)
     component = slice(14, 26), slice(46, 62)  # rows and columns round it

@@ -83,9 +83,7 @@ def test_a_machine_without_a_driver_or_a_card_says_what_pytorch_says(said: str, 
         ((12, 1), True),
     ],
 )
-def test_a_card_that_pytorch_has_no_kernels_for_is_refused(
-    capability: tuple[int, int], usable: bool, cards: Cards
-) -> None:
+def test_a_card_that_pytorch_has_no_kernels_for_is_refused(capability, usable, cards):
     cards.capability = capability
     if usable:
         assert device_of("cuda").type == "cuda"

@@ -23,9 +23,7 @@ def images(height: int, width: int, masked: bool) -> tuple[torch.Tensor, torch.T
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (7, 5), (16, 11), (37, 53), (50, 129)])
 @pytest.mark.parametrize("weight", [0.1, 1.0])
-def test_value_and_gradient_match_the_reference(
-    simd: str, height: int, width: int, masked: bool, weight: float
-) -> None:
+def test_value_and_gradient_match_the_reference(simd, height, width, masked, weight):
     image, target, mask = images(height, width, masked)
     exact = image.detach().double().requires_grad_()
     expected = photometric_loss_reference(exact, target.double(), mask, weight)

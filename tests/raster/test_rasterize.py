@@ -333,9 +333,7 @@ def test_the_reference_draws_the_same_on_cuda() -> None:
     ],
 )
 @pytest.mark.parametrize(("sh_count", "channels"), [(1, 0), (16, 3)])
-def test_image_and_gradients_are_the_references_on_the_backends_device(
-    backend: str, package: str, sh_count: int, channels: int
-) -> None:
+def test_image_and_gradients_are_the_references_on_the_backends_device(backend, package, sh_count, channels):
     """That of the camera's pose too."""
     pytest.importorskip(package)
     scene = make_scene(150, sh_count, channels)
@@ -355,9 +353,7 @@ def test_image_and_gradients_are_the_references_on_the_backends_device(
 
 @pytest.mark.parametrize("size", [1.0, 12.0])
 @pytest.mark.parametrize("learned_fx", [None, 120.0, 30.0])
-def test_gaussians_alone_in_a_rendering_are_those_rendered_without_the_others(
-    simd: str, size: float, learned_fx: float | None
-) -> None:
+def test_gaussians_alone_in_a_rendering_are_those_rendered_without_the_others(simd, size, learned_fx):
     scene = make_scene(400, 4, 5, seed=3, width=131, height=97, size=size)
     _, gaussians, camera = leaves(scene, torch.float32)
     camera = replace(camera, learned_fx=learned_fx)

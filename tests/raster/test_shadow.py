@@ -187,9 +187,7 @@ def slope(value: Callable[[Tensor], Tensor], at: float, step: float) -> float:
     width=st.sampled_from([0.0, 0.03, 0.1]),
     turned=st.booleans(),
 )
-def test_the_kernel_finds_behind_what_the_reference_finds(
-    size: tuple[int, int], count: int, seed: int, offset: tuple[float, float, float], width: float, turned: bool
-) -> None:
+def test_the_kernel_finds_behind_what_the_reference_finds(size, count, seed, offset, width, turned):
     """Of a map that may be of a single pixel; values and the gradients of the lamp's place and width."""
     g = torch.Generator().manual_seed(seed)
     pose = torch.eye(4)

@@ -108,9 +108,7 @@ def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[s
         pytest.param(75, {"sh_count": 16, "channels": 1}, False, marks=pytest.mark.slow),
     ],
 )
-def test_every_kernel_compiles_without_a_gpu(
-    capability: int, scene: dict[str, Any], deterministic: bool, compiled: dict[str, Any]
-) -> None:
+def test_every_kernel_compiles_without_a_gpu(capability, scene, deterministic, compiled):
     """The interpreter takes what the compiler does not."""
     import triton
 
@@ -142,9 +140,7 @@ def test_every_kernel_compiles_without_a_gpu(
 @here
 @pytest.mark.skipif(ready.interpreted(), reason="the interpreter compiles nothing")
 @pytest.mark.parametrize(("capability", "masked"), [(80, True), (90, False)])
-def test_the_kernels_of_a_training_step_compile_without_a_gpu(
-    capability: int, masked: bool, compiled: dict[str, Any]
-) -> None:
+def test_the_kernels_of_a_training_step_compile_without_a_gpu(capability, masked, compiled):
     import triton
 
     from neeco.raster.triton.photometric import photometric, step_together
@@ -161,9 +157,7 @@ def test_the_kernels_of_a_training_step_compile_without_a_gpu(
 @here
 @pytest.mark.skipif(ready.interpreted(), reason="the interpreter compiles nothing")
 @pytest.mark.parametrize(("capability", "joints", "slides", "roll"), [(80, 2, 2, 1.0), (90, 1, 0, 0.0)])
-def test_the_kernels_of_posing_compile_without_a_gpu(
-    capability: int, joints: int, slides: int, roll: float, compiled: dict[str, Any]
-) -> None:
+def test_the_kernels_of_posing_compile_without_a_gpu(capability, joints, slides, roll, compiled):
     import triton
 
     from neeco.raster.triton.articulated import Posing

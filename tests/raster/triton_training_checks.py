@@ -44,9 +44,7 @@ def images(height: int, width: int, masked: bool, seed: int = 0) -> tuple[Tensor
     weight=st.sampled_from([0.0, 0.1, 1.0]),
     outer=st.sampled_from([1.0, -2.5]),
 )
-def test_value_and_gradient_match_the_reference(
-    height: int, width: int, masked: bool, weight: float, outer: float
-) -> None:
+def test_value_and_gradient_match_the_reference(height, width, masked, weight, outer):
     """From images smaller than the window to such of several blocks of numbers, whose borders fall anywhere."""
     image, target, mask = images(height, width, masked)
     exact = image.detach().double().requires_grad_()

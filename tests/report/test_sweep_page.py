@@ -31,7 +31,6 @@ def plan(world, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SweepPlan:
         return nullcontext(world.TinyRun(folder, scenes.get(folder.name.split("-seed")[0], scenes["3dgs"]), None))
 
     monkeypatch.setattr(sweep_page, "open_run", open_run)
-    monkeypatch.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
     capture = tmp_path / "capture <b>"
     write_capture(world.make_capture(capture, world.TinyScene(), ("train",) * 4 + ("test", "test", "unseen")), capture)
     configurations = {name: Configuration(method="3dgs") for name in ("kinematic", "3dgs", "lost")}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 from scene_worlds import make_scene
-from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
@@ -112,9 +110,7 @@ def test_another_schema_is_refused_by_name(kinematic: GaussianScene, tmp_path: P
         load_scene(path)
 
 
-def test_a_run_over_several_tissues_is_refused_and_one_of_a_single_named_tissue_loads(
-    kinematic: GaussianScene, tmp_path: Path
-) -> None:
+def test_a_run_over_several_tissues_is_refused_and_one_of_a_single_named_tissue_loads(kinematic, tmp_path):
     path = tmp_path / "scene.safetensors"
 
     def name_tissues(*names: str) -> None:
@@ -186,9 +182,7 @@ def test_a_missing_tensor_is_refused(kinematic: GaussianScene, tmp_path: Path, d
         ("recorded.poses", lambda tensor: tensor[:1], "out of bounds"),
     ],
 )
-def test_a_tensor_that_does_not_fit_is_refused(
-    kinematic: GaussianScene, tmp_path: Path, name: str, change: Callable[[Tensor], Tensor], told: str
-) -> None:
+def test_a_tensor_that_does_not_fit_is_refused(kinematic, tmp_path, name, change, told):
     tensors, header = pack_scene(kinematic)
     path = tmp_path / "scene.safetensors"
     save_tensors(tensors | {name: change(tensors[name]).contiguous()}, {"neeco": json.dumps(header)}, path)
@@ -216,9 +210,7 @@ def test_no_file_is_no_scene(tmp_path: Path) -> None:
         ("recorded.poses", 7.0, "the recorded pose of grasper in frame 0 is not a rigid transform"),
     ],
 )
-def test_recorded_poses_that_are_none_are_refused(
-    tensor: str, value: float, told: str, any_scene: GaussianScene, tmp_path: Path
-) -> None:
+def test_recorded_poses_that_are_none_are_refused(tensor, value, told, any_scene, tmp_path):
     tensors, header = pack_scene(any_scene)
     if tensor not in tensors:
         pytest.skip("it has no instrument")
@@ -237,9 +229,7 @@ def test_a_scene_stored_under_a_methods_former_name_is_read(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("change", [{"recorded": 3}, {"instruments": [{"name": 1}]}, {"deformation": []}])
-def test_a_header_built_otherwise_is_refused(
-    change: dict[str, object], any_scene: GaussianScene, tmp_path: Path
-) -> None:
+def test_a_header_built_otherwise_is_refused(change, any_scene, tmp_path):
     tensors, header = pack_scene(any_scene)
     save_tensors(tensors, {"neeco": json.dumps(header | change)}, tmp_path / "scene.safetensors")
     with pytest.raises(NeecoError, match=r"scene.safetensors: header: .*; it is damaged; train again"):

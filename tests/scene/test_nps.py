@@ -209,9 +209,7 @@ def test_states_that_bfloat16_cannot_tell_apart_stay_apart(small: tuple) -> None
     assert torch.allclose(near, exact, rtol=0, atol=0.1 * float(exact.abs().max()))
 
 
-def test_a_processor_without_bfloat16_stays_with_float32_and_says_so(
-    small: tuple, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_processor_without_bfloat16_stays_with_float32_and_says_so(small, monkeypatch):
     monkeypatch.setattr("neeco.raster.devices.processor_has", lambda *features: False)
     with pytest.warns(UserWarning, match="no bfloat16"):
         half = in_bfloat16(*small, half=True)
@@ -228,9 +226,7 @@ def test_a_processor_without_bfloat16_stays_with_float32_and_says_so(
         (None, [], False),  # an older PyTorch, or another architecture
     ],
 )
-def test_bfloat16_is_fast_with_tiles_and_on_amd(
-    monkeypatch: pytest.MonkeyPatch, name: str | None, features: list[str], fast: bool
-) -> None:
+def test_bfloat16_is_fast_with_tiles_and_on_amd(monkeypatch, name, features, fast):
     said = dict.fromkeys(features, True) | ({} if name is None else {"cpu_name": name})
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: said, raising=False)
     processor_has.cache_clear()

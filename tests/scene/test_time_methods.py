@@ -157,9 +157,7 @@ def test_a_layer_split_between_place_and_time_is_the_layer() -> None:
     state_noise=st.sampled_from([0.0, 0.3]),
 )
 @torch.no_grad()
-def test_every_gaussian_has_a_place_a_turn_and_a_size(
-    method: str, tissue: int, instrument: int, time: float, state_noise: float
-) -> None:
+def test_every_gaussian_has_a_place_a_turn_and_a_size(method, tissue, instrument, time, state_noise):
     """Whatever the time, also far outside of the recording, and however many Gaussians there are."""
     deformation = woken(make_deformation(method, (), method_settings(method, SMALL[method])))
     canonical = random_canonical(torch.Generator().manual_seed(0), (tissue, instrument))

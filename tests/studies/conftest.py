@@ -10,12 +10,6 @@ from neeco.studies.training_job import TrainingJob
 from neeco.training.config import training_config
 
 
-@pytest.fixture(autouse=True)
-def alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No LPIPS weights from outside."""
-    monkeypatch.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
-
-
 @pytest.fixture(scope="session")
 def unchanged_capture(world, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny world of 48 x 40 px on disk: six training frames, two test, one unseen, with true masks."""
@@ -50,10 +44,8 @@ def make_job(unchanged_capture: Path, tmp_path: Path):
 @pytest.fixture(scope="session")
 def trained_job(unchanged_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainingJob:
     """The job that `make_job()` makes, done; not to be changed."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
-        job = short_job(unchanged_capture, tmp_path_factory.mktemp("trained"))
-        job.run()
+    job = short_job(unchanged_capture, tmp_path_factory.mktemp("trained"))
+    job.run()
     return job
 
 

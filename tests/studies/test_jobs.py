@@ -27,7 +27,6 @@ from neeco.base.settings import with_fields
 from neeco.capture import read_capture
 from neeco.scene.training_session import UNLIMITED
 from neeco.studies import study
-from neeco.studies import training_job as module
 from neeco.studies.study import check_workers, run_jobs, threads_per_worker
 from neeco.studies.training_job import Curve, phase_1_psnr, psnr_at
 from neeco.training import train as train_module
@@ -76,11 +75,8 @@ def result_of(job) -> dict:
     return json.loads((job.folder / "job.json").read_text())
 
 
-def test_a_finished_job_is_not_done_again(finished_job, make_job, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = result_of(finished_job)
-    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
-    monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: pytest.fail("scored again"))
-    assert make_job().run() == first
+def test_a_finished_job_is_not_done_again(finished_job, make_job) -> None:
+    assert make_job().run() == result_of(finished_job)  # the seconds and the images per second, too
 
 
 def test_a_begun_run_keeps_what_its_processor_decided(make_job) -> None:
@@ -92,7 +88,7 @@ def test_a_begun_run_keeps_what_its_processor_decided(make_job) -> None:
         make_job("nps", settings=["deformation.half=true"]).check()
 
 
-def test_a_finished_job_of_a_methods_former_name_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_finished_job_of_a_methods_former_name_is_not_done_again(make_job) -> None:
     small = ["deformation.width=16", "deformation.depth=2"]
     job = make_job("nps", settings=small)
     first = job.run()
@@ -102,7 +98,6 @@ def test_a_finished_job_of_a_methods_former_name_is_not_done_again(make_job, mon
         (job.folder / name).write_text(
             text.replace('"method": "nps"', '"method": "neeco"').replace("method: nps", "method: neeco")
         )
-    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
     with pytest.warns(FutureWarning, match="method neeco is now called nps"):
         assert make_job("nps", settings=small).run() == first | {"name": "nps", "method": "neeco"}
 
@@ -115,11 +110,8 @@ def test_the_numbers_of_a_capture_that_changed_are_not_given_again(finished_job)
         job.run()
 
 
-def test_other_splits_are_scored_without_training_again(
-    finished_job, make_job, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_splits_are_scored_without_training_again(finished_job, make_job):
     first = result_of(finished_job)
-    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
     again = make_job(splits=("unseen",)).run()
     assert list(again["splits"]) == ["unseen"]
     assert without_times(again["splits"]["unseen"]) == without_times(first["splits"]["unseen"])
@@ -127,9 +119,7 @@ def test_other_splits_are_scored_without_training_again(
 
 
 @pytest.mark.parametrize("stop", [1, 7, 12])
-def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
-    stop: int, trained_job, make_job, tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(stop, trained_job, make_job, tmp_path, monkeypatch):
     whole, cut = trained_job, make_job(folder=tmp_path / "cut")
     step = GaussianSession.step
 
@@ -161,9 +151,7 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
         ("job.json", {"seconds": []}, "seconds: is not as neeco writes it"),
     ],
 )
-def test_damaged_files_of_a_job_are_reported_by_file_and_field(
-    name: str, change: dict, reported: str, finished_job
-) -> None:
+def test_damaged_files_of_a_job_are_reported_by_file_and_field(name, change, reported, finished_job):
     file = finished_job.folder / name
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     with pytest.raises(NeecoError, match=f"{name}: {reported}.*remove that run's folder"):
@@ -265,11 +253,12 @@ def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytes
     ],
 )
 def test_a_folder_of_another_job_is_refused_before_any_work(
-    make_job, finished_job, tmp_path, changes, reported, monkeypatch
+    make_job, finished_job, tmp_path, changes, reported
 ) -> None:
-    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained"))
+    other = make_job(seed=1)
     with pytest.raises(NeecoError, match=f"{reported}; give another --output"):
-        run_jobs([make_job(seed=1), make_job(**changes)])
+        run_jobs([other, make_job(**changes)])
+    assert not other.folder.exists()
     with pytest.raises(NeecoError, match="capture: begun with"):
         run_jobs([replace(finished_job, capture=tmp_path / "other")])
 
@@ -293,7 +282,6 @@ def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, monkeypatc
 )
 def test_workers_have_a_gpu_each(workers: int, device: str, reported: str, monkeypatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     check_workers(workers, torch.device("cpu"))
     check_workers(1, torch.device(device))
     with pytest.raises(NeecoError, match=reported) if reported else contextlib.nullcontext():
@@ -316,10 +304,8 @@ def test_a_task_on_a_node_sees_the_gpu_it_was_given(monkeypatch) -> None:
     assert workers.work_on_node(seen_gpu, None, None, 1, os.getcwd()) == "1"
 
 
-@pytest.mark.parametrize(("visible", "seen"), [("", {"0", "1"}), ("4,5", {"4", "5"})])
-@pytest.mark.parametrize("shared", [None, 2])
+@pytest.mark.parametrize(("shared", "visible", "seen"), [(None, "4,5", {"4", "5"}), (2, "", {"0", "1"})])
 def test_tasks_here_see_a_gpu_each_or_share_them_where_they_are_small(shared, visible, seen, monkeypatch) -> None:
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     count = 3 if shared else 2
@@ -390,8 +376,7 @@ def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(where, make_jo
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="a worker's checkpoint is waited for")
-def test_interrupted_workers_leave_their_checkpoints(make_job, tmp_path, monkeypatch) -> None:
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+def test_interrupted_workers_leave_their_checkpoints(make_job, tmp_path) -> None:
     values = {"checkpoint_interval": 10**6, "iterations": 5000}
     jobs = [make_job(seed=seed, values=values, folder=tmp_path / str(seed)) for seed in (0, 1)]
 

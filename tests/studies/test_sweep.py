@@ -92,9 +92,7 @@ def test_every_configuration_seed_and_split_has_a_row_with_its_scores(capture: P
     )
 
 
-def test_interrupted_it_goes_on_and_trains_only_what_is_missing(
-    capture: Path, study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_interrupted_it_goes_on_and_trains_only_what_is_missing(capture, study, tmp_path, monkeypatch, capsys):
     whole, output = tmp_path / "whole", tmp_path / "out"
     assert sweep(capture, study, whole, "--seeds", "1") == 0
     step, steps = GaussianSession.step, [0]
@@ -128,9 +126,7 @@ def test_more_configurations_and_seeds_are_added(capture: Path, study: Path, tmp
     assert len(rows_of(output)) == 12
 
 
-def test_a_failed_run_has_its_reason_in_its_place_and_the_status_is_1(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failed_run_has_its_reason_in_its_place_and_the_status_is_1(capture, tmp_path, monkeypatch, capsys):
     step = GaussianSession.step
 
     def diverging(session: GaussianSession):
@@ -287,9 +283,7 @@ def test_directions_agree_when_the_signs_do(ours: float | None, published: float
         ("configurations: [", "line 2: not valid YAML"),
     ],
 )
-def test_a_wrong_field_of_a_study_is_one_line_with_file_and_field(
-    text: str, reported: str, capture: Path, study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_field_of_a_study_is_one_line_with_file_and_field(text, reported, capture, study, tmp_path, capsys):
     if "iterations" not in text and "minutes" not in text:
         text = f"{text}\niterations: 5" if text else ""
     study.write_text(text)
@@ -320,9 +314,7 @@ def test_a_wrong_field_of_a_study_is_one_line_with_file_and_field(
         (["--methods", "3dgs", "--iterations", "5", "--set", "deformation.wide=3"], "--set deformation.wide: no such"),
     ],
 )
-def test_what_cannot_be_compared_is_refused_in_one_line_before_any_work(
-    words: list[str], reported: str, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_compared_is_refused_in_one_line_before_any_work(words, reported, capture, tmp_path, capsys):
     assert main(["compare", str(capture), *words, "--output", str(tmp_path / "out")]) == 1
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert re.search(reported, line)
@@ -379,9 +371,7 @@ def test_settings_reach_the_methods_that_have_them(capture: Path, tmp_path: Path
     assert configs["3dgs"]["deformation"] == {}
 
 
-def test_a_cluster_without_ray_is_refused_before_anything_is_written(
-    capture: Path, study: Path, tmp_path, monkeypatch, capsys
-) -> None:
+def test_a_cluster_without_ray_is_refused_before_anything_is_written(capture, study, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")
     monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
     assert sweep(capture, study, tmp_path / "out", "--workers", "2") == 1

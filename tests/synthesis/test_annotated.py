@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from folder_contents import contents
 from PIL import Image
 from rod_world import CAMERA, FakeRun, make_scene, rod_state
 
@@ -80,10 +81,6 @@ def made(recorded: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 def layers(scene: GaussianScene, state: State) -> LayeredDrawing:
     return draw_layers(scene, CompositedLabels(scene), state, CAMERA, 0.01, tissue_image=True)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def test_an_image_supports_a_right_label_and_not_a_wrong_one(scene: GaussianScene) -> None:
@@ -211,13 +208,7 @@ def test_a_frame_that_is_not_trusted_is_listed_and_not_written(made: Path) -> No
     assert "http" not in page.replace("http://www.w3.org/", "")
 
 
-def test_files_are_numbered_anew_and_the_card_and_the_command_say_so(
-    made: Path,
-    recorded: RecordedRun,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_files_are_numbered_anew_and_the_card_and_the_command_say_so(made, recorded, tmp_path, monkeypatch, capsys):
     words = " ".join((made / "README.md").read_text().split())
     assert "Files are numbered anew: the field `frame` of `states.jsonl` has the name" in words
     trusted = SimpleNamespace(**vars(recorded), capture=recorded.capture, require_trusted=lambda verb: None)
@@ -230,9 +221,7 @@ def test_files_are_numbered_anew_and_the_card_and_the_command_say_so(
     ]
 
 
-def test_the_same_again_gives_the_same_bytes_and_so_does_going_on(
-    made: Path, recorded: RecordedRun, tmp_path: Path
-) -> None:
+def test_the_same_again_gives_the_same_bytes_and_so_does_going_on(made, recorded, tmp_path):
     def stop(done: int, total: int) -> None:
         if done == 4:
             raise KeyboardInterrupt
@@ -282,12 +271,11 @@ def test_a_recording_that_changed_is_not_gone_on_with(made: Path, recorded: Reco
         annotate_capture(changed, begun, resume=True)
 
 
-def test_recorded_images_and_labels_are_written_as_large_as_asked_and_through_the_lens(
-    recorded: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    few = replace(recorded, recording=replace(recorded.recording, frames=recorded.recording.frames[2:4]))
+def test_recorded_images_and_labels_are_written_as_large_as_asked_and_through_the_lens(recorded, tmp_path):
+    scene, recording = copy(recorded.scene), replace(recorded.recording, frames=recorded.recording.frames[2:4])
     lens = Lens(50.0, 50.0, 32.0, 24.0, (-0.3, 0.1, 0.0, 0.0), (64, 48), border=(32.0, 24.0, 31.0))
-    monkeypatch.setattr(few.scene, "recorded", replace(few.scene.recorded, lens=lens))
+    scene.recorded = replace(scene.recorded, lens=lens)
+    few = replace(recorded, scene=scene, recording=recording)
     annotate_capture(few, tmp_path / "large", images=ImageSettings(scale=2.0, image_format="jpg"), formats=())
     annotate_capture(few, tmp_path / "bent", images=ImageSettings(lens=True), formats=())
     pixels = read_image(tmp_path / "large/images/000000.jpg").permute(2, 0, 1)

@@ -89,9 +89,7 @@ def test_half_of_the_images_show_a_background_and_labels_stay(scene: GaussianSce
     assert kinds == {"0.png", None}
 
 
-def test_half_of_the_images_take_on_the_colours_of_other_frames_and_labels_stay(
-    scene: GaussianScene, tmp_path: Path
-) -> None:
+def test_half_of_the_images_take_on_the_colours_of_other_frames_and_labels_stay(scene, tmp_path):
     folder = tmp_path / "frames"
     folder.mkdir()
     colors = np.random.default_rng(0).uniform([0.1, 0.3, 0.2], [0.3, 0.9, 0.4], (60, 80, 3))

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from ball_world import ball_scene, run_of
+from folder_contents import contents
 
 from neeco.base.errors import NeecoError
 from neeco.raster.native import torch_threads
@@ -21,10 +22,6 @@ from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 
 SETTINGS = Settings(count=120, seed=1, tissue_tolerance_mm=2.0)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def free_port() -> int:

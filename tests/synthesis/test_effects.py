@@ -269,9 +269,7 @@ def blurred(scene: GaussianScene, state: State, motion: Motion, shutter_s: float
 
 
 @pytest.mark.parametrize(("speed", "seen"), [(60.0, 0.06), (250.0, 0.2)])
-def test_motion_blur_is_the_integral_over_the_exposure(
-    speed: float, seen: float, moving: GaussianScene, tmp_path: Path
-) -> None:
+def test_motion_blur_is_the_integral_over_the_exposure(speed, seen, moving, tmp_path):
     path = effects_file(tmp_path, "shutter_s: 0.05\nsoft_masks: mean\n")
     generator = SampleGenerator.of(moving, replace(SETTINGS, camera_effects=path))
     motion = Motion({"rod": np.array([0, 0, 0.5, speed, 0, 0])}, {"rod": {"jaw_angle": 2.0}}, np.zeros(6))

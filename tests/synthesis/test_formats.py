@@ -181,9 +181,7 @@ def test_imagefolder_has_a_line_for_every_image_and_mask(made: Path) -> None:
     ("names", "classes"),
     [(("near=grasper",), ["grasper", "far"]), (("near=grasper", "far=grasper"), ["grasper"])],
 )
-def test_every_format_has_the_given_names_of_classes(
-    names: tuple[str, ...], classes: list[str], runs: list[FakeRun], tmp_path: Path
-) -> None:
+def test_every_format_has_the_given_names_of_classes(names, classes, runs, tmp_path):
     settings = Settings(count=2, tissue_tolerance_mm=2.0, class_names=names)
     synthesize(runs[0], tmp_path, settings, FORMATS, instrument_runs=runs[1:])  # type: ignore[arg-type]
     coco = json.loads((tmp_path / "coco/instances.json").read_text())
@@ -215,9 +213,7 @@ def test_every_format_has_the_given_names_of_classes(
 
 
 @pytest.mark.parametrize("names", [("nobody=a",), ("near",), ("near=",), ("near=a", "near=b")])
-def test_names_of_classes_that_fit_no_instrument_are_refused(
-    names: tuple[str, ...], runs: list[FakeRun], tmp_path: Path
-) -> None:
+def test_names_of_classes_that_fit_no_instrument_are_refused(names, runs, tmp_path):
     settings = Settings(count=2, tissue_tolerance_mm=2.0, class_names=names)
     with pytest.raises(NeecoError, match=r"--class-names: .* expected INSTRUMENT=CLASS, once for each of near, far"):
         synthesize(runs[0], tmp_path / "set", settings, FORMATS, instrument_runs=runs[1:])  # type: ignore[arg-type]

@@ -113,9 +113,7 @@ def test_the_hub_gets_the_data_set_its_card_and_nothing_else(hub: Hub, dataset: 
     assert hub.files == {name: (dataset / name).read_bytes() for name in names}
 
 
-def test_whoever_is_not_logged_in_learns_it_before_anything_is_rendered(
-    hub: Hub, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_whoever_is_not_logged_in_learns_it_before_anything_is_rendered(hub, monkeypatch):
     monkeypatch.setenv("HF_TOKEN", "hf_expired")
     with pytest.raises(NeecoError, match=r"^--push-to-hub lab/rods: .+; log in with `hf auth login`") as caught:
         check_hub("lab/rods")

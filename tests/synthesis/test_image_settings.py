@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from copy import copy
 from dataclasses import replace
 
 import cv2
@@ -28,12 +29,13 @@ FORMATS = ("coco", "yolo", "webdataset", "imagefolder")
 
 
 @pytest.fixture
-def lens_scene(scene, monkeypatch):
+def lens_scene(scene):
     """Its frames are what the lens's images are once they are undistorted."""
     pinhole = LENS.pinhole((64, 48))
     camera = pinhole.camera(np.eye(4))
     cameras = (camera,) * len(scene.recorded.cameras)
-    monkeypatch.setattr(scene, "recorded", replace(scene.recorded, lens=LENS, cameras=cameras))
+    scene = copy(scene)
+    scene.recorded = replace(scene.recorded, lens=LENS, cameras=cameras)
     return scene
 
 
@@ -135,7 +137,7 @@ def _maps_of(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_data_set_drawn_through_the_lens_says_so(lens_scene, run, tmp_path):
-    output = tmp_path / "dataset"
+    output, run = tmp_path / "dataset", replace(run, scene=lens_scene)
     synthesize(run, output, replace(SETTINGS, lens=True), ("coco",))
     assert json.loads((output / "states.jsonl").read_text().splitlines()[0])["intrinsics"] == LENS.intrinsics_json()
     planes = {name: read_labels(output / name / "000000.png") for name in ("parts", "masks")}

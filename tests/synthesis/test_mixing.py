@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,9 +99,7 @@ def test_the_light_is_that_of_the_tissue_and_shafts_are_matched(near: GaussianSc
     assert Mixture.of(tissue, [tissue]).gains == ((1.0, 1.0, 1.0),)
 
 
-def test_instruments_in_each_other_are_refused_but_not_those_recorded_so(
-    near: GaussianScene, far: GaussianScene
-) -> None:
+def test_instruments_in_each_other_are_refused_but_not_those_recorded_so(near, far):
     mixed = Mixture.of(near, [near, far]).scene
     labeller = CompositedLabels(mixed)
     groups = (frozenset({"near"}), frozenset({"far"}))
@@ -113,9 +110,7 @@ def test_instruments_in_each_other_are_refused_but_not_those_recorded_so(
         assert Acceptance(0.0, None, recorded_together=(groups[0] | groups[1],)).refusal(drawing) is None
 
 
-def test_a_mixed_data_set_is_made_by_any_number_of_workers_with_the_same_bytes(
-    near: GaussianScene, far: GaussianScene, tmp_path: Path
-) -> None:
+def test_a_mixed_data_set_is_made_by_any_number_of_workers_with_the_same_bytes(near, far, tmp_path):
     tissue, first, second = (
         run_of(scene, tmp_path / name)
         for name, scene in (("tissue", ball_scene("own", [(0, 0, 50)], wall=110.0)), ("near", near), ("far", far))
@@ -158,9 +153,7 @@ def test_what_cannot_be_mixed_is_told(near: GaussianScene, scene: GaussianScene)
         (["--tissue", "b", "--instruments", "c", "--count", "2"], "b: no such run folder"),
     ],
 )
-def test_the_command_line_asks_for_one_or_the_other(
-    words: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_line_asks_for_one_or_the_other(words, told, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["synthesize", *words, "--output", str(tmp_path / "out")]) == 1
     error = capsys.readouterr().err.strip()

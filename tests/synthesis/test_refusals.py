@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from folder_contents import contents
 
 import neeco.base.files
 from neeco.base.errors import NeecoError
@@ -17,10 +18,6 @@ from neeco.synthesis.generator import Acceptance, SampleGenerator
 from neeco.synthesis.settings import Settings
 
 SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0, max_attempts=3)
-
-
-def contents(folder) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def refusing(reasons, monkeypatch) -> None:
@@ -41,20 +38,18 @@ def behind_the_camera(state, path) -> str:
         ("nowhere.jsonl", "nowhere.jsonl: no such file; --states takes"),
         ("bad.jsonl", "bad.jsonl: line 1: not valid JSON"),
         ("behind.jsonl", "behind.jsonl: every state was refused .*leaves the image.*; correct its poses"),
-        ("interpolate", "image 0: no acceptable state in 3 attempts"),
+        ("interpolate", r"image 0: no acceptable state in 3 attempts \(leaves the image: 3\)"),
     ],
 )
-def test_a_refused_data_set_leaves_the_disk_as_it_was(there, states, told, run, tmp_path, state, monkeypatch):
+def test_a_refused_data_set_leaves_the_disk_as_it_was(there, states, told, run, tmp_path, state):
     (tmp_path / "bad.jsonl").write_text("{\n")
     behind_the_camera(state, tmp_path / "behind.jsonl")
-    if states == "interpolate":
-        refusing(["leaves the image"] * 3, monkeypatch)
     output = tmp_path / "new" / "dataset"
     if there:
         output.mkdir(parents=True)
-    given = states if states == "interpolate" else str(tmp_path / states)
+    asked = {"min_share": 0.9} if states == "interpolate" else {"states": str(tmp_path / states)}
     with pytest.raises(NeecoError, match=told):
-        synthesize(run, output, replace(SETTINGS, states=given))
+        synthesize(run, output, replace(SETTINGS, **asked))
     if there:
         assert list(output.iterdir()) == []
     else:

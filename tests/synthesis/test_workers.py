@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from ball_world import ball_scene, run_of
+from folder_contents import contents
 
 from neeco.base.errors import NeecoError
 from neeco.base.workers import Processes
@@ -32,11 +33,7 @@ def alone(ball_run, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return output
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-def test_a_killed_worker_costs_only_its_images(ball_run, alone: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_killed_worker_costs_only_its_images_and_ctrl_c_stops_all_and_goes_on(ball_run, alone, tmp_path, monkeypatch):
     started = []
     real = Processes.start_worker
 
@@ -44,40 +41,22 @@ def test_a_killed_worker_costs_only_its_images(ball_run, alone: Path, tmp_path: 
         started.append(real(pool))
         return started[-1]
 
-    def kill_the_first(done: int) -> None:
+    def disturb(done: int) -> None:
         if done == 2:
             started[0].process.kill()
             started[0].process.join()  # while it ends, the other one may do all the rest
             (tmp_path / "set/images/.unfinished-killed.png").write_bytes(b"half")  # as a killed worker may leave it
-
-    monkeypatch.setattr(Processes, "start_worker", start)
-    with torch_threads(1):
-        made = synthesize(ball_run, tmp_path / "set", SETTINGS, on_progress=kill_the_first, workers=2)
-    assert len(started) == 3
-    assert made.images == 10
-    assert contents(tmp_path / "set") == contents(alone)
-
-
-def test_interrupted_it_stops_its_workers_and_goes_on(ball_run, alone: Path, tmp_path: Path, monkeypatch) -> None:
-    started = []
-    real = Processes.start_worker
-
-    def start(pool):
-        worker = real(pool)
-        started.append(worker.process)
-        return worker
-
-    def interrupt(done: int) -> None:
-        if done == 3:
+        if done == 8:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(Processes, "start_worker", start)
     with torch_threads(1), pytest.raises(KeyboardInterrupt):
-        synthesize(ball_run, tmp_path / "set", SETTINGS, on_progress=interrupt, workers=2)
-    assert not any(process.is_alive() for process in started)
+        synthesize(ball_run, tmp_path / "set", SETTINGS, on_progress=disturb, workers=2)
+    assert len(started) == 3
+    assert not any(worker.process.is_alive() for worker in started)
     with torch_threads(1):
         resumed = synthesize(ball_run, tmp_path / "set", SETTINGS, resume=True)  # by any number of processes
-    assert resumed.made_now <= 7
+    assert resumed.made_now <= 2
     assert contents(tmp_path / "set") == contents(alone)
 
 

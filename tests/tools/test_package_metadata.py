@@ -20,9 +20,7 @@ def package_metadata(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return package_metadata
 
 
-def test_links_of_the_page_on_an_index_lead_to_the_files_of_the_version(
-    package_metadata: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_links_of_the_page_on_an_index_lead_to_the_files_of_the_version(package_metadata, monkeypatch):
     monkeypatch.setenv("GITHUB_SERVER_URL", "https://forge.example")
     monkeypatch.setenv("GITHUB_REPOSITORY", "surgery/neeco")
     fields = package_metadata.dynamic_metadata({}, {"version": "9.1"})

@@ -89,9 +89,7 @@ def test_instruments_stand_before_the_tissue_of_another_scene() -> None:
     assert torch.equal(joined.canonical.means[rows], other.canonical.means[~other.canonical.of_instruments])
 
 
-def test_footage_over_another_tissue_in_another_world_is_tracked(
-    tracked_run: RecordedRun, other_footage: Capture, other_tissue: GaussianRun, tmp_path: Path
-) -> None:
+def test_footage_over_another_tissue_in_another_world_is_tracked(tracked_run, other_footage, other_tissue, tmp_path):
     tracked = track_footage(tracked_run, other_footage, tmp_path / "out", tissue=other_tissue, min_trust=0.2)
     assert tracked.written == COUNT
     for k, rec in enumerate(tracked.records):
@@ -111,9 +109,7 @@ def test_footage_over_another_tissue_in_another_world_is_tracked(
 
 
 @pytest.mark.parametrize("what", ["no instrument", "black"])
-def test_footage_without_the_instrument_is_trusted_nowhere(
-    tracked_run: RecordedRun, other_footage: Capture, other_tissue: GaussianRun, tmp_path: Path, what: str
-) -> None:
+def test_footage_without_the_instrument_is_trusted_nowhere(tracked_run, other_footage, other_tissue, tmp_path, what):
     wall = TissueRenderer(other_wall()).render(CAMERA, None)
     frames = []
     for frame in other_footage.frames[:2]:

@@ -13,7 +13,7 @@ from grasper_world import RecordedRun, moving, record
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_json
 from neeco.capture import read_capture, write_capture
-from neeco.capture.model import Capture, InstrumentState, State
+from neeco.capture.model import InstrumentState, State
 from neeco.tracking import refine
 from neeco.training.session import trust_of
 
@@ -46,9 +46,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return given
 
 
-def test_tracked_frames_join_the_recorded_ones(
-    tracked_run: RecordedRun, tracked: Path, tmp_path: Path, asked: dict[str, Any]
-) -> None:
+def test_tracked_frames_join_the_recorded_ones(tracked_run, tracked, tmp_path, asked):
     output = tmp_path / "refined"
     assert refine.refine_run(tracked_run, [tracked], output, device=CPU) == output / "run"
     assert asked["capture"] == output / "capture"
@@ -106,9 +104,7 @@ def test_recorded_states_are_fitted_to_their_images(tracked_run: RecordedRun) ->
     assert kept.state is test.state  # what is scored stays as recorded
 
 
-def test_captures_that_do_not_belong_to_the_run_are_refused(
-    tracked_run: RecordedRun, tracked: Path, footage: Capture, tmp_path: Path
-) -> None:
+def test_captures_that_do_not_belong_to_the_run_are_refused(tracked_run, tracked, footage, tmp_path):
     bare = replace(footage, frames=tuple(replace(f, state=State({}, f.state.time)) for f in footage.frames))
     write_capture(bare, tmp_path / "bare")
     with pytest.raises(NeecoError, match="does not state 'grasper'"):

@@ -214,9 +214,7 @@ def judged_by(
     ("own", "gain", "verdict"),
     [(30.0, 20.0, Verdict.ACCEPTED), (30.0, 40.0, Verdict.REFITTED), (-30.0, -5.0, Verdict.ACCEPTED)],
 )
-def test_a_state_refutes_another_only_if_more_of_the_image_is_explained(
-    own: float, gain: float, verdict: Verdict, tmp_path: Path
-) -> None:
+def test_a_state_refutes_another_only_if_more_of_the_image_is_explained(own, gain, verdict, tmp_path):
     """One that hardly shows in the image leaves little unexplained there; one with a negative gain explains nothing."""
     search = search_of(session_of(tmp_path, TRUE))
     given = search.scene.recorded.states[5]
@@ -230,9 +228,7 @@ def test_a_state_refutes_another_only_if_more_of_the_image_is_explained(
 
 
 @pytest.mark.parametrize(("gain", "verdict"), [(50.0, Verdict.ACCEPTED), (35.0, Verdict.REFITTED)])
-def test_a_local_minimum_of_the_fit_from_a_recorded_state_does_not_refute_it(
-    gain: float, verdict: Verdict, tmp_path: Path
-) -> None:
+def test_a_local_minimum_of_the_fit_from_a_recorded_state_does_not_refute_it(gain, verdict, tmp_path):
     """Fits from starts nearby speak for the recorded state, too."""
     search = search_of(session_of(tmp_path, TRUE))
     given, layout = search.scene.recorded.states[5], search.refinement.layout
@@ -285,9 +281,7 @@ def test_an_instrument_outside_of_the_image_is_refuted_only_by_one_that_explains
     assert judged_by(search, explained) == verdict
 
 
-def test_no_frame_is_left_out_later_because_others_are_explained_ever_better(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_frame_is_left_out_later_because_others_are_explained_ever_better(tmp_path, monkeypatch):
     search = search_of(session_of(tmp_path, TRUE))
     given, limits = search.scene.recorded.states[5], replace(Misfits.of(search), limit=1.0, rejection_limit=4.0)
     monkeypatch.setattr(Misfits, "of", lambda search: limits)
@@ -299,9 +293,7 @@ def test_no_frame_is_left_out_later_because_others_are_explained_ever_better(
 
 
 @pytest.mark.parametrize(("misfit", "included"), [(0.22, True), (0.4, False)])
-def test_deviations_of_a_state_fitted_anew_include_states_that_its_image_does_not_refute(
-    misfit: float, included: bool, tmp_path: Path
-) -> None:
+def test_deviations_of_a_state_fitted_anew_include_states_that_its_image_does_not_refute(misfit, included, tmp_path):
     search, fits = search_of(session_of(tmp_path, TRUE)), 0
     given, refinement = search.scene.recorded.states[5], search.refinement
 
@@ -439,9 +431,7 @@ def test_the_size_of_stated_errors_is_told_in_those_of_a_robot(tmp_path: Path) -
         assert search_of(session_of(tmp_path / str(size), states)).stated_scale() == pytest.approx(size, rel=0.1)
 
 
-def test_a_shape_that_carving_no_longer_finds_goes_on_as_learned(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_shape_that_carving_no_longer_finds_goes_on_as_learned(tmp_path, monkeypatch):
     """States of few frames may be too far off for carving, while the learned shape explains their images."""
 
     def none(*given: object) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from folder_contents import contents
 from grasper_world import CAMERA, FRAMES, GRASPER, RecordedRun, grasper_state, moving, record, withheld
 
 from neeco.base.errors import NeecoError
@@ -39,10 +39,6 @@ def off(found: State, true: State) -> tuple[float, float, float]:
     angle = math.acos(max(-1.0, min(1.0, (float(turn.diagonal().sum()) - 1) / 2)))
     jaw = abs(a.joints["jaw_angle"] - b.joints["jaw_angle"])
     return angle / DEG, float((a.pose[:3, 3] - b.pose[:3, 3]).norm()), jaw / DEG
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -178,9 +174,7 @@ def test_smoke_and_exposure_are_taken_out_by_the_tissue(tracked_run: RecordedRun
 
 
 @pytest.mark.parametrize("spoil", [torch.zeros_like, lambda pixels: 1 - pixels, lambda pixels: pixels.flip(0)])
-def test_colours_that_are_not_the_tissues_stay_as_they_are(
-    tracked_run: RecordedRun, spoil: Callable[[torch.Tensor], torch.Tensor]
-) -> None:
+def test_colours_that_are_not_the_tissues_stay_as_they_are(tracked_run, spoil):
     tissue = TissueRenderer(tracked_run.scene).render(CAMERA, None)
     image = spoil(tissue)
     assert torch.equal(color_matched(image, tissue, torch.ones(64, 96)), image)
@@ -240,9 +234,7 @@ def test_footage_of_which_few_frames_are_trusted_is_doubtful(footage: Capture, w
     assert (f"in {10 - written} of 10 frames nothing was found" in found.verdict) == (written < 10)
 
 
-def test_an_instrument_is_found_where_nothing_is_known(
-    tracked_run: RecordedRun, footage: Capture, tmp_path: Path
-) -> None:
+def test_an_instrument_is_found_where_nothing_is_known(tracked_run, footage, tmp_path):
     bare = tuple(replace(frame, state=State({}, frame.state.time)) for frame in footage.frames[2:5])
     found = track_footage(tracked_run, replace(footage, frames=bare), tmp_path / "found")
     assert found.written == 3
@@ -253,9 +245,7 @@ def test_an_instrument_is_found_where_nothing_is_known(
         assert jaw < 2.5
 
 
-def test_footage_without_the_instrument_is_trusted_nowhere(
-    tracked_run: RecordedRun, footage: Capture, tmp_path: Path
-) -> None:
+def test_footage_without_the_instrument_is_trusted_nowhere(tracked_run, footage, tmp_path):
     wall = TissueRenderer(tracked_run.scene).render(CAMERA, None)
     frames = []
     for k, pixels in enumerate((wall, torch.zeros_like(wall), 1 - wall)):
@@ -270,9 +260,7 @@ def test_footage_without_the_instrument_is_trusted_nowhere(
         tracked.require_trusted()
 
 
-def test_what_was_broken_off_goes_on_to_the_same_bytes(
-    tracked_run: RecordedRun, footage: Capture, tracked: Tracked, tmp_path: Path
-) -> None:
+def test_what_was_broken_off_goes_on_to_the_same_bytes(tracked_run, footage, tracked, tmp_path):
     output = tmp_path / "capture"
 
     def stop(done: int, total: int) -> None:
@@ -293,9 +281,7 @@ def test_what_was_broken_off_goes_on_to_the_same_bytes(
     assert contents(output) == whole
 
 
-def test_frames_are_chosen_by_another_trust_without_tracking_again(
-    tracked_run: RecordedRun, footage: Capture, tracked: Tracked, tmp_path: Path
-) -> None:
+def test_frames_are_chosen_by_another_trust_without_tracking_again(tracked_run, footage, tracked, tmp_path):
     output = tmp_path / "capture"
     shutil.copytree(tracked.output, output)
     info = json.loads((output / "track.json").read_text())
@@ -360,9 +346,7 @@ def test_a_trust_that_is_no_share_is_reported(tracked: Tracked, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(("share", "how"), [(0.5, "followed"), (1.5, "beside")])
-def test_another_state_is_taken_only_if_it_explains_more_of_the_image(
-    tracked_run: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, how: str
-) -> None:
+def test_another_state_is_taken_only_if_it_explains_more_of_the_image(tracked_run, tmp_path, monkeypatch, share, how):
     """One that hardly shows in the image leaves little unexplained."""
     frames = record(tracked_run.scene, tmp_path, [moving(0), moving(1)], "new").frames
     follower = Follower.of(frames, fitter_of(tracked_run.scene), Reference(TypicalErrors(0.02, 0.02), 1e-3, 1.0))
@@ -375,9 +359,7 @@ def test_another_state_is_taken_only_if_it_explains_more_of_the_image(
 
 
 @pytest.mark.parametrize(("x", "shown"), [(0.0, True), (44.0, False)])
-def test_an_opening_that_the_image_does_not_show_is_not_trusted(
-    tracked_run: RecordedRun, tmp_path: Path, x: float, shown: bool
-) -> None:
+def test_an_opening_that_the_image_does_not_show_is_not_trusted(tracked_run, tmp_path, x, shown):
     true, given = grasper_state(x, jaw=0.9), grasper_state(x, jaw=0.8)
     frame = record(tracked_run.scene, tmp_path, [true], "new").frames[0]
     reference = Reference(TypicalErrors(0.02, 0.02), 0.1, 1.0)

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -17,6 +18,8 @@ from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, Poi
 from neeco.capture.writer import write_capture as write_folder
 from neeco.geometry.rotations import rigid_from_vector, rotate_about
 from neeco.raster import Camera, Gaussians, rasterize
+from neeco.training.config import TrainConfig
+from neeco.training.train import ProgressRow, train
 
 FRAMES = 8
 PIVOT_MM, WRIST_MM = 6.0, -3.0  # along the grasper's shaft, which is z of its frame
@@ -50,6 +53,22 @@ def write_capture(root: Path, *, instruments: bool = True) -> Path:
     document["instruments"] = [{"name": "grasper", "joints": {"jaw_angle": {"limits": [0, 1.5]}}}]
     (root / "transforms.json").write_text(json.dumps(document))
     return root
+
+
+def train_interrupted(capture: Path, folder: Path, config: TrainConfig, stop: int) -> tuple[Path, Path]:
+    """An uninterrupted run, and one that stopped after `stop` iterations and was resumed; both have the same scene."""
+
+    def interrupt(row: ProgressRow) -> None:
+        if row.iteration == stop and not row.note:
+            raise KeyboardInterrupt
+
+    whole = train(capture, folder / "whole", config)
+    with pytest.raises(KeyboardInterrupt):
+        train(capture, folder / "cut", config, progress=interrupt)
+    assert not (folder / "cut" / "scene.safetensors").exists()
+    resumed = train(capture, folder / "cut", config, resume=True)
+    assert (resumed / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
+    return whole, resumed
 
 
 def write_grasper(root: Path, *, frames: int = 24, sizes: tuple[tuple[int, int], ...] = ((80, 64),)) -> Path:

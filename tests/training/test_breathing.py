@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from capture_files import train_interrupted
 
 from neeco.capture.model import Frame, State
 from neeco.methods.breathing import BREATHING, Breathing, find_breathing, find_period
@@ -17,7 +18,6 @@ from neeco.scene import GaussianScene, Recorded
 from neeco.scene.canonical import seed_gaussians
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
-from neeco.training.train import ProgressRow, train
 
 PERIOD, SWING = 3.1, (1.0, 0.6, 2.0)  # s, mm
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=60.0, fy=60.0, cx=32.0, cy=24.0, width=64, height=48)
@@ -104,16 +104,8 @@ def test_an_interrupted_run_goes_on_breathing(capture: Path, tmp_path: Path, mon
         tissue = 10 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
         self.start_breathing(Breathing.of(tissue, 0.2, torch.full((2 * BREATHING.n_harmonics, 3), 0.5), 0.1))
 
-    def interrupt(row: ProgressRow) -> None:
-        if row.iteration == 15 and not row.note:
-            raise KeyboardInterrupt
-
     monkeypatch.setattr(Static, "begin", begin)
     config = training_config(
         "3dgs", {"iterations": 30}, ["density_start=10", "log_interval=5", "checkpoint_interval=10"]
     )
-    whole = train(capture, tmp_path / "whole", config)
-    with pytest.raises(KeyboardInterrupt):
-        train(capture, tmp_path / "cut", config, progress=interrupt)
-    resumed = train(capture, tmp_path / "cut", config, resume=True)
-    assert (resumed / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
+    train_interrupted(capture, tmp_path, config, 15)

@@ -105,9 +105,7 @@ def session_on_meta(method: str, batch_size: int) -> GaussianSession:
 @pytest.mark.parametrize(
     ("method", "batch_size"), [*((name, 1) for name, kind in methods().items() if kind.has_gaussians), ("nps", 3)]
 )
-def test_a_step_asks_the_device_once_and_copies_nothing_there(
-    method: str, batch_size: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_asks_the_device_once_and_copies_nothing_there(method, batch_size, monkeypatch):
     asked: list[int] = []
 
     def numbers(*scalars: Tensor) -> list[float]:

@@ -162,9 +162,7 @@ def test_the_colours_border_is_found_to_a_fraction_of_the_radius(session: Gaussi
     assert found == pytest.approx(WRIST_MM + 0.75, abs=1.0)
 
 
-def test_a_wrist_found_again_moves_unless_spinning_then_costs_more(
-    session: GaussianSession, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrist_found_again_moves_unless_spinning_then_costs_more(session, monkeypatch):
     monkeypatch.setattr(wrist, "WRIST", WristSettings(spin_angle=math.pi / 4))  # the rings have eight Gaussians each
     hinges = hinges_of(session)
     hinges.wrist_start.fill_(3.0)

@@ -25,9 +25,7 @@ def test_a_former_name_trains_the_method_of_today() -> None:
     assert [current_name(name) for name in ("nps", "kinematic", "nothing")] == ["nps", "kinematic", "nothing"]
 
 
-def test_a_run_of_a_former_name_is_continued_under_either(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_of_a_former_name_is_continued_under_either(capture, tmp_path, capsys):
     run = tmp_path / "run"
     flags = ["train", str(capture), "--output", str(run), "--iterations", "4", "--set", SMALL[0], "--set", SMALL[1]]
     assert main([*flags, "--method", "neeco"]) == 0

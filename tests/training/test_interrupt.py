@@ -15,12 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from capture_files import write_capture
 
 from neeco.base.errors import NeecoError
 from neeco.cli import main
 from neeco.training import train as module
 from neeco.training.config import training_config
-from neeco.training.run import load_run, read_checkpoint
+from neeco.training.run import checkpoint_path, load_run, read_checkpoint
 from neeco.training.session import GaussianSession
 from neeco.training.train import ProgressRow, deferred_interrupts, train
 
@@ -39,12 +40,15 @@ def signalling(stop: int, *signals: int):
     return call
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("stop", [1, 37])
-def test_a_stopped_run_keeps_its_last_step_and_ends_in_the_same_bytes(
-    number: int, stop: int, capture: Path, tmp_path: Path
-) -> None:
-    whole = train(capture, tmp_path / "whole", CONFIG)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted run of `CONFIG` on what `capture` holds."""
+    folder = tmp_path_factory.mktemp("whole")
+    return train(write_capture(folder / "capture"), folder / "run", CONFIG)
+
+
+@pytest.mark.parametrize(("number", "stop"), [(signal.SIGINT, 37), (signal.SIGTERM, 1)])
+def test_a_stopped_run_keeps_its_last_step_and_ends_in_the_same_bytes(number, stop, whole, capture, tmp_path):
     handlers = signal.getsignal(signal.SIGINT), signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt, match=f"at iteration {stop}; go on with: neeco train .* --resume"):
@@ -78,32 +82,26 @@ def test_rows_after_going_on_average_over_the_steps_before_the_stop_too(capture:
     assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
 
 
-def test_a_second_ctrl_c_stops_at_once(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    saved: list[int] = []
-    monkeypatch.setattr(module, "save_checkpoint", lambda session, run: saved.append(session.iteration))
+def test_a_second_ctrl_c_stops_at_once(capture: Path, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt, match="at iteration 12; go on with"):
         train(capture, tmp_path / "run", CONFIG, progress=signalling(12, signal.SIGINT, signal.SIGINT))
-    assert saved == []
+    assert not checkpoint_path(tmp_path / "run").exists()
 
 
-def test_ctrl_c_while_finishing_loses_no_step(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
+def test_ctrl_c_while_finishing_loses_no_step(whole: Path, capture: Path, tmp_path: Path) -> None:
+    def interrupt(row: ProgressRow) -> None:
+        if row.note.startswith("finishing"):
+            raise KeyboardInterrupt
 
-    whole = train(capture, tmp_path / "whole", CONFIG)
-    with monkeypatch.context() as patched:
-        patched.setattr(GaussianSession, "finish", interrupted)
-        with pytest.raises(KeyboardInterrupt, match="while finishing; go on with"):
-            train(capture, tmp_path / "cut", CONFIG)
+    with pytest.raises(KeyboardInterrupt, match="while finishing; go on with"):
+        train(capture, tmp_path / "cut", CONFIG, progress=interrupt)
     steps: list[int] = []
     train(capture, tmp_path / "cut", CONFIG, resume=True, progress=lambda row: steps.append(row.iteration))
     assert set(steps) == {0}  # the note of finishing alone
     assert (tmp_path / "cut" / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
 
 
-def test_ctrl_c_before_the_first_step_leaves_nothing(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ctrl_c_before_the_first_step_leaves_nothing(capture, tmp_path, monkeypatch, capsys):
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 

@@ -127,9 +127,7 @@ def test_every_link_is_seeded_where_it_is(carved: tuple[Evidence, CarvedShape]) 
         assert near - 4 < float(along.median()) < far + 4
 
 
-def test_a_carved_line_is_kept_where_the_links_agree_and_else_theirs_is_taken(
-    carved: tuple[Evidence, CarvedShape],
-) -> None:
+def test_a_carved_line_is_kept_where_the_links_agree_and_else_theirs_is_taken(carved):
     evidence, shape = carved
     links, kept, told = started(carved), session(evidence), session(evidence)
     assert align_to_links(kept, links, evidence, "tool", shape, torch.Generator().manual_seed(0)).seeds is shape.seeds
@@ -222,9 +220,7 @@ def test_links_that_nobody_recorded_open_from_where_they_are_closed() -> None:
         (lambda given: {**given, "pitch": -given["pitch"]}, {"tool.pitch"}, "with the sign of pitch reversed"),
     ],
 )
-def test_readings_that_drive_other_joints_than_they_say_are_doubted(
-    carved: tuple[Evidence, CarvedShape], change: Any, doubted: set[str], words: str
-) -> None:
+def test_readings_that_drive_other_joints_than_they_say_are_doubted(carved, change, doubted, words):
     carved = few_frames(carved, step=6)
     asked = session(carved[0])
     readings = [change(given) for given in readings_of(asked, carved[0], "tool")]
@@ -278,9 +274,7 @@ def pivots_off_mm(asked: Any, links: StatedLinks, evidence: Evidence, true: Evid
 
 @pytest.mark.slow
 @pytest.mark.parametrize("along_mm", [-5.0, 8.0])
-def test_a_frame_that_is_off_along_the_shaft_is_found_and_no_joint_is_called_reversed(
-    carved: tuple[Evidence, CarvedShape], along_mm: float
-) -> None:
+def test_a_frame_that_is_off_along_the_shaft_is_found_and_no_joint_is_called_reversed(carved, along_mm):
     true = few_frames(carved)
     off = moved(true, STILL, torch.from_numpy(shifted(0, 0, along_mm)))
     asked, links = session(off[0]), started(off)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from capture_files import write_capture, write_grasper
-from PIL import Image
+from capture_files import train_interrupted, write_grasper
 from safetensors.torch import load_file, save_file
 
 from neeco.base.errors import NeecoError
@@ -16,7 +15,7 @@ from neeco.cli import main
 from neeco.methods.nerfies.field import NerfScene
 from neeco.scene.io import load_scene, save_scene
 from neeco.training.config import training_config
-from neeco.training.train import ProgressRow, train
+from neeco.training.train import train
 
 SIZES = [
     "rays=32",
@@ -43,31 +42,16 @@ def run(tmp_path: Path) -> Path:
     return train(capture, tmp_path / "run", config_of(iterations=20))
 
 
-def test_two_runs_give_the_same_bytes_and_learn(capture: Path, tmp_path: Path) -> None:
+def test_runs_learn_and_an_interrupted_one_gives_the_same_bytes(capture: Path, tmp_path: Path) -> None:
     config = config_of("fine_samples=4", "appearance=2", iterations=60)
-    scenes = [train(capture, tmp_path / name, config) / "scene.safetensors" for name in ("a", "b")]
-    assert scenes[0].read_bytes() == scenes[1].read_bytes()
-    rows = [json.loads(line) for line in (tmp_path / "a" / "metrics.jsonl").read_text().splitlines()]
+    run, _ = train_interrupted(capture, tmp_path, config, 25)
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows] == list(range(5, 61, 5))
     assert {row["num_gaussians"] for row in rows} == {None}
     assert rows[-1]["psnr"] > rows[0]["psnr"]
 
 
-def test_an_interrupted_run_ends_in_the_same_bytes(capture: Path, tmp_path: Path) -> None:
-    def interrupt(row: ProgressRow) -> None:
-        if row.iteration == 25 and not row.note:
-            raise KeyboardInterrupt
-
-    whole = train(capture, tmp_path / "whole", config_of())
-    with pytest.raises(KeyboardInterrupt):
-        train(capture, tmp_path / "cut", config_of(), progress=interrupt)
-    resumed = train(capture, tmp_path / "cut", config_of(), resume=True)
-    assert (resumed / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
-
-
-def test_frequencies_open_over_the_stated_share_and_the_field_learns_all_its_parts(
-    capture: Path, tmp_path: Path
-) -> None:
+def test_frequencies_open_over_the_stated_share_and_the_field_learns_all_its_parts(capture, tmp_path):
     opened: dict[int, float] = {}
     first: dict[str, torch.Tensor] = {}
 
@@ -104,36 +88,6 @@ def header_of(path: Path) -> dict:
 
     with safe_open(path, framework="pt") as stream:
         return json.loads(stream.metadata()["neeco"])
-
-
-def test_what_a_loss_mask_hides_teaches_nothing(tmp_path: Path) -> None:
-    scenes = []
-    for paint in (0, 255):
-        capture = write_capture(tmp_path / f"capture{paint}")
-        document = json.loads((capture / "transforms.json").read_text())
-        mask = torch.full((24, 32), 255, dtype=torch.uint8)
-        mask[:8, :8] = 0
-        Image.fromarray(mask.numpy()).save(capture / "mask.png")
-        for frame in document["frames"]:
-            frame["mask_path"] = "mask.png"
-            image = Image.open(capture / frame["file_path"])
-            image.paste((paint, paint, paint), (0, 0, 8, 8))
-            image.save(capture / frame["file_path"])
-        (capture / "transforms.json").write_text(json.dumps(document))
-        path = train(capture, tmp_path / f"run{paint}", config_of(iterations=10)) / "scene.safetensors"
-        scenes.append(path.read_bytes())
-    assert scenes[0] == scenes[1]
-
-
-def test_frames_of_one_time_and_the_adjustment_of_gaussians_are_refused(tmp_path: Path) -> None:
-    capture = write_capture(tmp_path / "capture", instruments=False)
-    document = json.loads((capture / "transforms.json").read_text())
-    document["frames"] = [{**frame, "time": 0.5} for frame in document["frames"]]
-    (capture / "transforms.json").write_text(json.dumps(document))
-    with pytest.raises(NeecoError, match=r"time: .* method nerfies needs it"):
-        train(capture, tmp_path / "run", config_of(iterations=5))
-    with pytest.raises(NeecoError, match="nerfies has no Gaussians for the dynamic adjustment"):
-        training_config("nerfies+dta", {})
 
 
 def test_evaluate_and_render_take_the_run_as_any_other(run: Path, tmp_path: Path, capsys) -> None:

@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from capture_files import write_grasper
+from capture_files import train_interrupted, write_grasper
 
 from neeco.base.errors import NeecoError
 from neeco.training.config import training_config
 from neeco.training.run import load_run
-from neeco.training.train import ProgressRow, train
+from neeco.training.train import train
 
 SHORT = ["density_start=10", "log_interval=1", "checkpoint_interval=20", "deformation.carving.tissue_steps=100"]
 SMALL = ["deformation.preset=practical", "deformation.width=16", "deformation.depth=2", *SHORT]
@@ -26,15 +26,7 @@ def grasper(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_runs_repeat_and_resume_and_label_what_moves(grasper: Path, tmp_path: Path) -> None:
-    def interrupt(row: ProgressRow) -> None:
-        if row.iteration == 35 and not row.note:
-            raise KeyboardInterrupt
-
-    first = train(grasper, tmp_path / "first", CONFIG)
-    with pytest.raises(KeyboardInterrupt):
-        train(grasper, tmp_path / "cut", CONFIG, progress=interrupt)
-    cut = train(grasper, tmp_path / "cut", CONFIG, resume=True)
-    assert (first / "scene.safetensors").read_bytes() == (cut / "scene.safetensors").read_bytes()
+    first, _ = train_interrupted(grasper, tmp_path, CONFIG, 35)
     scene = load_run(first).scene
     moved = scene.deltas(scene.recorded.states[0]).means.norm(dim=1)
     channels = scene.deformation.label_channels(scene.canonical)[:, 0]

@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.geometry.projection import project_world
 from neeco.scene.io import load_scene
@@ -113,14 +112,6 @@ def test_limits_follow_the_number_of_pixels_unless_given() -> None:
     assert config.gaussian_limits(100) == config.gaussian_limits(320 * 256) == (20_000, 4_000)
     assert config.gaussian_limits(16 * 320 * 256) == (80_000, 16_000)
     assert training_config("kinematic", {"max_tissue_gaussians": 70}).gaussian_limits(1e6)[0] == 70
-
-
-@pytest.mark.parametrize(
-    "setting", ["resolution.full_size_at=1.5", "resolution.step=1", "resolution.min_side=0", "scale=2"]
-)
-def test_sizes_that_make_no_sense_are_refused(setting: str) -> None:
-    with pytest.raises(NeecoError, match=setting.split("=")[0]):
-        training_config("kinematic", {}, [setting])
 
 
 def test_what_is_learned_from_reduced_images_is_drawn_at_the_recorded_size(capture: Path, tmp_path: Path) -> None:

@@ -47,9 +47,7 @@ def run(capture: Path, tmp_path: Path) -> Path:
         (["--seed", "5", "--iterations", "200"], "begun with 20; --seed 5: the run was begun with 0; leave them out"),
     ],
 )
-def test_a_run_is_not_continued_with_other_settings(
-    flags: list[str], said: str, capture: Path, run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_is_not_continued_with_other_settings(flags, said, capture, run, capsys):
     assert main(["train", str(capture), "--output", str(run), "--resume", *flags]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
@@ -80,9 +78,7 @@ def test_an_adjusted_run_is_continued_by_its_own_name_alone() -> None:
     assert plain.schedule == training_config("3dgs", {}).schedule
 
 
-def test_a_finished_run_of_another_capture_is_not_called_finished(
-    capture: Path, run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_finished_run_of_another_capture_is_not_called_finished(capture, run, capsys):
     Image.new("RGB", (32, 24)).save(capture / "images" / "000003.png")
     assert main(["train", str(capture), "--output", str(run), "--resume"]) == 1
     assert f"{capture} has changed since this run was begun" in capsys.readouterr().err

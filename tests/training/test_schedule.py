@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neeco.training.schedule import DensityPhase, Part, Schedule, ScheduleConfig, order_by_pose
+from neeco.training.schedule import DensityPhase, Schedule, ScheduleConfig, order_by_pose
 
 SPARSE, DENSE = DensityPhase(500, 10_000, 4e-4), DensityPhase(200, 3_000, 2e-4)
 PLAIN = DensityPhase(100, 3_000, 2e-4)
@@ -27,9 +27,7 @@ def in_phase_2(config: ScheduleConfig | None = None, began: int = 2000) -> Sched
     ("name", "constant"),
     [("density_interval", "interval"), ("opacity_reset", "opacity_reset"), ("gradient_threshold", "threshold")],
 )
-def test_each_part_of_density_control_switches_alone(
-    name: str, constant: str, part: Part, first: DensityPhase, second: DensityPhase
-) -> None:
+def test_each_part_of_density_control_switches_alone(name, constant, part, first, second):
     config = ScheduleConfig(**{name: part})
     assert Schedule(config).density() == replace(SPARSE, **{constant: getattr(first, constant)})
     assert in_phase_2(config).density() == replace(DENSE, **{constant: getattr(second, constant)})

@@ -24,28 +24,19 @@ SMALL = {
 }
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_capture_without_times_is_refused_in_one_line(method: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("times", [{3: None}, dict.fromkeys(range(8), 2.5)], ids=["one is missing", "one moment"])
+@pytest.mark.parametrize("method", [*METHODS, "nerfies"])
+def test_a_capture_without_times_is_refused_in_one_line(method, times, tmp_path):
     capture = write_capture(tmp_path / "capture")
-    file = capture / "transforms.json"
-    document = json.loads(file.read_text())
-    del document["frames"][3]["time"]
-    file.write_text(json.dumps(document))
+    document = json.loads((capture / "transforms.json").read_text())
+    for number, time in times.items():
+        document["frames"][number]["time"] = time
+        if time is None:
+            del document["frames"][number]["time"]
+    (capture / "transforms.json").write_text(json.dumps(document))
     with pytest.raises(NeecoError, match=rf"capture: time: .*; method {method} needs it .*, 3dgs does not$"):
         train(capture, tmp_path / "run", training_config(method, {"iterations": 3}))
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_a_single_moment_is_no_recording(method: str, tmp_path: Path) -> None:
-    capture = write_capture(tmp_path / "capture")
-    file = capture / "transforms.json"
-    document = json.loads(file.read_text())
-    for frame in document["frames"]:
-        frame["time"] = 2.5
-    file.write_text(json.dumps(document))
-    with pytest.raises(NeecoError, match="time: "):
-        train(capture, tmp_path / "run", training_config(method, {"iterations": 3}))
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -71,9 +62,7 @@ def test_with_instruments_what_moves_is_labelled_at_the_end(tmp_path: Path) -> N
     assert float(spread[labels[:, 0] == 1].min()) >= float(spread[labels[:, 0] == 0].max()) * 0.99
 
 
-def test_training_disturbs_the_time_until_half_of_the_run_and_drawing_never_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_disturbs_the_time_until_half_of_the_run_and_drawing_never_does(tmp_path, monkeypatch):
     asked: list[tuple[bool, float]] = []
     real = TimeMLP.pose
 

@@ -40,9 +40,7 @@ def changed(trained: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("verb", ["evaluate", "render", "track", "refine"])
-def test_a_capture_that_changed_since_training_is_refused_by_every_verb_that_reads_it(
-    verb: str, changed: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_capture_that_changed_since_training_is_refused_by_every_verb_that_reads_it(verb, changed, capsys):
     output = changed.parent / "output"
     capture = changed.parent / "capture"
     words = {
@@ -79,9 +77,7 @@ def test_masks_to_compare_with_and_another_place_are_no_change(changed: Path) ->
 
 
 @pytest.mark.parametrize("verb", ["annotate", "synthesize"])
-def test_labels_of_a_doubtful_run_are_refused_unless_forced(
-    verb: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_labels_of_a_doubtful_run_are_refused_unless_forced(verb, trained, tmp_path, capsys):
     words = [
         verb,
         str(trained / "run"),

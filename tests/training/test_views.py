@@ -61,9 +61,7 @@ def test_what_is_prefetched_is_copied_once_and_ahead(views: TrainingViews, monke
 
 
 @pytest.mark.parametrize("stays", [True, False])
-def test_pixels_stay_in_the_hosts_memory_where_the_device_is_too_small(
-    stays: bool, views: TrainingViews, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pixels_stay_in_the_hosts_memory_where_the_device_is_too_small(stays, views, monkeypatch):
     size = sum(image.numel() for image in views.images) + views.masks[1].numel()
     free = int(size / module.MAX_MEMORY_SHARE) - 2 if stays else int(size / module.MAX_MEMORY_SHARE) + 2
     moved: list[torch.device] = []

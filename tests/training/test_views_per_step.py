@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from neeco.training.config import TrainConfig, training_config
 from neeco.training.initial import begin_session
 from neeco.training.schedule import due
 from neeco.training.session import GaussianSession
-from neeco.training.train import ProgressRow, train
 
 NEECO = ["deformation.width=16", "deformation.depth=2", "deformation.warm_up=0", "refine.start=0"]
 
@@ -56,9 +54,7 @@ def gradients(session: GaussianSession, monkeypatch: pytest.MonkeyPatch, steps: 
     return seen
 
 
-def test_gradients_are_the_mean_of_single_ones_and_density_counts_every_frame(
-    capture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gradients_are_the_mean_of_single_ones_and_density_counts_every_frame(capture, monkeypatch):
     still = ("schedule.compensation=off", "schedule.frame_order=off", "density_start=50", "refine.frame_poses=true")
     one, two = (begun(capture, config_of(views, assignments=still)) for views in (1, 2))
     torch.nn.init.normal_(one.scene.deformation.head.weight, std=0.1)
@@ -78,24 +74,6 @@ def test_gradients_are_the_mean_of_single_ones_and_density_counts_every_frame(
     assert (two.iteration, two.queue) == (one.iteration, one.queue)
     histories = (torch.tensor(list(session.schedule.history)) for session in (one, two))
     assert torch.allclose(*histories, rtol=1e-4)
-
-
-@pytest.mark.parametrize(("method", "views"), [("3dgs", 2), ("nps", 3)])
-def test_an_interrupted_run_ends_in_the_same_bytes(method: str, views: int, capture: Path, tmp_path: Path) -> None:
-    def interrupt(row: ProgressRow) -> None:
-        if row.iteration == 36 and not row.note:
-            raise KeyboardInterrupt
-
-    config = config_of(views, method)
-    whole = train(capture, tmp_path / "whole", config)
-    with pytest.raises(KeyboardInterrupt):
-        train(capture, tmp_path / "cut", config, progress=interrupt)
-    resumed = train(capture, tmp_path / "cut", config, resume=True)
-    assert (resumed / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
-    rows = [json.loads(line) for line in (resumed / "metrics.jsonl").read_text().splitlines()]
-    steps = range(views, 60 + views, views)
-    assert [row["iteration"] for row in rows] == [step for step in steps if due(5, step - views, step)]
-    assert rows[-1]["psnr"] > rows[0]["psnr"]
 
 
 def test_intervals_fall_due_once_whatever_the_step() -> None:

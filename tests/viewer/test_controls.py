@@ -167,9 +167,7 @@ def test_sliders_go_to_the_limits_that_the_capture_states() -> None:
 
 
 @pytest.mark.parametrize("limits", [None, (math.nan, 1.0), (1.0, 1.0), (-math.inf, math.inf)])
-def test_where_limits_say_nothing_sliders_go_a_little_beyond_what_was_recorded(
-    limits: tuple[float, float] | None,
-) -> None:
+def test_where_limits_say_nothing_sliders_go_a_little_beyond_what_was_recorded(limits):
     instruments = (Instrument(NAME, {"jaw_angle": limits}),)
     span = slider_ranges(instruments, two_states())[NAME, "jaw_angle"]
     assert span.lower == pytest.approx(0.2 - 0.08)

@@ -168,9 +168,7 @@ def test_without_its_shadows_it_would_not(page: Page, scene: GaussianScene) -> N
 @pytest.mark.parametrize(
     ("name", "value"), [("jaw_angle", 0.31), ("slide", 6.0), ("roll", 0.8), ("yaw", 0.25), ("pitch", -0.3)]
 )
-def test_every_slider_moves_the_instrument_as_the_server_does(
-    page: Page, scene: GaussianScene, name: str, value: float
-) -> None:
+def test_every_slider_moves_the_instrument_as_the_server_does(page, scene, name, value):
     page.page.evaluate("window.neeco.toFrame(2)")
     before = page.drawn()[0]
     page.slide(name, value)
@@ -202,9 +200,7 @@ def driver(scene: GaussianScene) -> GaussianScene:
 @pytest.mark.parametrize(
     ("name", "value"), [("pitch", -0.5), ("yaw", 0.6), ("jaw", 1.1), ("blade_mm", 0.8), (None, None)]
 )
-def test_sliders_move_every_joint_of_a_wrist_as_the_server_does(
-    chromium: Any, driver: GaussianScene, tmp_path: Path, name: str | None, value: float | None
-) -> None:
+def test_sliders_move_every_joint_of_a_wrist_as_the_server_does(chromium, driver, tmp_path, name, value):
     path = tmp_path / "driver.html"
     path.write_text(page_of(*pack(driver, 3), "driver", [("method", "kinematic")]))
     opened = Page(chromium, path)
@@ -424,9 +420,7 @@ def test_a_damaged_file_says_so(chromium: Any, exported: Path, tmp_path: Path) -
         {"fields": [["mean", 10**9, "uint24"]]},
     ],
 )
-def test_a_hostile_file_neither_hangs_nor_shows_anything(
-    chromium: Any, scene: GaussianScene, tmp_path: Path, change: dict[str, Any]
-) -> None:
+def test_a_hostile_file_neither_hangs_nor_shows_anything(chromium, scene, tmp_path, change):
     header, planes = pack(scene, 1)
     path = tmp_path / "hostile.html"
     path.write_text(page_of(header | change, planes, "hostile", []))

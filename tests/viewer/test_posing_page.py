@@ -164,9 +164,7 @@ def test_arrows_on_a_focused_slider_move_that_slider_alone(page: Any) -> None:
     assert jaw.evaluate("input => input.ariaValueText").startswith(f"{before[1] + 1:.0f}°")
 
 
-def test_a_file_that_leads_to_the_address_opens_the_page_and_another_page_gets_nothing(
-    server: PosingServer, context: Any, tmp_path: Path
-) -> None:
+def test_a_file_that_leads_to_the_address_opens_the_page_and_another_page_gets_nothing(server, context, tmp_path):
     """As `neeco view` opens a browser; the file's origin is another site's."""
     leading = tmp_path / "view.html"
     leading.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={server.address}">')

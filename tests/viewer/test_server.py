@@ -76,9 +76,7 @@ def test_a_taken_port_gives_the_next_one(made_run: Path, serve: Serve) -> None:
     assert port_of(serve(made_run, port=first)) > first
 
 
-def test_a_browser_that_asks_for_a_tunnel_gets_none(
-    made_run: Path, serve: Serve, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_browser_that_asks_for_a_tunnel_gets_none(made_run, serve, monkeypatch):
     asked: list[object] = []
     monkeypatch.setattr("viser._viser.ViserTunnel", lambda *given: asked.append(given))
     viewer = serve(made_run)
@@ -109,9 +107,7 @@ def _packed(message: object) -> bytes:
     return msgspec.msgpack.encode({"type": type(message).__name__})
 
 
-def test_a_server_that_the_guard_does_not_see_is_not_left_running(
-    made_run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_that_the_guard_does_not_see_is_not_left_running(made_run, monkeypatch):
     stopped: list[object] = []
 
     class Other:
@@ -162,9 +158,7 @@ def test_it_prints_its_address_and_ends_quietly_on_interrupt(made_run: Path) -> 
     assert (rest.strip(), errors) == ("", "")
 
 
-def test_the_browser_is_opened_without_the_token_in_its_arguments(
-    made_run: Path, monkeypatch: pytest.MonkeyPatch, capsys
-) -> None:
+def test_the_browser_is_opened_without_the_token_in_its_arguments(made_run, monkeypatch, capsys):
     """By way of a file that nobody else can read and that goes again."""
     opened: list[Path] = []
 
@@ -182,9 +176,7 @@ def test_the_browser_is_opened_without_the_token_in_its_arguments(
     assert not opened[0].parent.exists()
 
 
-def test_a_host_that_others_reach_is_warned_of_as_plain_http(
-    made_run: Path, monkeypatch: pytest.MonkeyPatch, capsys
-) -> None:
+def test_a_host_that_others_reach_is_warned_of_as_plain_http(made_run, monkeypatch, capsys):
     def stop(_: float) -> None:
         raise KeyboardInterrupt
 

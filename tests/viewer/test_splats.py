@@ -155,9 +155,7 @@ def test_openusd_reads_the_same_gaussians_from_a_prim_of_its_own_schema(tmp_path
     assert (means.numpy() < highest).all()
 
 
-def test_a_missing_or_old_openusd_is_refused_with_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_or_old_openusd_is_refused_with_what_to_install(tmp_path, monkeypatch):
     scene = ball_scene("ball", [(0.0, 0.0, 60.0)])
     splats = splats_of(scene, *exported_state(scene, 0, None))
     old = SimpleNamespace(Usd=SimpleNamespace(GetVersion=lambda: (0, 25, 5)), UsdVol=SimpleNamespace())
@@ -230,9 +228,7 @@ def test_the_format_is_that_of_the_ending(tmp_path: Path, capsys: pytest.Capture
         ["score-masks", "RUN", "RUN", "--json", "scores.txt"],
     ],
 )
-def test_no_file_is_written_under_another_formats_name(
-    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_file_is_written_under_another_formats_name(words, tmp_path, capsys):
     run = run_folder(tmp_path / "run", ball_scene("ball", [(0.0, 0.0, 60.0)]))
     assert main([str(run) if word == "RUN" else word for word in words]) == 1
     assert f"{words[-2]}: {words[-1]}: another format's name" in capsys.readouterr().err

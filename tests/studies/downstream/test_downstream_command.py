@@ -127,9 +127,7 @@ def test_ctrl_c_says_how_to_go_on(words, monkeypatch, capsys) -> None:
         (["--transforms", "nowhere.json"], "nowhere.json"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_1(
-    more: list[str], told: str, words, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_bad_input_is_one_line_and_exit_1(more, told, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert told in stopped_by([*words, *more], capsys)
     assert not (tmp_path / "out").exists()
