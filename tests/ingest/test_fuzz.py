@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from damaged_files import refusals
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.calibration.lens import read_lens
@@ -16,7 +15,24 @@ from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 
 POSES, COUNTS, TABLE = "instrument.csv", "jaw.csv", "table.csv"
-CELLS = ["", "nan", "inf", "-inf", "1e300", "-1e308", "1e19", "0", "-1", "x", "1,5", '"', "1e400", "é", "=1+1", "0x1F"]
+CELLS = [
+    "",
+    "nan",
+    "inf",
+    "-inf",
+    "1e300",
+    "-1e308",
+    "1e19",
+    "0",
+    "-1",
+    "x",
+    "1,5",
+    '"',
+    "1e400",
+    "\u00e9",
+    "=1+1",
+    "0x1F",
+]
 NAMES = ["", "t", "time", "t_ns", "x_m", "qx", "x_mm", "Frame", "State", "q0", "roll", "t_s#2", "\u00b5", "12"]
 YAML = [
     "", "null", "[]", "{}", "3", "-1", ".nan", ".inf", "1e999", "'x'", "[1, 2]", "{a: 1}", "*a", "!!python/none", "@",
@@ -125,14 +141,24 @@ def test_no_table_makes_reading_raise(folder, seed):
     refused(lambda: read_logs(folder), POSES, COUNTS, TABLE)
 
 
-def test_no_bytes_make_reading_raise(folder):
+@pytest.mark.parametrize("seed", range(40))
+def test_no_bytes_make_reading_raise(folder, seed):
+    pick = np.random.default_rng(seed)
+    path = folder / str(pick.choice([POSES, COUNTS, TABLE]))
+    content = bytearray(path.read_bytes())
+    match seed % 4:
+        case 0:
+            content = bytearray(pick.bytes(int(pick.integers(0, 3000))))
+        case 1:
+            content = content[: int(pick.integers(0, len(content)))]
+        case _:
+            for place in pick.integers(0, len(content), 1 + seed):
+                content[place] = int(pick.integers(0, 256))
+    path.write_bytes(content)
+    refused(lambda: read_logs(folder), POSES, COUNTS, TABLE)
     (folder / "video.mp4").write_bytes(b"film")
-
-    def draft():
-        (folder / "recording.yaml").write_text(write_template(folder), encoding="utf-8")
-        read_recording(folder / "recording.yaml")
-
-    refusals([folder / name for name in (POSES, COUNTS, TABLE)], [lambda: read_logs(folder), draft], 40)
+    (folder / "recording.yaml").write_text(write_template(folder), encoding="utf-8")
+    read_recording(folder / "recording.yaml")
 
 
 @pytest.mark.parametrize("seed", range(120))
@@ -162,11 +188,18 @@ def test_no_recording_makes_reading_raise(folder, seed):
 
 
 def test_no_film_makes_reading_raise(world):
-    path = world.video(frames=12)
+    whole = world.video(frames=12).read_bytes()
+    path = world.folder / "damaged.mp4"
+    for seed in range(40):
+        pick = np.random.default_rng(seed)
+        content = bytearray(whole[: int(pick.integers(0, len(whole) + 1))] if seed % 2 else whole)
+        for place in pick.integers(0, max(len(content), 1), min(int(pick.choice([0, 3, 30])), len(content))):
+            content[place] = int(pick.integers(0, 256))
+        path.write_bytes(content)
 
-    def read():
-        video = open_video(path)
-        count = len(video.times)
-        assert len(list(video.read(range(count)))) == count
+        def read():
+            video = open_video(path)
+            count = len(video.times)
+            assert len(list(video.read(range(count)))) == count
 
-    refusals([path], [read], 40)
+        refused(read, "damaged.mp4")
