@@ -59,6 +59,12 @@ class Silhouettes:
         size = np.array(self.distances.shape[:0:-1])
         return np.asarray(((pixels > margin) & (pixels < size - margin)).all(-1))
 
+    def overlap(self, filled: np.ndarray, counted: np.ndarray | bool = True) -> float:
+        """Intersection over union of filled silhouettes bool [F, h, w] with the masks, over all frames, of the pixels
+        that are `counted`."""
+        both, either = filled & self.masks & counted, (filled | self.masks) & counted
+        return int(both.sum()) / max(int(either.sum()), 1)
+
     def take(self, rows: np.ndarray) -> Silhouettes:
         """Return those of some of the frames."""
         return Silhouettes(self.masks[rows], self.distances[rows], self.intrinsics, self.shafts.take(rows))

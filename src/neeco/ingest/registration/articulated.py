@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import KinematicTree
@@ -40,7 +39,7 @@ from neeco.ingest.registration.base import (
 )
 from neeco.ingest.registration.layers import LAYERS
 from neeco.ingest.registration.silhouette_fit import RIGID_FIT, BasePrior
-from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock, step_between
 from neeco.ingest.registration.silhouette_search import distance_to, search_bases
 from neeco.states.outline_model import ArticulatedModel, bends, joint_values, with_motion
 
@@ -241,16 +240,10 @@ def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[A
     """The fits that differ from each better one, the best first."""
     found: list[ArticulatedFit] = []
     for fit in sorted(fits, key=lambda fit: fit.cost):
-        steps = [_step(problem, other, fit) for other in found]
+        steps = [step_between(other.world_from_base, fit.world_from_base, problem.middle) for other in found]
         if all(np.linalg.norm(s[:3]) > LINKED.apart_rad or np.linalg.norm(s[3:]) > LINKED.apart_mm for s in steps):
             found.append(fit)
     return found
-
-
-def _step(problem: ArticulatedProblem, first: ArticulatedFit, second: ArticulatedFit) -> np.ndarray:
-    """Turn rad and shift mm [6], world, at the instrument, from one base to another."""
-    turn = Rotation.from_matrix(second.world_from_base[:3, :3] @ first.world_from_base[:3, :3].T).as_rotvec()
-    return np.append(turn, problem.pivot(second.world_from_base) - problem.pivot(first.world_from_base))
 
 
 def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
@@ -273,7 +266,7 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
     spread = LINKED.scatter**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
         weight = float(np.exp(-0.5 * (other.cost - fits[0].cost)))
-        off = _step(problem, best, other)
+        off = step_between(best.world_from_base, other.world_from_base, problem.middle)
         spread = spread + weight / (1 + weight) * np.outer(off, off)
     in_view = in_camera(spread, problem.camera_from_world[0])
     floor = np.array([np.radians(LINKED.floor_deg)] * 3 + [LINKED.floor_mm, LINKED.floor_mm, LINKED.floor_depth_mm])
@@ -318,7 +311,7 @@ def _doubts(
     ]
     found = [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
     if prior.sd_mm is not None and prior.sd_rad is not None:
-        step = _step(problem, replace(fit, world_from_base=prior.world_from_base), fit)
+        step = step_between(prior.world_from_base, fit.world_from_base, problem.middle)
         off = np.linalg.norm(step[3:]) / prior.sd_mm, np.linalg.norm(step[:3]) / prior.sd_rad
         if max(off) > LINKED.max_shift_sds:
             found.append(

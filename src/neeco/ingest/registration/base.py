@@ -16,7 +16,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import BaseUncertainty, evenly_spaced
@@ -34,6 +33,7 @@ from neeco.ingest.registration.silhouette_model import (
     pivot_of,
     resized,
     sides,
+    step_between,
 )
 from neeco.ingest.registration.silhouette_search import SEARCH, distance_to, search_bases
 
@@ -275,13 +275,7 @@ def _settle_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFi
 
 def overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
     """Intersection over union of the fit's filled silhouette with the masks, over all frames."""
-    both, either = 0, 0
-    left, right = np.split(sides(problem, fit).pixels, 2, axis=1)
-    for row, mask in enumerate(problem.silhouettes.masks):
-        filled = _filled(left[row], right[row], mask.shape)
-        both += int((filled & mask).sum())
-        either += int((filled | mask).sum())
-    return both / max(either, 1)
+    return problem.silhouettes.overlap(_filled(problem, sides(problem, fit).pixels))
 
 
 def shaft_overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
@@ -290,25 +284,21 @@ def shaft_overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
     counted = fit.stations > RIGID_FIT.front_share * fit.stations[-1]
     stations = np.append(fit.stations[counted], fit.stations[-1] + RIGID.max_length_mm)
     shape = np.concatenate([fit.shape[counted], fit.shape[-1:]])
-    left, right = np.split(sides(problem, replace(fit, stations=stations, shape=shape)).pixels, 2, axis=1)
+    pixels = sides(problem, replace(fit, stations=stations, shape=shape)).pixels
+    left, right = np.split(pixels, 2, axis=1)
     front, back = (left[:, 0] + right[:, 0]) / 2, (left[:, -2] + right[:, -2]) / 2
-    height, width = problem.silhouettes.masks.shape[1:]
-    y, x = np.mgrid[:height, :width] + 0.5
-    both, either = 0, 0
-    for row, mask in enumerate(problem.silhouettes.masks):
-        filled = _filled(left[row], right[row], mask.shape)
-        along = front[row] - back[row]
-        behind = (x - front[row, 0]) * along[0] + (y - front[row, 1]) * along[1] <= 0
-        both += int((filled & mask & behind).sum())
-        either += int(((filled | mask) & behind).sum())
-    return both / max(either, 1)
+    along = (front - back)[..., None, None]
+    y, x = np.mgrid[: problem.silhouettes.masks.shape[1], : problem.silhouettes.masks.shape[2]] + 0.5
+    behind = (x - front[:, 0, None, None]) * along[:, 0] + (y - front[:, 1, None, None]) * along[:, 1] <= 0
+    return problem.silhouettes.overlap(_filled(problem, pixels), behind)
 
 
-def _filled(left: np.ndarray, right: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Pixels bool [h, w] between sides [K, 2] px of a silhouette."""
-    corners = np.rint(np.clip(np.concatenate([left, right[::-1]]), -1e4, 1e4) - 0.5).astype(np.int32)
-    filled = np.zeros(shape, np.uint8)
-    cv2.fillPoly(filled, [corners], 1)
+def _filled(problem: SilhouetteProblem, pixels: np.ndarray) -> np.ndarray:
+    """Pixels bool [F, h, w] between the sides [F, 2K, 2] px of silhouettes."""
+    filled = np.zeros(problem.silhouettes.masks.shape, np.uint8)
+    left, right = np.split(np.rint(np.clip(pixels, -1e4, 1e4) - 0.5).astype(np.int32), 2, axis=1)
+    for row, corners in enumerate(np.concatenate([left, right[:, ::-1]], 1)):
+        cv2.fillPoly(filled[row], [corners], 1)
     return filled.astype(bool)
 
 
@@ -349,9 +339,8 @@ def unmoved(*, stated: bool, linked: bool = False) -> str:
 
 def moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, Any]:
     """Distance mm and degrees between a base and a given one, at the instrument's mean position [3] mm in its frame."""
-    shift = (base[:3, :3] - given[:3, :3]) @ middle + base[:3, 3] - given[:3, 3]
-    turn = Rotation.from_matrix(base[:3, :3] @ given[:3, :3].T).magnitude()
-    return {"moved_mm": float(np.linalg.norm(shift)), "turned_deg": float(np.degrees(turn))}
+    turn, shift = np.linalg.norm(step_between(given, base, middle).reshape(2, 3), axis=1)
+    return {"moved_mm": float(shift), "turned_deg": float(np.degrees(turn))}
 
 
 def _result(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> BaseRegistration:
