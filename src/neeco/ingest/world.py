@@ -384,12 +384,11 @@ def _right_camera(data: Episodes, images: ChosenImages, folder: Path, progress: 
     if data.recording.stereo is None:
         return None
     names = [data.frame_name(int(frame)) for frame in images.selected]
-    cameras = []
+    camera, names_by_row, delays = None, dict[int, str](), dict[int, float]()
     for episode, rows in _rows_by_episode(data, images).items():
         part = data.parts[episode]
         own, stems = images.selected[rows] - part.first_frame, [names[row] for row in rows]
         found = read_right_camera(part.recording, own, part.times, stems, folder / "right", progress)
-        moved = {row: int(rows[row]) for row in found.names}
         late = np.array([*found.delays.values()])
         if np.median(np.abs(late)) > WORLD.same_moment_s:
             data.notes.add(
@@ -397,15 +396,7 @@ def _right_camera(data: Episodes, images: ChosenImages, folder: Path, progress: 
                 f"{1000 * late.min():+.0f} to {1000 * late.max():+.0f} ms): theirs are the states of these moments",
                 episode,
             )
-        cameras.append(
-            replace(
-                found,
-                names={moved[row]: name for row, name in found.names.items()},
-                delays={moved[row]: delay for row, delay in found.delays.items()},
-            )
-        )
-    return replace(
-        cameras[0],
-        names={row: name for camera in cameras for row, name in camera.names.items()},
-        delays={row: delay for camera in cameras for row, delay in camera.delays.items()},
-    )
+        camera = camera or found
+        names_by_row |= {int(rows[row]): name for row, name in found.names.items()}
+        delays |= {int(rows[row]): delay for row, delay in found.delays.items()}
+    return None if camera is None else replace(camera, names=names_by_row, delays=delays)

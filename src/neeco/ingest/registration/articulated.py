@@ -15,6 +15,7 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
+from neeco.geometry.lines import unit
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated_fit import (
     LINKED_FIT,
@@ -124,10 +125,7 @@ def find_articulated_base(
             f"poses, readings and what moves are there together in fewer than {BASES.min_frames} frames; give the "
             "transform exactly, or a recording that shows more of it"
         )
-    if prior is None:
-        fits = _explaining(problem, unknown_starts(problem, seed))
-    else:
-        fits = _explaining(problem, known_starts(problem))
+    fits = _explaining(problem, unknown_starts(problem, seed) if prior is None else known_starts(problem))
     reached = overlap(problem, fits[0]) if fits else 0.0
     if prior is not None and reached < LINKED.usual_overlap and (words := _elsewhere(problem, reached, seed)):
         raise NeecoError(words)
@@ -208,8 +206,7 @@ def _fits(problem: ArticulatedProblem, starts: list[np.ndarray]) -> list[Articul
 def known_starts(problem: ArticulatedProblem) -> list[np.ndarray]:
     """The base as stated, and shifted along the shaft or turned about it: there it is the least certain."""
     base = problem.prior.world_from_base
-    shaft = (base[:3, :3] @ problem.poses[len(CLOCK_SHIFTS_S) // 2][:, :3, :3] @ problem.model.axis).mean(0)
-    shaft /= np.linalg.norm(shaft)
+    shaft = unit((base[:3, :3] @ problem.poses[len(CLOCK_SHIFTS_S) // 2][:, :3, :3] @ problem.model.axis).mean(0))
     steps = [np.zeros(6)]
     steps += [np.append(np.zeros(3), along * shaft) for along in LINKED.along_mm]
     steps += [np.append(roll * shaft, np.zeros(3)) for roll in LINKED.rolls_rad]
@@ -272,7 +269,7 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
     floor = np.array([np.radians(LINKED.floor_deg)] * 3 + [LINKED.floor_mm, LINKED.floor_mm, LINKED.floor_depth_mm])
     spread = in_view + np.diag(floor**2)
     poses = problem.camera_from_world[0] @ best.world_from_base @ poses_at_clock(problem.poses, best.clock)
-    shaft = (poses[:, :3, :3] @ problem.model.axis).mean(0)
+    shaft = unit((poses[:, :3, :3] @ problem.model.axis).mean(0))
     stated: dict[str, Any] = {}
     if prior.sd_mm is not None:
         stated = moved_from(prior.world_from_base, best.world_from_base, problem.middle)
@@ -287,7 +284,7 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
         residual_px=best.residual_px * problem.px_scale,
         frames=len(problem.blocks),
         from_masks=True,
-        shaft=shaft / np.linalg.norm(shaft),
+        shaft=shaft,
         sd_motion_mm=sd_motion(spread, poses),
         doubts=tuple(_doubts(problem, fits[0], best, motion)),
         **stated,

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
-from neeco.ingest.foreground.silhouettes import SHAFT_LINES
+from neeco.ingest.foreground.silhouettes import SHAFT_LINES, border_of
 from neeco.ingest.registration.silhouette_fit import POSE_SDS, BasePrior
 from neeco.ingest.registration.silhouette_model import (
     BASE,
@@ -90,12 +90,7 @@ class ArticulatedFit:
 def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
     """Evenly spaced points [F, `max_points`, 2] px of the outlines of masks bool [F, h, w]; NaN where there are fewer.
     Those at the image's border, or beside what is hidden (bool [h, w]), do not count."""
-    height, width = masks.shape[1:]
-    open_ = np.zeros((height, width), bool)
-    open_[SHAFT_LINES.edge_px : -SHAFT_LINES.edge_px, SHAFT_LINES.edge_px : -SHAFT_LINES.edge_px] = True
-    if hidden is not None:
-        grown = cv2.dilate(hidden.astype(np.uint8), np.ones((2 * SHAFT_LINES.edge_px + 1,) * 2, np.uint8))
-        open_ &= ~grown.astype(bool)
+    open_ = ~border_of(masks.shape[1:], hidden)
     found = np.full((len(masks), LINKED_FIT.max_points, 2), np.nan)
     for row, mask in enumerate(masks):
         lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -252,6 +247,10 @@ def _loss(px: np.ndarray, width: float, noise: float) -> float:
     return LINKED_FIT.share * float(np.log1p((px / width) ** 2).sum()) * (width / noise) ** 2
 
 
+def _weights(px: np.ndarray, width: float, noise: float) -> np.ndarray:
+    return np.asarray(LINKED_FIT.share / noise**2 / (1 + (px / width) ** 2))
+
+
 def minimise(
     problem: ArticulatedProblem, fit: ArticulatedFit, width: float, max_steps: int = 12, *, rough: bool = False
 ) -> ArticulatedFit:
@@ -264,7 +263,7 @@ def minimise(
         use = _points(problem, fit)
         px = _residuals(problem, fit, use)
         columns = _jacobian(problem, fit, use, free)
-        weights = LINKED_FIT.share / noise**2 / (1 + (px / width) ** 2)
+        weights = _weights(px, width, noise)
         off, scale = prior_residuals(problem, fit)
         fitted = np.append(free, np.arange(count, len(scale)))
 
@@ -324,7 +323,7 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     use = _points(problem, fit)
     px = _residuals(problem, fit, use)
     columns = _jacobian(problem, fit, use, free)
-    weights = LINKED_FIT.share / noise**2 / (1 + (px / width) ** 2)
+    weights = _weights(px, width, noise)
     scores = _scores(columns, weights * px, len(free))
     scale = prior_residuals(problem, fit)[1]
     count = BASE + len(problem.model.means)

@@ -19,6 +19,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import BaseUncertainty, evenly_spaced
+from neeco.geometry.lines import unit
 from neeco.geometry.trocar import ShaftLine
 from neeco.ingest.foreground.silhouettes import ShaftLines, silhouettes_of
 from neeco.ingest.registration.axial_texture import with_marks
@@ -65,6 +66,8 @@ class BaseSettings:
 
 
 BASES = BaseSettings()
+
+LEVERS = np.repeat([1 / BASES.lever_mm, 1.0], 3)  # rad, mm: about as much motion of a silhouette each
 
 BY_SIZE = "a shift towards where the instrument comes in, together with its size"
 
@@ -141,21 +144,10 @@ class BaseRegistration:
             listed = [float(value) if np.isfinite(value) else None for value in np.atleast_1d(values)]
             return listed if np.ndim(values) else listed[0]
 
-        numbers = (
-            "sd_mm",
-            "sd_deg",
-            "sd_motion_mm",
-            "clock_s",
-            "clock_sd_s",
-            "moved_mm",
-            "turned_deg",
-            "overlap",
-            "explained",
-        )
-        found = {name: known(getattr(self, name)) for name in (*numbers, "overlap_before")}
+        numbers = "sd_mm sd_deg sd_motion_mm clock_s clock_sd_s moved_mm turned_deg overlap explained overlap_before"
         return {
             "world_from_base": self.world_from_base.tolist(),
-            **found,
+            **{name: known(getattr(self, name)) for name in numbers.split()},
             "open": list(self.open_directions),
             "doubts": list(self.doubts),
             "covariance": [known(row) for row in self.covariance],
@@ -345,8 +337,7 @@ def moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[
 
 def _result(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> BaseRegistration:
     poses = fit.world_from_base @ instrument_in_base(problem, fit)
-    shaft = (poses[:, :3, :3] @ fit.axis).mean(0)
-    shaft /= np.linalg.norm(shaft)
+    shaft = unit((poses[:, :3, :3] @ fit.axis).mean(0))
     covariance, open_directions, clock_sd = _covariance(problem, known, fit, shaft)
     moved: dict[str, Any] = {}
     if known.sd_mm is not None:
@@ -388,7 +379,7 @@ def _covariance(
     valleys = [BASES.along_sd_mm * shaft] + ([BASES.size_sd * away] if still else [])
     for valley in valleys:
         covariance[3:6, 3:6] += np.outer(valley, valley)
-    units = np.array([1 / BASES.lever_mm] * 3 + [1.0] * 3)  # about as much motion of a silhouette each
+    units = LEVERS
     limit = BASES.open_sd_mm**2
     if known.sd_rad is not None and known.sd_mm is not None:
         units, limit = np.array([known.sd_rad] * 3 + [known.sd_mm] * 3), BASES.open_share**2
@@ -444,10 +435,8 @@ def base_from_layers(
     """Return the base that two layers of a still camera's images show, given its prior. poses [F, 4, 4]:
     base_from_instrument."""
     base = world_from_camera @ found.camera_from_base
-    shaft = (found.camera_from_base[:3, :3] @ poses[:, :3, :3] @ line.axis).mean(0)
-    shaft /= np.linalg.norm(shaft)
-    units = np.array([1 / BASES.lever_mm] * 3 + [1.0] * 3)
-    after, before = found.covariance[:6, :6] / np.outer(units, units), np.square(found.given[:6] / units)
+    shaft = unit((found.camera_from_base[:3, :3] @ poses[:, :3, :3] @ line.axis).mean(0))
+    after, before = found.covariance[:6, :6] / np.outer(LEVERS, LEVERS), np.square(found.given[:6] / LEVERS)
     values, vectors = np.linalg.eigh(after)
     words = [
         _direction(np.eye(3), [shaft], vector)

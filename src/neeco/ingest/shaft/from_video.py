@@ -47,8 +47,8 @@ class ShaftSearchSettings:
     head_range: tuple[float, float] = (0.4, 1.6)  # of the median length of the head, for an end to be accepted
     closed_quantile: float = 0.8  # of the heads' lengths, taken for that of closed jaws
     # solution
-    min_rounds: int = 3
-    max_rounds: int = 7
+    min_rounds: int = 3  # of detecting edges and solving for axes, at least
+    max_rounds: int = 7  # the same, at most
     straight_px: float = 0.15  # by which the median of the edges may leave a straight line
     bin_radii: float = 0.5  # of shaft, in each of which the edges are averaged
     bins: int = 16  # of that length
