@@ -55,7 +55,7 @@ class OutlineFitSettings:
 OUTLINES = OutlineFitSettings()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LinkViews:
     """V images of an instrument in S states, and what was recorded of these."""
 
@@ -70,10 +70,9 @@ class LinkViews:
 
     def take(self, rows: np.ndarray, state_of_view: np.ndarray, poses: np.ndarray, readings: np.ndarray) -> LinkViews:
         """Return the views `rows`, of these states."""
-        images, usable, cameras, intrinsics = (
-            part[rows] for part in (self.images, self.usable, self.camera_from_world, self.intrinsics)
-        )
-        return LinkViews(self.tree, images, usable, cameras, intrinsics, state_of_view, poses, readings)
+        images = ("images", "usable", "camera_from_world", "intrinsics")
+        found = replace(self, **{name: getattr(self, name)[rows] for name in images})
+        return replace(found, state_of_view=state_of_view, poses=poses, readings=readings)
 
 
 @dataclass(frozen=True, eq=False)
