@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.ingest.pipeline import LEFT_OUT, UNSEEN_MARGIN, assign_splits
+from neeco.ingest.pipeline import LEFT_OUT, SPLITS, assign_splits
 from neeco.ingest.recording.model import Splits
 
 FRAMES = np.arange(200)
@@ -18,7 +18,7 @@ def test_the_widest_openings_are_unseen_and_training_never_comes_near_them() -> 
     names, rule = assign_splits(FRAMES, POSES, {"jaw_angle": OPENING}, Splits(unseen_by="jaw_angle"))
     assert (names == "unseen").sum() == 30
     assert OPENING[names == "unseen"].min() > OPENING[names == "train"].max()
-    assert FRAMES[names == "unseen"].min() - FRAMES[names == "train"].max() > UNSEEN_MARGIN
+    assert FRAMES[names == "unseen"].min() - FRAMES[names == "train"].max() > SPLITS.unseen_margin
     assert "jaw_angle above" in rule
 
 

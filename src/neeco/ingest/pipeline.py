@@ -15,7 +15,7 @@ instruments is in the `Episodes` that it returns; what it has to report, in `Epi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,20 @@ from neeco.ingest.staging import staged
 from neeco.ingest.timing.episodes import Episodes, States
 from neeco.ingest.timing.reading import read_episodes
 from neeco.ingest.world import World, find_moving_world, find_still_world, is_still
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitSettings:
+    """Settings of the choice of frames that test."""
+
+    unseen_margin: int = 3  # video frames on each side of an unseen one chosen by us that no other split may use
+    min_range: float = 0.1  # rad that a joint's readings must span to be split by
+    test_every: int = 8  # frames, or episodes, of which one tests unless the recording states otherwise
+
+
+SPLITS = SplitSettings()
+
+LEFT_OUT = "left out"  # split of a frame too close to an unseen one to train on
 
 
 def ingest(
@@ -206,12 +220,6 @@ def _measure_roll(world: World, result: IngestResult, capture: Path, progress: S
     prepare(capture, {item.name: lambda frame: masks[frame]})
 
 
-UNSEEN_MARGIN = 3  # video frames on each side of an unseen one chosen by us that no other split may use
-MIN_RANGE = 0.1  # rad that a joint's readings must span to be split by
-TEST_EVERY = 8  # frames, or episodes, of which one tests unless the recording states otherwise
-LEFT_OUT = "left out"  # split of a frame too close to an unseen one to train on
-
-
 def split_frames(data: Episodes, frames: np.ndarray, states: States, usable: np.ndarray) -> tuple[np.ndarray, str]:
     """Split video frames [M] by the first tracked instrument's states where these are `usable` [M]; LEFT_OUT elsewhere.
 
@@ -260,8 +268,8 @@ def assign_splits(
     episodes = episodes or {}
     whole = rule.test_episodes
     if episodes and not (whole or rule.test or rule.test_every is not None):
-        whole = tuple(episodes)[-max(1, len(episodes) // TEST_EVERY) :]
-    every = TEST_EVERY if rule.test_every is None else rule.test_every
+        whole = tuple(episodes)[-max(1, len(episodes) // SPLITS.test_every) :]
+    every = SPLITS.test_every if rule.test_every is None else rule.test_every
     splits = np.full(len(frames), "train", dtype=object)
     if whole:
         splits[_inside(frames, tuple(episodes[name] for name in whole))] = "test"
@@ -286,8 +294,8 @@ def assign_splits(
     if not unseen.any():
         return splits, f"{words}; unseen: none, as nothing moves"
     splits[unseen] = "unseen"
-    splits[~unseen & (np.abs(frames[:, None] - frames[unseen]).min(1) <= UNSEEN_MARGIN)] = LEFT_OUT
-    left_out = f"frames within {UNSEEN_MARGIN} of an unseen one are left out of the capture"
+    splits[~unseen & (np.abs(frames[:, None] - frames[unseen]).min(1) <= SPLITS.unseen_margin)] = LEFT_OUT
+    left_out = f"frames within {SPLITS.unseen_margin} of an unseen one are left out of the capture"
     return splits, f"{words}; unseen: {why}; {left_out}"
 
 
@@ -308,7 +316,7 @@ def _extremes(
 ) -> tuple[np.ndarray, str]:
     """Return the frames [N] at the far end of one joint, of the instrument's turn from its mean direction, or half of
     each; and the rule in words."""
-    moving = [name for name, values in joints.items() if np.ptp(values) > MIN_RANGE]
+    moving = [name for name, values in joints.items() if np.ptp(values) > SPLITS.min_range]
     joint = by or (moving[0] if moving else None)
     share = fraction if by or joint is None else fraction / 2
     unseen, words = np.zeros(len(poses), dtype=bool), []

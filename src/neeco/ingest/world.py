@@ -15,7 +15,7 @@ from neeco.capture.model import SEPARATE_TISSUES, PointCloud, evenly_spaced
 from neeco.geometry.lens import Lens
 from neeco.ingest.cameras.sfm import StructureFromMotion
 from neeco.ingest.cameras.still_scene import (
-    N_FRAMES,
+    STILL_SCOPE,
     RightCamera,
     look_behind,
     read_right_camera,
@@ -43,6 +43,18 @@ from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.from_video import FoundShaft, find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes, States
 from neeco.ingest.timing.reading import require_lens
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldSettings:
+    """Thresholds between episodes and cameras of a scope that stands still."""
+
+    same_place: float = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
+    mostly_similar: float = 0.7  # of them: less is worth a note
+    same_moment_s: float = 1e-3  # between two cameras' images
+
+
+WORLD = WorldSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -267,11 +279,6 @@ def _compare_motion(
         note_motion_contradiction(data, name, name in shapes, lag)
 
 
-SAME_PLACE = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
-SAME_MOMENT_S = 1e-3  # between two cameras' images
-MOSTLY_SIMILAR = 0.7  # less is worth a note
-
-
 def is_still(data: Episodes, images: ChosenImages, progress: StageProgress) -> bool:
     """Return whether the scope stands still: as the recording states, else as its images show."""
     stated, stereo = data.recording.camera, data.recording.stereo is not None
@@ -354,19 +361,19 @@ def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgre
     progress("comparing what the recordings show", 0, 0)
     backgrounds = {}
     for episode, rows in _rows_by_episode(data, images).items():
-        load = images.loader(rows[evenly_spaced(len(rows), N_FRAMES)])
-        found = find_background(load, min(len(rows), N_FRAMES))
+        load = images.loader(rows[evenly_spaced(len(rows), STILL_SCOPE.n_frames)])
+        found = find_background(load, min(len(rows), STILL_SCOPE.n_frames))
         backgrounds[episode] = np.clip(found.colors, 0, 255).astype(np.uint8)
     first, *others = backgrounds
     for episode in others:
         share = same_place(backgrounds[first], backgrounds[episode])
         name, before = data.parts[episode].name, data.parts[first].name
-        if share is not None and share < SAME_PLACE:
+        if share is not None and share < WORLD.same_place:
             raise NeecoError(
                 f"{data.parts[episode].recording.path}: {name} shows another place than {before}: {share:.0%} of "
                 f"the background is where it was; ingest each place alone; of several tissues, {SEPARATE_TISSUES}"
             )
-        if share is not None and share < MOSTLY_SIMILAR:
+        if share is not None and share < WORLD.mostly_similar:
             data.notes.add(
                 f"{1 - share:.0%} of the background is not where it was in {before}: what changed is blurred", episode
             )
@@ -377,28 +384,19 @@ def _right_camera(data: Episodes, images: ChosenImages, folder: Path, progress: 
     if data.recording.stereo is None:
         return None
     names = [data.frame_name(int(frame)) for frame in images.selected]
-    cameras = []
+    camera, names_by_row, delays = None, dict[int, str](), dict[int, float]()
     for episode, rows in _rows_by_episode(data, images).items():
         part = data.parts[episode]
         own, stems = images.selected[rows] - part.first_frame, [names[row] for row in rows]
         found = read_right_camera(part.recording, own, part.times, stems, folder / "right", progress)
-        moved = {row: int(rows[row]) for row in found.names}
         late = np.array([*found.delays.values()])
-        if np.median(np.abs(late)) > SAME_MOMENT_S:
+        if np.median(np.abs(late)) > WORLD.same_moment_s:
             data.notes.add(
                 f"the right camera's images were taken {1000 * np.median(late):+.0f} ms after the left one's (median; "
                 f"{1000 * late.min():+.0f} to {1000 * late.max():+.0f} ms): theirs are the states of these moments",
                 episode,
             )
-        cameras.append(
-            replace(
-                found,
-                names={moved[row]: name for row, name in found.names.items()},
-                delays={moved[row]: delay for row, delay in found.delays.items()},
-            )
-        )
-    return replace(
-        cameras[0],
-        names={row: name for camera in cameras for row, name in camera.names.items()},
-        delays={row: delay for camera in cameras for row, delay in camera.delays.items()},
-    )
+        camera = camera or found
+        names_by_row |= {int(rows[row]): name for row, name in found.names.items()}
+        delays |= {int(rows[row]): delay for row, delay in found.delays.items()}
+    return None if camera is None else replace(camera, names=names_by_row, delays=delays)

@@ -18,6 +18,7 @@ from scipy.special import expit
 from neeco.capture.kinematics import KinematicTree
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.lines import frame_about
+from neeco.geometry.rotations import rigid
 from neeco.geometry.trocar import line_through_trocar
 from neeco.states.outline_model import MODEL, ArticulatedModel, Outlines, joint_values
 
@@ -67,6 +68,12 @@ class LinkViews:
     poses: np.ndarray  # [S, 4, 4] world_from_root
     readings: np.ndarray  # [S, R] rad or mm
 
+    def take(self, rows: np.ndarray, state_of_view: np.ndarray, poses: np.ndarray, readings: np.ndarray) -> LinkViews:
+        """Return the views `rows`, of these states."""
+        images = ("images", "usable", "camera_from_world", "intrinsics")
+        found = replace(self, **{name: getattr(self, name)[rows] for name in images})
+        return replace(found, state_of_view=state_of_view, poses=poses, readings=readings)
+
 
 @dataclass(frozen=True, eq=False)
 class StatesFit:
@@ -112,19 +119,19 @@ class StatesProblem:
         """The states as recorded, and the shape expected."""
         return StatesFit(self.shared_means.copy(), np.zeros_like(self.sds))
 
-    def steps_of(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Motions [S, 6] (rotation vector rad, shift mm; in the root's frame) and changes [S, R] of readings."""
-        turns = own[:, :3] @ self.basis.T
-        shifts = np.einsum("sij,sj->si", self.root_from_camera, own[:, 3:POSE])
-        return np.concatenate([turns, shifts], 1), own[:, POSE:]
+    @property
+    def to_root(self) -> np.ndarray:
+        """Transforms [S, 6 + R, 6 + R] of corrections to rotation vectors (rad) and shifts (mm) in the root's frame
+        and changes of readings."""
+        turns = np.tile(np.eye(self.sds.shape[1]), (len(self.sds), 1, 1))
+        turns[:, :3, :3], turns[:, 3:POSE, 3:POSE] = self.basis, self.root_from_camera
+        return turns
 
     def corrected(self, fit: StatesFit) -> tuple[np.ndarray, np.ndarray]:
         """Poses [S, 4, 4] and readings [S, R] with their corrections, without the base's."""
-        motions, changes = self.steps_of(fit.own)
-        moved = np.tile(np.eye(4), (len(motions), 1, 1))
-        moved[:, :3, :3] = Rotation.from_rotvec(motions[:, :3]).as_matrix()
-        moved[:, :3, 3] = motions[:, 3:]
-        return self.views.poses @ moved, self.views.readings + changes
+        steps = (self.to_root @ fit.own[..., None])[..., 0]
+        moved = rigid(Rotation.from_rotvec(steps[:, :3]).as_matrix(), steps[:, 3:POSE])
+        return self.views.poses @ moved, self.views.readings + steps[:, POSE:]
 
     def outlines(self, fit: StatesFit) -> Outlines:
         """Outlines of all cones in every view."""
@@ -139,23 +146,25 @@ class StatesProblem:
         intrinsics = tuple(views.intrinsics.T[..., None])
         return self.model.outlines(fit.shared[:-6], values[shown], views.camera_from_world @ poses[shown], intrinsics)
 
+    def _distances(self, fit: StatesFit, cell: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Middles [N, 2] px of so many rows and columns of cells, and their signed distances [V, C, N] px to the cones'
+        outlines."""
+        grid = _grid(rows * cell, columns * cell, cell)
+        return grid, self.outlines(fit).distances(np.broadcast_to(grid, (len(self.views.images), *grid.shape)))[0]
+
     def learn_colors(self, fit: StatesFit, softness: float) -> np.ndarray:
         """Log likelihood ratios float32 [V, H, W] of the instrument to the tissue, by the colours of both where a fit
         has them."""
         images = self.views.images
         count, height, width, _ = images.shape
-        grid = _grid(
-            -(-height // OUTLINES.grid_px) * OUTLINES.grid_px,
-            -(-width // OUTLINES.grid_px) * OUTLINES.grid_px,
-            OUTLINES.grid_px,
-        )
         apart = fit.shared.copy()
         apart[self.model.ears] = OUTLINES.ears_mm
-        distances = self.outlines(replace(fit, shared=apart)).distances(np.broadcast_to(grid, (count, *grid.shape)))[0]
+        size = -(-height // OUTLINES.grid_px), -(-width // OUTLINES.grid_px)
+        _, distances = self._distances(replace(fit, shared=apart), OUTLINES.grid_px, *size)
         sizes = [np.zeros_like(distances[:, 0]), distances[:, 0], distances[:, 2:].max(1), distances[:, 1]]
         scaled = np.stack(sizes, -1) / softness
         member = np.exp(scaled - scaled.max(-1, keepdims=True))
-        member = (member / member.sum(-1, keepdims=True)).reshape(count, -(-height // OUTLINES.grid_px), -1, len(sizes))
+        member = (member / member.sum(-1, keepdims=True)).reshape(count, *size, len(sizes))
         bins = (images.astype(np.uint16) * OUTLINES.bins // 256).astype(np.int32)
         index = (bins[..., 0] * OUTLINES.bins + bins[..., 1]) * OUTLINES.bins + bins[..., 2]
         rows, columns = np.arange(height) // OUTLINES.grid_px, np.arange(width) // OUTLINES.grid_px
@@ -174,9 +183,8 @@ class StatesProblem:
         """Cells of `cell` px in the blocks near a fit's outlines; ratios [V, H, W] as `learn_colors` returns them."""
         count, height, width = ratios.shape
         rows, columns, inner = height // OUTLINES.block_px, width // OUTLINES.block_px, OUTLINES.block_px // cell
-        grid = _grid(rows * OUTLINES.block_px, columns * OUTLINES.block_px, OUTLINES.block_px)
-        distances = self.outlines(fit).distances(np.broadcast_to(grid, (count, *grid.shape)))[0].max(1)
-        near = np.abs(distances) < OUTLINES.block_px + 3 * softness  # [V, B]
+        grid, distances = self._distances(fit, OUTLINES.block_px, rows, columns)
+        near = np.abs(distances.max(1)) < OUTLINES.block_px + 3 * softness  # [V, B]
 
         def pooled(images: np.ndarray) -> np.ndarray:
             cut = images[:, : rows * OUTLINES.block_px, : columns * OUTLINES.block_px]
@@ -205,9 +213,8 @@ class StatesProblem:
         """Misfit [V] of each view: likelihood ratios on the wrong side of the outline, by those on its right side."""
         count, height, width = ratios.shape
         rows, columns = height // OUTLINES.block_px, width // OUTLINES.block_px
-        grid = _grid(rows * OUTLINES.block_px, columns * OUTLINES.block_px, OUTLINES.block_px)
-        distances = self.outlines(fit).distances(np.broadcast_to(grid, (count, *grid.shape)))[0].max(1)
-        inside = expit(distances / (OUTLINES.block_px / 4))
+        _, distances = self._distances(fit, OUTLINES.block_px, rows, columns)
+        inside = expit(distances.max(1) / (OUTLINES.block_px / 4))
         cut = np.clip(ratios, -OUTLINES.max_ratio, OUTLINES.max_ratio) * self.views.usable
         cut = cut[:, : rows * OUTLINES.block_px, : columns * OUTLINES.block_px].reshape(
             count, rows, OUTLINES.block_px, columns, OUTLINES.block_px
@@ -228,6 +235,16 @@ class StatesProblem:
         """Half the sum of squares of all parameters, in standard deviations of their priors."""
         shared = (fit.shared - self.shared_means) / self.shared_sds
         return 0.5 * float((shared**2).sum() + ((fit.own / self.sds) ** 2).sum())
+
+    def blocks_with_priors(self, fit: StatesFit, cells: Cells, shared: bool) -> Blocks:
+        """`blocks`, with those of the priors."""
+        b = self.blocks(fit, cells, shared)
+        own = b.own + np.eye(self.sds.shape[1]) / self.sds[..., None] ** 2
+        b = replace(b, own=own, own_gradient=b.own_gradient + fit.own / self.sds**2)
+        if not shared:
+            return b
+        gradient = b.shared_gradient + (fit.shared - self.shared_means) / self.shared_sds**2
+        return replace(b, shared=b.shared + np.diag(self.shared_sds**-2), shared_gradient=gradient)
 
     def blocks(self, fit: StatesFit, cells: Cells, shared: bool = True) -> Blocks:
         """Gradient and information of the cells' likelihood, without priors; `shared`: of shared parameters, too."""
@@ -329,14 +346,7 @@ def adjust(problem: StatesProblem, fit: StatesFit, cells: Cells, max_steps: int,
     sds, shared_sds = problem.sds, problem.shared_sds
 
     def linearise(fit: StatesFit) -> Linearisation[StatesFit]:
-        b = problem.blocks(fit, cells, shared)
-        own = b.own + np.eye(sds.shape[1]) / sds[..., None] ** 2
-        own_gradient = b.own_gradient + fit.own / sds**2
-        common, common_gradient = b.shared, b.shared_gradient
-        if shared:
-            common = common + np.diag(shared_sds**-2)
-            common_gradient = common_gradient + (fit.shared - problem.shared_means) / shared_sds**2
-        b = replace(b, own=own, own_gradient=own_gradient, shared=common, shared_gradient=common_gradient)
+        b = problem.blocks_with_priors(fit, cells, shared)
 
         def cost(other: StatesFit) -> float:
             return float(problem.losses(other, cells).sum()) + problem.prior_cost(other)
@@ -373,11 +383,10 @@ def _grid(height: int, width: int, cell: int) -> np.ndarray:
 
 def posterior(problem: StatesProblem, fit: StatesFit, cells: Cells, *, shared: bool = True) -> np.ndarray:
     """Covariances [S, 6 + R, 6 + R] of the corrections at a minimum; `shared`: what is shared was fitted, too."""
-    b = problem.blocks(fit, cells, shared)
-    own = b.own + np.eye(problem.sds.shape[1]) / problem.sds[..., None] ** 2
-    inverse = np.linalg.inv(own)
+    b = problem.blocks_with_priors(fit, cells, shared)
+    inverse = np.linalg.inv(b.own)
     if not shared:
         return np.asarray(inverse)
     carried = inverse @ b.cross  # [S, d, p]
-    left = b.shared + np.diag(problem.shared_sds**-2) - np.einsum("sdp,sdq->pq", b.cross, carried)
+    left = b.shared - np.einsum("sdp,sdq->pq", b.cross, carried)
     return np.asarray(inverse + carried @ np.linalg.inv(left) @ carried.transpose(0, 2, 1))

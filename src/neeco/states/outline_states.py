@@ -14,6 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Instrument, InstrumentState, evenly_spaced
+from neeco.geometry.rotations import rigid
 from neeco.scene.training_views import TrainingViews
 from neeco.states.outline_fit import OUTLINES, POSE, Cells, LinkViews, StatesFit, StatesProblem, adjust, posterior
 from neeco.states.outline_model import mirrored
@@ -78,7 +79,10 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
     expected [6 + R]: standard deviations of the recorded states; slides [R]: which readings are of prismatic joints.
     """
     tried = np.maximum(expected, sds_of(STATES.tried, slides))
-    few = take(views, np.array(evenly_spaced(len(views.poses), STATES.max_estimated)))
+    some = np.array(evenly_spaced(len(views.poses), STATES.max_estimated))
+    shown = np.flatnonzero(np.isin(views.state_of_view, some))
+    own = np.searchsorted(some, views.state_of_view[shown])
+    few = views.take(shown, own, views.poses[some], views.readings[some])
     first = _fit(few, tried)
     if np.median(first.misfits) > STATES.max_usual_misfit:
         return None
@@ -151,6 +155,13 @@ class _Fitted:
     cells: Cells
     misfits: np.ndarray  # [V]
 
+    @property
+    def worst(self) -> np.ndarray:
+        """Largest misfit [S] of each state's views."""
+        worst = np.zeros(len(self.problem.views.poses))
+        np.maximum.at(worst, self.problem.views.state_of_view, self.misfits)
+        return worst
+
 
 def _fit(views: LinkViews, sds: np.ndarray, known: _Fitted | None = None) -> _Fitted:
     """Fit all states from those recorded; known: a fit of some of them, whose shape and base are where it begins."""
@@ -197,13 +208,14 @@ def error_sizes(found: _Fitted, sds: np.ndarray) -> np.ndarray:
 
 def _bad(found: _Fitted) -> np.ndarray:
     """bool [S]: states that a fit explains far worse than most, or that it moves far."""
-    problem = found.problem
-    worst = np.zeros(len(problem.views.poses))
-    np.maximum.at(worst, problem.views.state_of_view, found.misfits)
-    off = worst - np.median(worst)
-    return np.asarray(
-        (off > max(STATES.bad_mads * 1.48 * float(np.median(np.abs(off))), STATES.bad_misfit)) | _far(found)
-    )
+    return np.asarray((found.worst > _worst_usual(found.worst)) | _far(found))
+
+
+def _worst_usual(misfits: np.ndarray) -> float:
+    """Misfit above which a state's is bad, by those of others."""
+    usual = float(np.median(misfits))
+    deviation = 1.48 * float(np.median(np.abs(misfits - usual)))
+    return usual + max(STATES.bad_mads * deviation, STATES.bad_misfit)
 
 
 def _far(found: _Fitted) -> np.ndarray:
@@ -216,19 +228,12 @@ def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray, *, l
     """The states of a fit; those that are badly explained, from other starts."""
     problem, fit = found.problem, found.fit
     poses, readings = problem.corrected(fit)
-    covariances = posterior(problem, fit, found.cells)
-    to_root = np.zeros((len(poses), *covariances.shape[1:]))
-    to_root[:, :3, :3] = problem.basis
-    to_root[:, 3:POSE, 3:POSE] = problem.root_from_camera
-    to_root[:, POSE:, POSE:] = np.eye(readings.shape[1])
+    covariances = problem.to_root @ posterior(problem, fit, found.cells) @ problem.to_root.transpose(0, 2, 1)
     far = _far(found)
     inconsistent, refitted = _bad(found), np.zeros(len(poses), bool)
     good = np.flatnonzero(~inconsistent)
-    worst = np.array([found.misfits[problem.views.state_of_view == s].max() for s in range(len(poses))])
-    usual = worst[good]
-    limit = np.median(usual) + max(
-        STATES.bad_mads * 1.48 * float(np.median(np.abs(usual - np.median(usual)))), STATES.bad_misfit
-    )
+    worst = found.worst
+    limit = _worst_usual(worst[good])
     for state in np.flatnonzero(inconsistent).tolist():
         trial = _from_starts(found, state, good, slides)
         best = trial.misfits.argmin()
@@ -237,19 +242,19 @@ def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray, *, l
             continue
         own, values = trial.problem.corrected(trial.fit)
         poses[state], readings[state] = own[best], values[best]
-        covariances[state] = posterior(trial.problem, trial.fit, trial.cells, shared=False)[best]
-        to_root[state, :3, :3], to_root[state, 3:POSE, 3:POSE] = (
-            trial.problem.basis,
-            trial.problem.root_from_camera[best],
+        covariance, to_root = (
+            posterior(trial.problem, trial.fit, trial.cells, shared=False)[best],
+            trial.problem.to_root[best],
         )
-        known = np.sqrt(np.diagonal(covariances[state])) < sds_of(STATES.settled, slides)
+        covariances[state] = to_root @ covariance @ to_root.T
+        known = np.sqrt(np.diagonal(covariance)) < sds_of(STATES.settled, slides)
         refitted[state] = trial.misfits[best] <= limit and bool(known.all())
     return FoundStates(
         large=large,
         sds=sds,
         poses=poses,
         readings=readings,
-        covariances=to_root @ covariances @ to_root.transpose(0, 2, 1),
+        covariances=covariances,
         inconsistent=inconsistent,
         refitted=refitted,
     )
@@ -262,7 +267,8 @@ def _from_starts(found: _Fitted, state: int, good: np.ndarray, slides: np.ndarra
     given, readings = views.poses[state], views.readings[state]
     axis = problem.model.shaft_axis(found.fit.shared)
     starts = [(given, readings), (problem.corrected(found.fit)[0][state], problem.corrected(found.fit)[1][state])]
-    starts += [(given @ _turn(axis, angle), readings) for angle in (np.pi / 2, np.pi, -np.pi / 2)]
+    quarters = Rotation.from_rotvec(np.outer((np.pi / 2, np.pi, -np.pi / 2), axis)).as_matrix()
+    starts += [(given @ rigid(turn, np.zeros(3)), readings) for turn in quarters]
     names = views.tree.readings
     there, bent = mirrored(
         views.tree, axis, views.camera_from_world[view], given, dict(zip(names, readings.tolist(), strict=True))
@@ -285,37 +291,6 @@ def _from_starts(found: _Fitted, state: int, good: np.ndarray, slides: np.ndarra
 
 def _subproblem(found: _Fitted, view: int, poses: np.ndarray, readings: np.ndarray, sds: np.ndarray) -> StatesProblem:
     """The problem of one view at several states, with the shape as found."""
-    views, count = found.problem.views, len(poses)
-    repeated = replace(
-        views,
-        images=np.broadcast_to(views.images[view], (count, *views.images.shape[1:])),
-        usable=np.broadcast_to(views.usable[view], (count, *views.usable.shape[1:])),
-        camera_from_world=np.repeat(views.camera_from_world[view][None], count, 0),
-        intrinsics=np.repeat(views.intrinsics[view][None], count, 0),
-        state_of_view=np.arange(count),
-        poses=poses,
-        readings=readings,
-    )
+    count = len(poses)
+    repeated = found.problem.views.take(np.full(count, view), np.arange(count), poses, readings)
     return StatesProblem(repeated, np.tile(sds, (count, 1)), like=found.problem)
-
-
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation [4, 4] about an axis through the origin."""
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
-    return turn
-
-
-def take(views: LinkViews, states: np.ndarray) -> LinkViews:
-    """Return the views of some of the states."""
-    shown = np.isin(views.state_of_view, states)
-    return replace(
-        views,
-        images=views.images[shown],
-        usable=views.usable[shown],
-        camera_from_world=views.camera_from_world[shown],
-        intrinsics=views.intrinsics[shown],
-        state_of_view=np.searchsorted(states, views.state_of_view[shown]),
-        poses=views.poses[states],
-        readings=views.readings[states],
-    )

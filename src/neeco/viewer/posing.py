@@ -29,7 +29,7 @@ from neeco.base.files import LOCK_WAIT_S, own_folder, require_like
 from neeco.capture.images import open_image
 from neeco.ingest.posing.along_shaft import crop
 from neeco.ingest.posing.posed_capture import (
-    N_SUGGESTED,
+    POSING,
     HandPose,
     PosedCapture,
     SolvedPosing,
@@ -286,9 +286,9 @@ class PosingServer:
             "frames": len(self.posed.frames),
             "suggested": [
                 {"frame": item.frame, "reason": item.reason}
-                for item in posing.suggestions(max(1, N_SUGGESTED - len(answered)))
+                for item in posing.suggestions(max(1, POSING.n_suggested - len(answered)))
             ],
-            "of": max(N_SUGGESTED, len(answered)),
+            "of": max(POSING.n_suggested, len(answered)),
             "answered": [
                 {
                     "frame": frame,

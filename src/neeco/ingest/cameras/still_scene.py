@@ -30,16 +30,25 @@ from neeco.ingest.frames.images import SfmResult, StageProgress, Views, reduced
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import IngestSettings, Recording, VideoFile
 
-N_FRAMES = 24  # spread over the recording, that are compared with each other
-N_CELLS = 20  # across an image, with a feature each
-MIN_TEXTURE = 2e-5  # of a feature: the lesser eigenvalue of its slopes' covariance, of a white of 1
-MIN_FEATURES = 30
+
+@dataclass(frozen=True, kw_only=True)
+class StillScopeSettings:
+    """Settings of the test whether a scope stands still, and of its second camera."""
+
+    n_frames: int = 24  # spread over the recording, that are compared with each other
+    n_cells: int = 20  # across an image, with a feature each
+    min_texture: float = 2e-5  # of a feature: the lesser eigenvalue of its slopes' covariance, of a white of 1
+    min_features: int = 30  # of an image
+    in_place: float = 0.0125  # share of the image's width within which a feature is in place (tissue breathes)
+    max_return_px: float = 1.0  # error of a feature that is tracked there and back
+    still_share: float = 0.2  # of the features, in place in frames of a still scope; the others move or breathe
+    still_pairs: float = 0.85  # share of the pairs of frames, in which they are
+    max_epipolar: float = 0.004  # of the image's width, distance from epipolar lines: a quarter of a degree
+
+
+STILL_SCOPE = StillScopeSettings()
+
 TRACKING: dict[str, Any] = {"winSize": (15, 15), "maxLevel": 1, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-IN_PLACE = 0.0125  # share of the image's width within which a feature is in place (tissue breathes)
-MAX_RETURN_PX = 1.0  # error of a feature that is tracked there and back
-STILL_SHARE = 0.2  # of the features, in place in frames of a still scope; the others move or breathe
-MAX_EPIPOLAR = 0.004  # of the image's width, distance from epipolar lines: a quarter of a degree
-STILL_PAIRS = 0.85  # share of the pairs of frames, in which they are
 Tracked = Mapping[str, PosesAt]  # instrument -> camera_from_instrument [K, 4, 4] of the chosen frames
 
 
@@ -48,18 +57,18 @@ def stands_still(load: Callable[[int], np.ndarray], count: int) -> bool:
 
     load: one of the images, uint8 [H, W, 3].
     """
-    rows = evenly_spaced(count, N_FRAMES)
+    rows = evenly_spaced(count, STILL_SCOPE.n_frames)
     grey = [_even_light(cv2.cvtColor(reduced(load(row)), cv2.COLOR_RGB2GRAY)) for row in rows]
     stay = []
     for step in {1, len(grey) // 3, len(grey) // 2, 2 * len(grey) // 3} - {0}:
         stay += [_share_in_place(first, second) for first, second in zip(grey, grey[step:], strict=False)]
     shares = np.array([share for share in stay if share is not None])
-    return len(shares) > 0 and float(np.mean(shares > STILL_SHARE)) > STILL_PAIRS
+    return len(shares) > 0 and float(np.mean(shares > STILL_SCOPE.still_share)) > STILL_SCOPE.still_pairs
 
 
 def video_stands_still(video: VideoSource) -> bool:
     """Return the same of a video. Raises NeecoError where it cannot be read."""
-    images = [image for _, image in video.read(evenly_spaced(len(video.times), N_FRAMES))]
+    images = [image for _, image in video.read(evenly_spaced(len(video.times), STILL_SCOPE.n_frames))]
     return stands_still(images.__getitem__, len(images))
 
 
@@ -72,18 +81,18 @@ def same_place(first: np.ndarray, second: np.ndarray) -> float | None:
 def _share_in_place(first: np.ndarray, second: np.ndarray) -> float | None:
     """`same_place` of equalised images [H, W]."""
     found = _features(first)
-    if len(found) < MIN_FEATURES:
+    if len(found) < STILL_SCOPE.min_features:
         return None
     there, seen, _ = cv2.calcOpticalFlowPyrLK(first, second, found, found.copy(), **TRACKING)
     back, seen_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, there.copy(), **TRACKING)
-    returns = np.linalg.norm(back - found, axis=-1)[:, 0] < MAX_RETURN_PX
-    near = np.linalg.norm(there - found, axis=-1)[:, 0] < IN_PLACE * first.shape[1]
+    returns = np.linalg.norm(back - found, axis=-1)[:, 0] < STILL_SCOPE.max_return_px
+    near = np.linalg.norm(there - found, axis=-1)[:, 0] < STILL_SCOPE.in_place * first.shape[1]
     return float((returns & near & (seen[:, 0] > 0) & (seen_back[:, 0] > 0)).mean())
 
 
 def _even_light(grey: np.ndarray) -> np.ndarray:
     """Return an image uint8 [H, W] relative to its local brightness, which exposure and shadows change."""
-    around = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), grey.shape[1] / N_CELLS)
+    around = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), grey.shape[1] / STILL_SCOPE.n_cells)
     return np.clip(128.0 * grey / np.maximum(around, 8), 0, 255).astype(np.uint8)
 
 
@@ -91,12 +100,12 @@ def _features(grey: np.ndarray) -> np.ndarray:
     """The best feature float32 [K, 1, 2] px of every cell of an image uint8 [H, W] that has one. The best of the whole
     image would be highlights, which come and go."""
     strength = cv2.cornerMinEigenVal(grey, 7)
-    side = max(1, grey.shape[1] // N_CELLS)
+    side = max(1, grey.shape[1] // STILL_SCOPE.n_cells)
     places = []
     for top in range(side // 2, grey.shape[0] - side, side):
         for left in range(side // 2, grey.shape[1] - side, side):
             cell = strength[top : top + side, left : left + side]
-            if cell.max() > MIN_TEXTURE:
+            if cell.max() > STILL_SCOPE.min_texture:
                 row, column = np.unravel_index(cell.argmax(), cell.shape)
                 places.append((left + column, top + row))
     return np.array(places, np.float32).reshape(-1, 1, 2)
@@ -263,7 +272,7 @@ def _by_stereo(
     right_from_left = np.linalg.inv(other.world_from_camera)
     lenses = (views.pinhole, other.pinhole)
     error = epipolar_error(left.colors, right.colors, lenses, right_from_left)
-    limit, doubt = MAX_EPIPOLAR * left.colors.shape[1], ""
+    limit, doubt = STILL_SCOPE.max_epipolar * left.colors.shape[1], ""
     if error is not None and error > limit:
         doubt = (
             f"what the second camera shows lies {error:.1f} px off where its calibration puts it (median; up to "

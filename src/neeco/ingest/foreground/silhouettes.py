@@ -59,6 +59,12 @@ class Silhouettes:
         size = np.array(self.distances.shape[:0:-1])
         return np.asarray(((pixels > margin) & (pixels < size - margin)).all(-1))
 
+    def overlap(self, filled: np.ndarray, counted: np.ndarray | bool = True) -> float:
+        """Intersection over union of filled silhouettes bool [F, h, w] with the masks, over all frames, of the pixels
+        that are `counted`."""
+        both, either = filled & self.masks & counted, (filled | self.masks) & counted
+        return int(both.sum()) / max(int(either.sum()), 1)
+
     def take(self, rows: np.ndarray) -> Silhouettes:
         """Return those of some of the frames."""
         return Silhouettes(self.masks[rows], self.distances[rows], self.intrinsics, self.shafts.take(rows))
@@ -107,17 +113,21 @@ class ShaftLines:
         return replace(self, points=self.entering_points, directions=self.entering_directions)
 
 
-def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLines:
-    """Return lines and tips of the largest elongated piece of each mask [F, h, w] that enters at the image's border."""
-    count, height, width = masks.shape
-    points, directions, tips, entries, courses = (np.full((count, 2), np.nan) for _ in range(5))
-    hulls: list[np.ndarray] = [np.full((1, 2), np.nan)] * count
-    border = np.zeros((height, width), dtype=bool)
-    edge = SHAFT_LINES.edge_px
-    border[:edge] = border[-edge:] = True
-    border[:, :edge] = border[:, -edge:] = True
+def border_of(size: tuple[int, ...], hidden: np.ndarray | None) -> np.ndarray:
+    """Pixels bool [h, w] within `edge_px` of the border of an image of that size, or of what is hidden."""
+    border, edge = np.ones(size, dtype=bool), SHAFT_LINES.edge_px
+    border[edge:-edge, edge:-edge] = False
     if hidden is not None:
         border |= cv2.dilate(hidden.astype(np.uint8), np.ones((2 * edge + 1,) * 2, np.uint8)).astype(bool)
+    return border
+
+
+def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLines:
+    """Return lines and tips of the largest elongated piece of each mask [F, h, w] that enters at the image's border."""
+    count = len(masks)
+    points, directions, tips, entries, courses = (np.full((count, 2), np.nan) for _ in range(5))
+    hulls: list[np.ndarray] = [np.full((1, 2), np.nan)] * count
+    border = border_of(masks.shape[1:], hidden)
     for row, mask in enumerate(masks):
         pieces, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
         if pieces < 2:

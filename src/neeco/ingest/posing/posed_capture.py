@@ -44,6 +44,7 @@ REMEDY = "mend or remove that line"
 class PosingSettings:
     """Thresholds of suggested frames and of answers that contradict each other."""
 
+    n_suggested: int = 10  # frames in all
     jaw_limits: tuple[float, float] = (0.0, 2.1)  # rad, of unknown jaws
     frame_s: float = 0.04  # from frame to frame, where the recording does not say
     near_break: int = 3  # frames from a break of the chain that count as at it
@@ -54,11 +55,11 @@ class PosingSettings:
     max_degrees: int = 720  # of an angle in the file of answers
 
 
-SETTINGS = PosingSettings()
+POSING = PosingSettings()
 
 
 def _degrees(node: Node) -> float:
-    if type(node.value) not in (int, float) or not abs(node.value) <= SETTINGS.max_degrees:
+    if type(node.value) not in (int, float) or not abs(node.value) <= POSING.max_degrees:
         raise Fault(node.field, f"{printable(node.value)} is no angle in degrees; {REMEDY}")
     return float(node.value)
 
@@ -132,9 +133,6 @@ def _line(answer: HandPose) -> str:
     return str(yaml.dump(value, Dumper=YamlDumper, **style)).strip()
 
 
-N_SUGGESTED = 10  # frames in all
-
-
 @dataclass(frozen=True)
 class Suggestion:
     """A frame that would help if it were posed by hand, and why, in a few words."""
@@ -177,7 +175,7 @@ class SolvedPosing:
         """Frames before which texture alone does not determine the roll."""
         return chain_breaks(self.measured.pairs, self.rolls)
 
-    def suggestions(self, count: int = N_SUGGESTED) -> list[Suggestion]:
+    def suggestions(self, count: int = POSING.n_suggested) -> list[Suggestion]:
         """The frames whose answers would help most, each as if those before it were answered already."""
         solved = list(self.angles.values())
         usable = self.measured.seen.copy()
@@ -198,11 +196,11 @@ class SolvedPosing:
 
     def _reason(self, frame: int, deviations: Sequence[float], breaks: np.ndarray) -> str:
         widths = self.measured.shapes.widths
-        if self.joints and widths[frame] >= np.quantile(widths, 1 - SETTINGS.extreme):
+        if self.joints and widths[frame] >= np.quantile(widths, 1 - POSING.extreme):
             return "jaws at their widest"
-        if len(breaks) and np.abs(breaks - frame).min() <= SETTINGS.near_break:
+        if len(breaks) and np.abs(breaks - frame).min() <= POSING.near_break:
             return "the chain of rolls breaks here"
-        if self.joints and widths[frame] <= np.quantile(widths, SETTINGS.extreme):
+        if self.joints and widths[frame] <= np.quantile(widths, POSING.extreme):
             return "jaws at their narrowest"
         names = list(self.angles)
         least = int(np.argmax(deviations))
@@ -213,20 +211,17 @@ class SolvedPosing:
         most from the others' prediction, as a wrong one makes others look wrong, too."""
         found = []
         for what, solved in self.angles.items():
-            worst, least = None, SETTINGS.outlier_sd
+            worst, least = None, POSING.outlier_sd
             for position, (frame, answer) in enumerate(self.answers):
                 angle = _angle(answer, what)
                 earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
-                if (
-                    earlier is not None
-                    and abs(apart := half_turn(angle - _angle(earlier, what))) > SETTINGS.outlier_deg
-                ):
+                if earlier is not None and abs(apart := half_turn(angle - _angle(earlier, what))) > POSING.outlier_deg:
                     found.append(OutlierAnswer(frame, what, apart, "an earlier answer"))
                 # leaving one answer out of a Gaussian posterior
                 left = max(1 - (float(solved.deviations[frame]) / math.radians(HAND_SD_DEG)) ** 2, 0.02)
                 apart = half_turn(angle - math.degrees(solved.values[frame])) / left
                 far = abs(apart) * math.sqrt(left) / HAND_SD_DEG
-                if len(self.answers) >= SETTINGS.min_answers and abs(apart) > SETTINGS.outlier_deg and far > least:
+                if len(self.answers) >= POSING.min_answers and abs(apart) > POSING.outlier_deg and far > least:
                     worst, least = OutlierAnswer(frame, what, half_turn(apart), "what its neighbours say"), far
             found += [] if worst is None else [worst]
         return found
@@ -254,7 +249,7 @@ def prepare(root: Path, load_mask: Mapping[str, Load]) -> None:
     for item in [*document["instruments"], *(item for frame in document["frames"] for item in frame["instruments"])]:
         if item["name"] in measured and (new := measured[item["name"]].joints):
             in_frame = "pose" in item
-            item["joints"] = {joint: 0.0 if in_frame else {"limits": list(SETTINGS.jaw_limits)} for joint in new}
+            item["joints"] = {joint: 0.0 if in_frame else {"limits": list(POSING.jaw_limits)} for joint in new}
     write_json(path, document)
     write_measurements(capture, measured)
     posed = PosedCapture(root)
@@ -278,7 +273,7 @@ class PosedCapture:
         self.instruments = {item.name: item for item in found if item.name in self.measured}
         self.frames = [frame.name for frame in self.capture.frames]
         times = np.array([frame.state.time for frame in self.capture.frames], float)
-        self.times = times if self.capture.timed else np.arange(len(times)) * SETTINGS.frame_s
+        self.times = times if self.capture.timed else np.arange(len(times)) * POSING.frame_s
         self.shafts = {name: Shafts.of(self.capture, item) for name, item in self.instruments.items()}
 
     def solve(self, answers: Sequence[HandPose] | None = None) -> dict[str, SolvedPosing]:

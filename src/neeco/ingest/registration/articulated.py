@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
+from neeco.geometry.lines import unit
 from neeco.ingest.foreground.silhouettes import silhouettes_of
 from neeco.ingest.registration.articulated_fit import (
     LINKED_FIT,
@@ -40,7 +40,7 @@ from neeco.ingest.registration.base import (
 )
 from neeco.ingest.registration.layers import LAYERS
 from neeco.ingest.registration.silhouette_fit import RIGID_FIT, BasePrior
-from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock, step_between
 from neeco.ingest.registration.silhouette_search import distance_to, search_bases
 from neeco.states.outline_model import ArticulatedModel, bends, joint_values, with_motion
 
@@ -125,10 +125,7 @@ def find_articulated_base(
             f"poses, readings and what moves are there together in fewer than {BASES.min_frames} frames; give the "
             "transform exactly, or a recording that shows more of it"
         )
-    if prior is None:
-        fits = _explaining(problem, unknown_starts(problem, seed))
-    else:
-        fits = _explaining(problem, known_starts(problem))
+    fits = _explaining(problem, unknown_starts(problem, seed) if prior is None else known_starts(problem))
     reached = overlap(problem, fits[0]) if fits else 0.0
     if prior is not None and reached < LINKED.usual_overlap and (words := _elsewhere(problem, reached, seed)):
         raise NeecoError(words)
@@ -209,8 +206,7 @@ def _fits(problem: ArticulatedProblem, starts: list[np.ndarray]) -> list[Articul
 def known_starts(problem: ArticulatedProblem) -> list[np.ndarray]:
     """The base as stated, and shifted along the shaft or turned about it: there it is the least certain."""
     base = problem.prior.world_from_base
-    shaft = (base[:3, :3] @ problem.poses[len(CLOCK_SHIFTS_S) // 2][:, :3, :3] @ problem.model.axis).mean(0)
-    shaft /= np.linalg.norm(shaft)
+    shaft = unit((base[:3, :3] @ problem.poses[len(CLOCK_SHIFTS_S) // 2][:, :3, :3] @ problem.model.axis).mean(0))
     steps = [np.zeros(6)]
     steps += [np.append(np.zeros(3), along * shaft) for along in LINKED.along_mm]
     steps += [np.append(roll * shaft, np.zeros(3)) for roll in LINKED.rolls_rad]
@@ -241,16 +237,10 @@ def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[A
     """The fits that differ from each better one, the best first."""
     found: list[ArticulatedFit] = []
     for fit in sorted(fits, key=lambda fit: fit.cost):
-        steps = [_step(problem, other, fit) for other in found]
+        steps = [step_between(other.world_from_base, fit.world_from_base, problem.middle) for other in found]
         if all(np.linalg.norm(s[:3]) > LINKED.apart_rad or np.linalg.norm(s[3:]) > LINKED.apart_mm for s in steps):
             found.append(fit)
     return found
-
-
-def _step(problem: ArticulatedProblem, first: ArticulatedFit, second: ArticulatedFit) -> np.ndarray:
-    """Turn rad and shift mm [6], world, at the instrument, from one base to another."""
-    turn = Rotation.from_matrix(second.world_from_base[:3, :3] @ first.world_from_base[:3, :3].T).as_rotvec()
-    return np.append(turn, problem.pivot(second.world_from_base) - problem.pivot(first.world_from_base))
 
 
 def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
@@ -273,13 +263,13 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
     spread = LINKED.scatter**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
         weight = float(np.exp(-0.5 * (other.cost - fits[0].cost)))
-        off = _step(problem, best, other)
+        off = step_between(best.world_from_base, other.world_from_base, problem.middle)
         spread = spread + weight / (1 + weight) * np.outer(off, off)
     in_view = in_camera(spread, problem.camera_from_world[0])
     floor = np.array([np.radians(LINKED.floor_deg)] * 3 + [LINKED.floor_mm, LINKED.floor_mm, LINKED.floor_depth_mm])
     spread = in_view + np.diag(floor**2)
     poses = problem.camera_from_world[0] @ best.world_from_base @ poses_at_clock(problem.poses, best.clock)
-    shaft = (poses[:, :3, :3] @ problem.model.axis).mean(0)
+    shaft = unit((poses[:, :3, :3] @ problem.model.axis).mean(0))
     stated: dict[str, Any] = {}
     if prior.sd_mm is not None:
         stated = moved_from(prior.world_from_base, best.world_from_base, problem.middle)
@@ -294,7 +284,7 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
         residual_px=best.residual_px * problem.px_scale,
         frames=len(problem.blocks),
         from_masks=True,
-        shaft=shaft / np.linalg.norm(shaft),
+        shaft=shaft,
         sd_motion_mm=sd_motion(spread, poses),
         doubts=tuple(_doubts(problem, fits[0], best, motion)),
         **stated,
@@ -318,7 +308,7 @@ def _doubts(
     ]
     found = [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
     if prior.sd_mm is not None and prior.sd_rad is not None:
-        step = _step(problem, replace(fit, world_from_base=prior.world_from_base), fit)
+        step = step_between(prior.world_from_base, fit.world_from_base, problem.middle)
         off = np.linalg.norm(step[3:]) / prior.sd_mm, np.linalg.norm(step[:3]) / prior.sd_rad
         if max(off) > LINKED.max_shift_sds:
             found.append(

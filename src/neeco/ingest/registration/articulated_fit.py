@@ -16,12 +16,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
-from neeco.ingest.foreground.silhouettes import SHAFT_LINES
+from neeco.ingest.foreground.silhouettes import SHAFT_LINES, border_of
 from neeco.ingest.registration.silhouette_fit import POSE_SDS, BasePrior
-from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSilhouettes, moved_base, poses_at_clock
+from neeco.ingest.registration.silhouette_model import (
+    BASE,
+    CLOCK_SHIFTS_S,
+    LoggedSilhouettes,
+    moved_base,
+    poses_at_clock,
+)
 from neeco.states.outline_model import ArticulatedModel, Outlines
-
-BASE = 7  # parameters of the base (turn rad [3], shift mm [3]) and the clock (s); the model's follow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,12 +90,7 @@ class ArticulatedFit:
 def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
     """Evenly spaced points [F, `max_points`, 2] px of the outlines of masks bool [F, h, w]; NaN where there are fewer.
     Those at the image's border, or beside what is hidden (bool [h, w]), do not count."""
-    height, width = masks.shape[1:]
-    open_ = np.zeros((height, width), bool)
-    open_[SHAFT_LINES.edge_px : -SHAFT_LINES.edge_px, SHAFT_LINES.edge_px : -SHAFT_LINES.edge_px] = True
-    if hidden is not None:
-        grown = cv2.dilate(hidden.astype(np.uint8), np.ones((2 * SHAFT_LINES.edge_px + 1,) * 2, np.uint8))
-        open_ &= ~grown.astype(bool)
+    open_ = ~border_of(masks.shape[1:], hidden)
     found = np.full((len(masks), LINKED_FIT.max_points, 2), np.nan)
     for row, mask in enumerate(masks):
         lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -139,7 +138,7 @@ def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
 
 
 def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points) -> np.ndarray:
-    """[F, N + M] px: positive where the model is too small."""
+    """Residuals [F, N + M] px: positive where the model is too small."""
     found = outlines(problem, fit)
     ahead, _ = problem.silhouettes.look_up(problem.model.outline_points(found))
     back = -found.distances(use.contours)[0].max(1)
@@ -227,20 +226,12 @@ def _scores(columns: np.ndarray, weighted: np.ndarray, free: int) -> np.ndarray:
 def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np.ndarray, np.ndarray]:
     """Residuals [BASE + P] of all priors in standard deviations, and the inverse standard deviations [BASE + P]; with
     poses' errors [BASE + P + 6 F]."""
-    model, prior = problem.model, problem.prior
-    scale, off = np.zeros(BASE + len(model.means)), np.zeros(BASE + len(model.means))
-    if prior.sd_rad is not None and prior.sd_mm is not None:
-        given = prior.world_from_base
-        scale[:3], scale[3:6] = 1 / prior.sd_rad, 1 / prior.sd_mm
-        off[:3] = Rotation.from_matrix(fit.world_from_base[:3, :3] @ given[:3, :3].T).as_rotvec()
-        off[3:6] = problem.pivot(fit.world_from_base) - problem.pivot(given)
-    if prior.sd_clock > 0:
-        scale[6], off[6] = 1 / prior.sd_clock, fit.clock
-    scale[BASE:], off[BASE:] = 1 / model.sds, fit.parameters - model.means
+    model = problem.model
+    off, sds = problem.prior.offsets(problem, fit.world_from_base, fit.clock)
+    off, sds = np.append(off, fit.parameters - model.means), np.append(sds, model.sds)
     if fit.pose_errors is not None:
-        scale = np.append(scale, np.tile(1 / POSE_SDS, len(fit.pose_errors)))
-        off = np.append(off, fit.pose_errors.ravel())
-    return off * scale, scale
+        off, sds = np.append(off, fit.pose_errors), np.append(sds, np.tile(POSE_SDS, len(fit.pose_errors)))
+    return off * (1 / sds), 1 / sds
 
 
 def _free(problem: ArticulatedProblem, rough: bool = False) -> np.ndarray:
@@ -256,6 +247,10 @@ def _loss(px: np.ndarray, width: float, noise: float) -> float:
     return LINKED_FIT.share * float(np.log1p((px / width) ** 2).sum()) * (width / noise) ** 2
 
 
+def _weights(px: np.ndarray, width: float, noise: float) -> np.ndarray:
+    return np.asarray(LINKED_FIT.share / noise**2 / (1 + (px / width) ** 2))
+
+
 def minimise(
     problem: ArticulatedProblem, fit: ArticulatedFit, width: float, max_steps: int = 12, *, rough: bool = False
 ) -> ArticulatedFit:
@@ -268,7 +263,7 @@ def minimise(
         use = _points(problem, fit)
         px = _residuals(problem, fit, use)
         columns = _jacobian(problem, fit, use, free)
-        weights = LINKED_FIT.share / noise**2 / (1 + (px / width) ** 2)
+        weights = _weights(px, width, noise)
         off, scale = prior_residuals(problem, fit)
         fitted = np.append(free, np.arange(count, len(scale)))
 
@@ -328,7 +323,7 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     use = _points(problem, fit)
     px = _residuals(problem, fit, use)
     columns = _jacobian(problem, fit, use, free)
-    weights = LINKED_FIT.share / noise**2 / (1 + (px / width) ** 2)
+    weights = _weights(px, width, noise)
     scores = _scores(columns, weights * px, len(free))
     scale = prior_residuals(problem, fit)[1]
     count = BASE + len(problem.model.means)
@@ -349,18 +344,16 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
 
 def overlap(problem: ArticulatedProblem, fit: ArticulatedFit) -> float:
     """Intersection over union of the fit's filled silhouette with the masks, over all frames."""
-    found, both, either = outlines(problem, fit), 0, 0
+    found = outlines(problem, fit)
     along = found.ends[:, :, 1] - found.ends[:, :, 0]
     along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-6)
     out = np.stack([-along[..., 1], along[..., 0]], -1)[:, :, None] * found.widths[..., None]
     corners = np.concatenate([found.ends + out, (found.ends - out)[:, :, ::-1]], 2)  # [F, C, 4, 2]
-    for row, mask in enumerate(problem.silhouettes.masks):
-        filled = np.zeros(mask.shape, np.uint8)
-        for cone in np.flatnonzero(found.valid[row]):
-            polygon = np.rint(np.clip(corners[row, cone], -1e4, 1e4) - 0.5).astype(np.int32)
-            cv2.fillPoly(filled, [polygon], 1)
-            end = np.rint(np.clip(found.ends[row, cone, 1], -1e4, 1e4) - 0.5).astype(int)
-            cv2.circle(filled, (int(end[0]), int(end[1])), int(min(found.widths[row, cone, 1], 1e3)), 1, -1)
-        both += int((filled.astype(bool) & mask).sum())
-        either += int((filled.astype(bool) | mask).sum())
-    return both / max(either, 1)
+    corners, ends = (
+        np.rint(np.clip(part, -1e4, 1e4) - 0.5).astype(np.int32) for part in (corners, found.ends[:, :, 1])
+    )
+    filled = np.zeros(problem.silhouettes.masks.shape, np.uint8)
+    for row, cone in np.argwhere(found.valid):
+        cv2.fillPoly(filled[row], [corners[row, cone]], 1)
+        cv2.circle(filled[row], ends[row, cone].tolist(), int(min(found.widths[row, cone, 1], 1e3)), 1, -1)
+    return problem.silhouettes.overlap(filled.astype(bool))

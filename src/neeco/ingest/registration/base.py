@@ -16,10 +16,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import BaseUncertainty, evenly_spaced
+from neeco.geometry.lines import unit
 from neeco.geometry.trocar import ShaftLine
 from neeco.ingest.foreground.silhouettes import ShaftLines, silhouettes_of
 from neeco.ingest.registration.axial_texture import with_marks
@@ -34,6 +34,7 @@ from neeco.ingest.registration.silhouette_model import (
     pivot_of,
     resized,
     sides,
+    step_between,
 )
 from neeco.ingest.registration.silhouette_search import SEARCH, distance_to, search_bases
 
@@ -65,6 +66,8 @@ class BaseSettings:
 
 
 BASES = BaseSettings()
+
+LEVERS = np.repeat([1 / BASES.lever_mm, 1.0], 3)  # rad, mm: about as much motion of a silhouette each
 
 BY_SIZE = "a shift towards where the instrument comes in, together with its size"
 
@@ -141,21 +144,10 @@ class BaseRegistration:
             listed = [float(value) if np.isfinite(value) else None for value in np.atleast_1d(values)]
             return listed if np.ndim(values) else listed[0]
 
-        numbers = (
-            "sd_mm",
-            "sd_deg",
-            "sd_motion_mm",
-            "clock_s",
-            "clock_sd_s",
-            "moved_mm",
-            "turned_deg",
-            "overlap",
-            "explained",
-        )
-        found = {name: known(getattr(self, name)) for name in (*numbers, "overlap_before")}
+        numbers = "sd_mm sd_deg sd_motion_mm clock_s clock_sd_s moved_mm turned_deg overlap explained overlap_before"
         return {
             "world_from_base": self.world_from_base.tolist(),
-            **found,
+            **{name: known(getattr(self, name)) for name in numbers.split()},
             "open": list(self.open_directions),
             "doubts": list(self.doubts),
             "covariance": [known(row) for row in self.covariance],
@@ -275,13 +267,7 @@ def _settle_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFi
 
 def overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
     """Intersection over union of the fit's filled silhouette with the masks, over all frames."""
-    both, either = 0, 0
-    left, right = np.split(sides(problem, fit).pixels, 2, axis=1)
-    for row, mask in enumerate(problem.silhouettes.masks):
-        filled = _filled(left[row], right[row], mask.shape)
-        both += int((filled & mask).sum())
-        either += int((filled | mask).sum())
-    return both / max(either, 1)
+    return problem.silhouettes.overlap(_filled(problem, sides(problem, fit).pixels))
 
 
 def shaft_overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
@@ -290,25 +276,21 @@ def shaft_overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
     counted = fit.stations > RIGID_FIT.front_share * fit.stations[-1]
     stations = np.append(fit.stations[counted], fit.stations[-1] + RIGID.max_length_mm)
     shape = np.concatenate([fit.shape[counted], fit.shape[-1:]])
-    left, right = np.split(sides(problem, replace(fit, stations=stations, shape=shape)).pixels, 2, axis=1)
+    pixels = sides(problem, replace(fit, stations=stations, shape=shape)).pixels
+    left, right = np.split(pixels, 2, axis=1)
     front, back = (left[:, 0] + right[:, 0]) / 2, (left[:, -2] + right[:, -2]) / 2
-    height, width = problem.silhouettes.masks.shape[1:]
-    y, x = np.mgrid[:height, :width] + 0.5
-    both, either = 0, 0
-    for row, mask in enumerate(problem.silhouettes.masks):
-        filled = _filled(left[row], right[row], mask.shape)
-        along = front[row] - back[row]
-        behind = (x - front[row, 0]) * along[0] + (y - front[row, 1]) * along[1] <= 0
-        both += int((filled & mask & behind).sum())
-        either += int(((filled | mask) & behind).sum())
-    return both / max(either, 1)
+    along = (front - back)[..., None, None]
+    y, x = np.mgrid[: problem.silhouettes.masks.shape[1], : problem.silhouettes.masks.shape[2]] + 0.5
+    behind = (x - front[:, 0, None, None]) * along[:, 0] + (y - front[:, 1, None, None]) * along[:, 1] <= 0
+    return problem.silhouettes.overlap(_filled(problem, pixels), behind)
 
 
-def _filled(left: np.ndarray, right: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Pixels bool [h, w] between sides [K, 2] px of a silhouette."""
-    corners = np.rint(np.clip(np.concatenate([left, right[::-1]]), -1e4, 1e4) - 0.5).astype(np.int32)
-    filled = np.zeros(shape, np.uint8)
-    cv2.fillPoly(filled, [corners], 1)
+def _filled(problem: SilhouetteProblem, pixels: np.ndarray) -> np.ndarray:
+    """Pixels bool [F, h, w] between the sides [F, 2K, 2] px of silhouettes."""
+    filled = np.zeros(problem.silhouettes.masks.shape, np.uint8)
+    left, right = np.split(np.rint(np.clip(pixels, -1e4, 1e4) - 0.5).astype(np.int32), 2, axis=1)
+    for row, corners in enumerate(np.concatenate([left, right[:, ::-1]], 1)):
+        cv2.fillPoly(filled[row], [corners], 1)
     return filled.astype(bool)
 
 
@@ -349,15 +331,13 @@ def unmoved(*, stated: bool, linked: bool = False) -> str:
 
 def moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, Any]:
     """Distance mm and degrees between a base and a given one, at the instrument's mean position [3] mm in its frame."""
-    shift = (base[:3, :3] - given[:3, :3]) @ middle + base[:3, 3] - given[:3, 3]
-    turn = Rotation.from_matrix(base[:3, :3] @ given[:3, :3].T).magnitude()
-    return {"moved_mm": float(np.linalg.norm(shift)), "turned_deg": float(np.degrees(turn))}
+    turn, shift = np.linalg.norm(step_between(given, base, middle).reshape(2, 3), axis=1)
+    return {"moved_mm": float(shift), "turned_deg": float(np.degrees(turn))}
 
 
 def _result(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> BaseRegistration:
     poses = fit.world_from_base @ instrument_in_base(problem, fit)
-    shaft = (poses[:, :3, :3] @ fit.axis).mean(0)
-    shaft /= np.linalg.norm(shaft)
+    shaft = unit((poses[:, :3, :3] @ fit.axis).mean(0))
     covariance, open_directions, clock_sd = _covariance(problem, known, fit, shaft)
     moved: dict[str, Any] = {}
     if known.sd_mm is not None:
@@ -399,7 +379,7 @@ def _covariance(
     valleys = [BASES.along_sd_mm * shaft] + ([BASES.size_sd * away] if still else [])
     for valley in valleys:
         covariance[3:6, 3:6] += np.outer(valley, valley)
-    units = np.array([1 / BASES.lever_mm] * 3 + [1.0] * 3)  # about as much motion of a silhouette each
+    units = LEVERS
     limit = BASES.open_sd_mm**2
     if known.sd_rad is not None and known.sd_mm is not None:
         units, limit = np.array([known.sd_rad] * 3 + [known.sd_mm] * 3), BASES.open_share**2
@@ -455,10 +435,8 @@ def base_from_layers(
     """Return the base that two layers of a still camera's images show, given its prior. poses [F, 4, 4]:
     base_from_instrument."""
     base = world_from_camera @ found.camera_from_base
-    shaft = (found.camera_from_base[:3, :3] @ poses[:, :3, :3] @ line.axis).mean(0)
-    shaft /= np.linalg.norm(shaft)
-    units = np.array([1 / BASES.lever_mm] * 3 + [1.0] * 3)
-    after, before = found.covariance[:6, :6] / np.outer(units, units), np.square(found.given[:6] / units)
+    shaft = unit((found.camera_from_base[:3, :3] @ poses[:, :3, :3] @ line.axis).mean(0))
+    after, before = found.covariance[:6, :6] / np.outer(LEVERS, LEVERS), np.square(found.given[:6] / LEVERS)
     values, vectors = np.linalg.eigh(after)
     words = [
         _direction(np.eye(3), [shaft], vector)

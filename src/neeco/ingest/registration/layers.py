@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from neeco.capture.model import evenly_spaced
+from neeco.geometry.lines import unit
 from neeco.geometry.trocar import ShaftLine
 from neeco.ingest.foreground.background import exposure, find_background
 from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, RIGID, moved_base, poses_at_clock
@@ -320,8 +321,7 @@ def _common_errors(trial: _Trial, mean: np.ndarray) -> np.ndarray:
     as its size hardly is, and everywhere by blurred edges."""
     base, arm = trial.at(mean)[0], trial.model.arm
     place = base[:3, :3] @ trial.middle + base[:3, 3]
-    shaft = base[:3, :3] @ (arm.poses[len(CLOCK_SHIFTS_S) // 2, :, :3, :3] @ arm.line.axis).mean(0)
-    shaft = shaft / np.linalg.norm(shaft)
+    shaft = unit(base[:3, :3] @ (arm.poses[len(CLOCK_SHIFTS_S) // 2, :, :3, :3] @ arm.line.axis).mean(0))
     along_view, along_shaft = LAYERS.size_sd**2 * np.outer(place, place), LAYERS.end_sd_mm**2 * np.outer(shaft, shaft)
     return np.asarray(along_view + along_shaft + LAYERS.edge_sd_mm**2 * np.eye(3))
 

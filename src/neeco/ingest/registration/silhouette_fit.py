@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.ingest.registration.silhouette_model import (
     BASE,
     LINE,
     ORDERS,
+    LoggedSilhouettes,
     SilhouetteFit,
     SilhouetteProblem,
     first_shape,
@@ -24,6 +24,7 @@ from neeco.ingest.registration.silhouette_model import (
     moved,
     reach,
     sides,
+    step_between,
 )
 
 
@@ -76,6 +77,17 @@ class BasePrior:
         if stated is None:
             return cls(np.eye(4), None, None, sd_clock)
         return cls(stated[0], np.radians(stated[2]), stated[1], sd_clock)
+
+    def offsets(self, problem: LoggedSilhouettes, base: np.ndarray, clock: float) -> tuple[np.ndarray, np.ndarray]:
+        """Turn, shift and clock [BASE] of a base [4, 4] from the prior, and the standard deviations [BASE], inf where
+        nothing is known and where the clock is."""
+        off, sds = np.zeros(BASE), np.full(BASE, np.inf)
+        if self.sd_rad is not None and self.sd_mm is not None:
+            off[:6] = step_between(self.world_from_base, base, problem.middle)
+            sds[:3], sds[3:6] = self.sd_rad, self.sd_mm
+        if self.sd_clock > 0:
+            off[6], sds[6] = clock, self.sd_clock
+        return off, sds
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,41 +174,26 @@ class _System:
 
     def prior_residuals(self, fit: SilhouetteFit) -> tuple[np.ndarray, np.ndarray]:
         """Residuals [Q] of all priors, in standard deviations, and their derivatives [Q, P]."""
-        count, start = len(self.free), BASE + LINE
-        indices, offsets, sds = [], [], []
-
-        def add(index: np.ndarray, off: np.ndarray, sd: np.ndarray | float) -> None:
-            indices.append(index)
-            offsets.append(off.ravel())
-            sds.append(np.broadcast_to(sd, off.shape).ravel())
-
-        line_sd = np.array([RIGID_FIT.line_sd_rad] * 2 + [RIGID_FIT.line_sd_mm] * 2)  # of a step
-        add(np.arange(BASE, start), np.zeros(LINE), line_sd)
-        prior, given = self.prior, self.prior.world_from_base
-        if prior.sd_rad is not None and prior.sd_mm is not None:
-            turn = Rotation.from_matrix(fit.world_from_base[:3, :3] @ given[:3, :3].T)
-            add(np.arange(3), turn.as_rotvec(), prior.sd_rad)
-            add(np.arange(3, 6), self.problem.pivot(fit.world_from_base) - self.problem.pivot(given), prior.sd_mm)
-        if prior.sd_clock > 0:
-            add(np.array([6]), np.array([fit.clock]), prior.sd_clock)
-        off = fit.shape.copy()
-        off[:, 0, 0] -= self.first.shape[:, 0, 0]
-        shape_sd = np.full(off.shape[1:], RIGID_FIT.joint_sd_mm)
-        shape_sd[0] = [RIGID_FIT.shape_sd_mm[0]] + [
-            RIGID_FIT.shape_sd_mm[order] for order in range(1, ORDERS + 1) for _ in range(2)
-        ]
-        add(start + np.arange(off[1:].size), off[1:], shape_sd)
-        end_sd = np.where(np.arange(len(fit.ends)), RIGID_FIT.end_sd_mm, RIGID_FIT.line_sd_mm)
-        add(np.arange(count - 1 - len(fit.ends), count - 1), fit.ends, end_sd)
-        add(np.array([count - 1]), np.zeros(1), RIGID_FIT.mark_sd_mm)
-        index, values, sd = (np.concatenate(part) for part in (indices, offsets, sds))
-        rows = np.zeros((len(index) + len(self.on_shaft), count))
-        rows[np.arange(len(index)), index] = 1 / sd
-        radii = start + fit.shape[0].size * (self.on_shaft - 1)  # parameters
-        rows[np.arange(len(index), len(rows)), radii] = 1 / RIGID_FIT.level_sd_mm
-        rows[np.arange(len(index), len(rows)), radii - fit.shape[0].size] = -1 / RIGID_FIT.level_sd_mm
+        start, kinds = BASE + LINE, fit.shape[0].size
+        end = start + fit.shape[1:].size
+        off, sds = np.zeros(len(self.free)), np.full(len(self.free), np.inf)
+        off[:BASE], sds[:BASE] = self.prior.offsets(self.problem, fit.world_from_base, fit.clock)
+        sds[BASE:start] = [RIGID_FIT.line_sd_rad] * 2 + [RIGID_FIT.line_sd_mm] * 2  # of a step
+        shape = fit.shape.copy()
+        shape[:, 0, 0] -= self.first.shape[:, 0, 0]
+        shape_sd = np.full(shape.shape[1:], RIGID_FIT.joint_sd_mm)
+        shape_sd[0] = np.repeat(RIGID_FIT.shape_sd_mm, [1] + [2] * ORDERS)
+        off[start:end], sds[start:end] = shape[1:].ravel(), np.tile(shape_sd.ravel(), len(shape) - 1)
+        off[end:-1], sds[end:-1] = (
+            fit.ends,
+            np.where(np.arange(len(fit.ends)), RIGID_FIT.end_sd_mm, RIGID_FIT.line_sd_mm),
+        )
+        sds[-1] = RIGID_FIT.mark_sd_mm
+        radii, level = start + kinds * (self.on_shaft - 1), np.arange(len(self.on_shaft))
+        levels = np.zeros((len(level), len(off)))
+        levels[level, radii], levels[level, radii - kinds] = 1 / RIGID_FIT.level_sd_mm, -1 / RIGID_FIT.level_sd_mm
         steps = fit.shape[self.on_shaft, 0, 0] - fit.shape[self.on_shaft - 1, 0, 0]
-        return np.concatenate([values / sd, steps / RIGID_FIT.level_sd_mm]), rows
+        return np.append(off / sds, steps / RIGID_FIT.level_sd_mm), np.concatenate([np.diag(1 / sds), levels])
 
     def prior_loss(self, fit: SilhouetteFit) -> float:
         """Sum of squares of the priors' residuals."""

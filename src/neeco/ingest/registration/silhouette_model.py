@@ -135,6 +135,13 @@ def moved_base(base: np.ndarray, pivot: np.ndarray, step: np.ndarray) -> np.ndar
     return moved
 
 
+def step_between(first: np.ndarray, second: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Rotation vector rad and shift mm [6], world, from one base [4, 4] to another at a point [3] mm in their frames:
+    the step of `moved_base`."""
+    turn = Rotation.from_matrix(second[:3, :3] @ first[:3, :3].T).as_rotvec()
+    return np.append(turn, second[:3, :3] @ middle + second[:3, 3] - (first[:3, :3] @ middle + first[:3, 3]))
+
+
 def instrument_in_base(problem: SilhouetteProblem, fit: SilhouetteFit) -> np.ndarray:
     """base_from_instrument [F, 4, 4] at the fit's clock."""
     return poses_at_clock(problem.poses, fit.clock)

@@ -27,29 +27,50 @@ from neeco.ingest.shaft.edges import (
 )
 from neeco.ingest.timing.episodes import Episodes
 
-# what is asked of a recording
-MIN_DIAMETERS, MIN_SHARE = 2.0, 0.6  # of visible shaft, and the share of the frames that show them
-MIN_FRAMES_SHARE, MIN_FRAMES = 0.3, 10  # that show an instrument with a shaft at all
-SECOND_AREA, SECOND_SHARE = 0.3, 0.4  # share of the largest piece's area, and of the frames: two instruments
 
-# first guess
-DEFAULT_HEAD_DIAMETERS = 5.0  # length of a head, where nothing measures it
-DEPTH_RANGE = (0.4, 2.5)  # of the median depth, for a shaft to be accepted
-WINDOW_FRAMES, MAX_JUMP = 5, 0.35  # to both sides; difference from their median direction, for an outlier
-HEAD_RANGE = (0.4, 1.6)  # of the median length of the head, for an end to be accepted
-CLOSED_QUANTILE = 0.8  # of the heads' lengths, taken for that of closed jaws
+@dataclass(frozen=True, kw_only=True)
+class ShaftSearchSettings:
+    """Thresholds of instruments found in a video."""
 
-MIN_ROUNDS, MAX_ROUNDS = 3, 7
-STRAIGHT_PX = 0.15  # by which the median of the edges may leave a straight line
-BIN_RADII, BINS = 0.5, 16  # of shaft, in each of which the edges are averaged
-MIN_FILLED = 0.3  # places on edges in a bin, per frame
-BLUR_FRAMES = 40  # from which the lens's blur is estimated
-TROCAR_RMS_MM = 3.0  # distance between the axes and a trocar that is fixed
-END_PX, TIP_MM = 1.5, 3.0  # standard deviations of the shaft's end, from its colour or from the tip
-SLIDING_MM_S = 20.0  # along its axis, where the end is not observed
-MAX_SD = (4.0, 2.5, 4.0)  # degrees of tilt, mm across the shaft, mm along it, of a frame that is kept
-TISSUE_BEHIND = 1.15  # depth of the tissue over that of the instrument's deepest place, where nothing measures it
-MAX_SCALE_SD = 0.15  # of its logarithm, up to which the cameras' scale is known
+    # what is asked of a recording
+    min_diameters: float = 2.0  # of visible shaft
+    min_share: float = 0.6  # of the frames that show them
+    min_frames_share: float = 0.3  # of the frames, that show an instrument with a shaft at all
+    min_frames: int = 10  # the same, at least
+    second_area: float = 0.3  # share of the largest piece's area, from which another is a second instrument
+    second_share: float = 0.4  # of the frames with such a piece: two instruments
+    # first guess
+    default_head_diameters: float = 5.0  # length of a head, where nothing measures it
+    depth_range: tuple[float, float] = (0.4, 2.5)  # of the median depth, for a shaft to be accepted
+    window_frames: int = 5  # to both sides, with which a frame's direction is compared
+    max_jump: float = 0.35  # difference from their median direction, for an outlier
+    head_range: tuple[float, float] = (0.4, 1.6)  # of the median length of the head, for an end to be accepted
+    closed_quantile: float = 0.8  # of the heads' lengths, taken for that of closed jaws
+    # solution
+    min_rounds: int = 3  # of detecting edges and solving for axes, at least
+    max_rounds: int = 7  # the same, at most
+    straight_px: float = 0.15  # by which the median of the edges may leave a straight line
+    bin_radii: float = 0.5  # of shaft, in each of which the edges are averaged
+    bins: int = 16  # of that length
+    min_filled: float = 0.3  # places on edges in a bin, per frame
+    blur_frames: int = 40  # from which the lens's blur is estimated
+    trocar_rms_mm: float = 3.0  # distance between the axes and a trocar that is fixed
+    end_px: float = 1.5  # standard deviation of the shaft's end, from its colour
+    tip_mm: float = 3.0  # the same, from the tip
+    sliding_mm_s: float = 20.0  # along its axis, where the end is not observed
+    # degrees of tilt, mm across the shaft, mm along it, of a frame that is kept
+    max_sd: tuple[float, float, float] = (4.0, 2.5, 4.0)
+    # depth of the tissue over that of the instrument's deepest place, where nothing measures it
+    tissue_behind: float = 1.15
+    max_scale_sd: float = 0.15  # of its logarithm, up to which the cameras' scale is known
+    roll_deg: float = 5.0  # standard deviation of a logged roll
+    reading_deg: float = 1.0  # of a logged joint
+    margin_px: int = 7  # about what moves, in which features are not the tissue's
+
+
+SHAFT = ShaftSearchSettings()
+
+NOT_VISIBLE = "too little of the shaft is visible"
 UNKNOWN_SCALE = (
     "nothing measures how far the cameras moved in mm (a fixed trocar does, where both move enough): their scale is a "
     "guess, and so is the distance between instrument and tissue; how both look from these cameras is not affected"
@@ -80,7 +101,7 @@ class FoundShaft:
     @property
     def share(self) -> float:
         """Share of the frames that show two diameters of shaft."""
-        return float((self.diameters >= MIN_DIAMETERS).mean())
+        return float((self.diameters >= SHAFT.min_diameters).mean())
 
 
 def find_shaft(
@@ -111,35 +132,35 @@ def find_shaft(
         notes.append(UNKNOWN_SCALE)
     diameters, blur = np.zeros(len(images)), BLURS[0]
     offset = 0.0  # mm by which the shaft ends before the change of colour
-    for turn in range(MAX_ROUNDS):
+    for turn in range(SHAFT.max_rounds):
         if turn == 0:
-            sample = evenly_spaced(len(images), BLUR_FRAMES)
+            sample = evenly_spaced(len(images), SHAFT.blur_frames)
             few = replace(axes, points=axes.points[sample], directions=axes.directions[sample])
             blur = min(BLURS, key=lambda px: shaded_edges(images[sample], few, video.radius, video.intrinsics, px)[2])
         edges, diameters, _ = shaded_edges(images, axes, video.radius, video.intrinsics, blur)
         axes = solve_axes(video, axes, edges, covariance=turn == 0)
-        if turn == 0 and axes.scale_sd is not None and axes.scale_sd > MAX_SCALE_SD:
+        if turn == 0 and axes.scale_sd is not None and axes.scale_sd > SHAFT.max_scale_sd:
             video, axes = replace(video, scaled=True), _plausible(axes, tissue)
             notes.append(UNKNOWN_SCALE)
         narrower = _narrower_part(video, axes, edges) if turn > 0 else 0.0
         offset += narrower
         axes, ends, heads = _at_end(axes, images, masks, video, working_length, offset)
-        if turn >= MIN_ROUNDS - 1 and not narrower:
+        if turn >= SHAFT.min_rounds - 1 and not narrower:
             break
     axes = solve_axes(video, axes, edges, covariance=True)
-    share = float((diameters >= MIN_DIAMETERS).mean())
-    if share < MIN_SHARE:
+    share = float((diameters >= SHAFT.min_diameters).mean())
+    if share < SHAFT.min_share:
         raise NeecoError(
-            f"two diameters of shaft are visible in {share:.0%} of the frames (at least {MIN_SHARE:.0%} are needed to "
-            "find its direction); hold the scope back, or the instrument farther in, so that its shaft shows"
+            f"two diameters of shaft are visible in {share:.0%} of the frames (at least {SHAFT.min_share:.0%} are "
+            "needed to find its direction); hold the scope back, or the instrument farther in, so that its shaft shows"
         )
     by_color = bool(ends.any()) and heads is not None
     length = working_length or (
-        float(np.nanquantile(heads, CLOSED_QUANTILE)) if heads is not None else _default_head(video)
+        float(np.nanquantile(heads, SHAFT.closed_quantile)) if heads is not None else _default_head(video)
     )
     along_sd = _along_deviation(video, axes, ends, by_color)
     uncertainties, tilt, across = _uncertainties(axes, poses := _poses(video, axes), along_sd, video)
-    known = (tilt < MAX_SD[0]) & (across < MAX_SD[1]) & (along_sd < MAX_SD[2])
+    known = (tilt < SHAFT.max_sd[0]) & (across < SHAFT.max_sd[1]) & (along_sd < SHAFT.max_sd[2])
     if not known.any():
         raise NeecoError("the shaft's direction is uncertain in all frames; film more of the shaft, and nearer")
     if not by_color:
@@ -162,13 +183,13 @@ def find_shaft(
 
 
 def _default_head(video: ShaftVideo) -> float:
-    return DEFAULT_HEAD_DIAMETERS * 2 * video.radius
+    return SHAFT.default_head_diameters * 2 * video.radius
 
 
 def _plausible(axes: ShaftAxes, tissue: float) -> ShaftAxes:
     """The axes with a scale of the cameras at which the tissue lies behind the instrument."""
     deepest = float(np.quantile(axes.points[:, 2], 0.95))
-    return replace(axes, scale=max(1.0, TISSUE_BEHIND * deepest / tissue), scale_sd=None)
+    return replace(axes, scale=max(1.0, SHAFT.tissue_behind * deepest / tissue), scale_sd=None)
 
 
 def _require_one(masks: np.ndarray) -> None:
@@ -178,13 +199,13 @@ def _require_one(masks: np.ndarray) -> None:
         facts = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)[2]
         areas = np.sort(facts[1:, cv2.CC_STAT_AREA])[::-1]
         seen += len(areas) > 0
-        two += len(areas) > 1 and areas[1] > SECOND_AREA * areas[0]
-    if seen < max(MIN_FRAMES, MIN_FRAMES_SHARE * len(masks)):
+        two += len(areas) > 1 and areas[1] > SHAFT.second_area * areas[0]
+    if seen < max(SHAFT.min_frames, SHAFT.min_frames_share * len(masks)):
         raise NeecoError(
             f"something moves before the tissue in {seen} of {len(masks)} frames; record longer, or move the "
             "instrument more"
         )
-    if two > SECOND_SHARE * seen:
+    if two > SHAFT.second_share * seen:
         raise NeecoError(
             f"two instruments are visible in {two} of {len(masks)} frames, and from video alone they cannot be "
             "distinguished; film one at a time"
@@ -202,7 +223,7 @@ def _first_axes(
         along = _behind_tips(masks, lines.points, lines.directions, radii)
     ends = lines.points + along[:, None] * lines.directions
     axes, edges, found = outline_edges(masks, ends, lines.directions, video.radius, video.intrinsics)
-    if found.sum() < max(MIN_FRAMES, MIN_FRAMES_SHARE * len(masks)):
+    if found.sum() < max(SHAFT.min_frames, SHAFT.min_frames_share * len(masks)):
         raise NeecoError(
             f"a shaft is visible in {int(found.sum())} of {len(masks)} frames; hold the scope back, so that more than "
             "the instrument's end shows"
@@ -231,20 +252,20 @@ def _passes_one_point(video: ShaftVideo, axes: ShaftAxes) -> bool:
     """Whether axes solved with a trocar pass it."""
     assert axes.trocar is not None
     missed = distances_to_lines(axes.trocar, *video.world_lines(axes))
-    return float(np.sqrt(np.mean(missed**2))) < TROCAR_RMS_MM
+    return float(np.sqrt(np.mean(missed**2))) < SHAFT.trocar_rms_mm
 
 
 def _bridged(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges, found: np.ndarray) -> tuple[ShaftAxes, ShaftEdges]:
     """Interpolate the axes of outlier frames from the others, which alone keep their edges."""
     depth = axes.points[:, 2]
     usual = float(np.median(depth[found]))
-    good = found & (depth > DEPTH_RANGE[0] * usual) & (depth < DEPTH_RANGE[1] * usual)
+    good = found & (depth > SHAFT.depth_range[0] * usual) & (depth < SHAFT.depth_range[1] * usual)
     points, directions = video.world_lines(axes)
     for _ in range(2):
         for frame in np.flatnonzero(good):
-            near = np.clip(frame + np.arange(-WINDOW_FRAMES, WINDOW_FRAMES + 1), 0, len(good) - 1)
+            near = np.clip(frame + np.arange(-SHAFT.window_frames, SHAFT.window_frames + 1), 0, len(good) - 1)
             near = near[good[near] & (video.episodes[near] == video.episodes[frame])]
-            if np.linalg.norm(directions[frame] - np.median(directions[near], axis=0)) > MAX_JUMP:
+            if np.linalg.norm(directions[frame] - np.median(directions[near], axis=0)) > SHAFT.max_jump:
                 good[frame] = False
     values = np.concatenate([points, directions], 1)
     values = np.stack([np.interp(video.times, video.times[good], column[good]) for column in values.T], 1)
@@ -281,7 +302,7 @@ def _at_end(
     if np.isfinite(shift).any():
         heads = tips - shift + offset
         usual = np.nanmedian(heads) if np.isfinite(heads).any() else np.nan
-        shift[(heads < HEAD_RANGE[0] * usual) | (heads > HEAD_RANGE[1] * usual)] = np.nan
+        shift[(heads < SHAFT.head_range[0] * usual) | (heads > SHAFT.head_range[1] * usual)] = np.nan
     else:
         shift = tips - (working_length or _default_head(video))
     shift = shift - offset
@@ -300,15 +321,15 @@ def _narrower_part(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges) -> flo
         for side in range(2):
             there = np.isfinite(edges.deviations[frame, side])
             behind = -axis_coordinates(axes, frame, edges.pixels[frame, side, there], video.intrinsics)
-            places.append(behind / (BIN_RADII * video.radius))
+            places.append(behind / (SHAFT.bin_radii * video.radius))
             values.append(missed[frame, side, there])
     place, value = np.concatenate(places).astype(int), np.concatenate(values)
-    numbers = [number for number in range(BINS) if (place == number).sum() >= MIN_FILLED * len(axes.points)]
+    numbers = [number for number in range(SHAFT.bins) if (place == number).sum() >= SHAFT.min_filled * len(axes.points)]
     medians = np.array([np.median(value[place == number]) for number in numbers])
-    if len(medians) < 4 or np.abs(medians).max() < STRAIGHT_PX:
+    if len(medians) < 4 or np.abs(medians).max() < SHAFT.straight_px:
         return 0.0
     step = int((medians[:-1] - medians[1:])[:-1].argmax())  # from inside the contour to outside, going back
-    return float(numbers[step + 1] * BIN_RADII * video.radius)
+    return float(numbers[step + 1] * SHAFT.bin_radii * video.radius)
 
 
 def _along_deviation(video: ShaftVideo, axes: ShaftAxes, ends: np.ndarray, by_color: bool) -> np.ndarray:
@@ -316,9 +337,9 @@ def _along_deviation(video: ShaftVideo, axes: ShaftAxes, ends: np.ndarray, by_co
     if not ends.any():
         return np.full(len(ends), np.inf)
     slant = np.abs((unit(axes.points) * axes.directions).sum(1))
-    seen = END_PX * axes.points[:, 2] / video.intrinsics[0] / np.sqrt(np.maximum(1 - slant**2, 1e-3))
+    seen = SHAFT.end_px * axes.points[:, 2] / video.intrinsics[0] / np.sqrt(np.maximum(1 - slant**2, 1e-3))
     nearest = np.abs(video.times[:, None] - video.times[ends]).min(1)
-    return np.asarray(np.hypot(seen if by_color else TIP_MM, SLIDING_MM_S * nearest))
+    return np.asarray(np.hypot(seen if by_color else SHAFT.tip_mm, SHAFT.sliding_mm_s * nearest))
 
 
 def _poses(video: ShaftVideo, axes: ShaftAxes) -> np.ndarray:
@@ -360,12 +381,6 @@ def _uncertainties(
     largest = np.sqrt(np.linalg.eigvalsh(axes.covariance[:, :2, :2])[:, -1])
     aside = np.sqrt(np.linalg.eigvalsh(axes.covariance[:, 2:, 2:])[:, -1])
     return found, np.degrees(largest), aside
-
-
-NOT_VISIBLE = "too little of the shaft is visible"
-ROLL_DEG = 5.0  # standard deviation of a logged roll
-READING_DEG = 1.0  # of a logged joint
-MARGIN_PX = 7  # about what moves, in which features are not the tissue's
 
 
 def find_in_video(
@@ -413,8 +428,8 @@ def _in_words(name: str, found: FoundShaft) -> str:
         scale = f"; the cameras' scale is known to {found.axes.scale_sd:.0%}, from the trocar"
     return (
         f"instrument {name!r} was found in the video: {found.share:.0%} of the frames show two diameters of its shaft "
-        f"({MIN_SHARE:.0%} are needed); {left_out} of {len(found.known)} show too little of it and are left out; its "
-        f"direction has a standard deviation of {np.median(turns):.1f} degrees, its place of "
+        f"({SHAFT.min_share:.0%} are needed); {left_out} of {len(found.known)} show too little of it and are left out; "
+        f"its direction has a standard deviation of {np.median(turns):.1f} degrees, its place of "
         f"{np.median(shifts[:, :2]):.1f} mm across the view and {np.median(shifts[:, 2]):.1f} mm in depth; from the "
         f"end of the shaft to the tip it is {found.working_length:.0f} mm{scale}"
     )
@@ -423,7 +438,9 @@ def _in_words(name: str, found: FoundShaft) -> str:
 def on_masks(masks: np.ndarray, sfm: SfmResult, size: tuple[int, int]) -> np.ndarray:
     """Return bool [Q], the observations of `sfm` on or near masks bool [M, h, w] of its rows. size: of the images whose
     pixels they count."""
-    around = np.stack([cv2.dilate(mask.astype(np.uint8), np.ones((MARGIN_PX, MARGIN_PX), np.uint8)) for mask in masks])
+    around = np.stack(
+        [cv2.dilate(mask.astype(np.uint8), np.ones((SHAFT.margin_px, SHAFT.margin_px), np.uint8)) for mask in masks]
+    )
     _, height, width = masks.shape
     row, x, y = (sfm.observations[:, column] for column in (0, 2, 3))
     column = np.clip(x * width / size[0], 0, width - 1).astype(int)
@@ -435,8 +452,8 @@ def uncertainties(item: InstrumentLogs, found: FoundShaft) -> tuple[Uncertainty,
     assert item.from_video is not None
     known = found.uncertainties
     if item.roll is not None:
-        known = tuple(replace(one, rotation_deg=(*one.rotation_deg[:2], ROLL_DEG)) for one in known)
-    joints = dict.fromkeys(item.joints, READING_DEG)
+        known = tuple(replace(one, rotation_deg=(*one.rotation_deg[:2], SHAFT.roll_deg)) for one in known)
+    joints = dict.fromkeys(item.joints, SHAFT.reading_deg)
     return tuple(replace(one, joints_deg=joints) for one in known)
 
 
