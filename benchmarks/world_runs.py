@@ -32,7 +32,6 @@ from neeco.base.files import finite, read_json, write_json
 ROOT = Path(__file__).resolve().parents[1]
 METHOD = "import neeco.methods.kinematic.deformation as m; "
 SEARCH = "import neeco.methods.kinematic.discovery as m; "
-PASSES = "import neeco.methods.kinematic.state_passes as m; "
 SESSION = "import neeco.training.session as m; "
 NOTHING = "lambda *_, **__: None"
 
@@ -93,12 +92,12 @@ WITHOUT: dict[str, Mechanism] = {
     ),
     "state-fits": Mechanism(f"{METHOD}m.fit_states = {NOTHING}", mistaken),
     "contradictions": Mechanism(
-        PASSES
+        METHOD
         + "; ".join(f"m.{name} = {NOTHING}" for name in ("refit_outliers", "judge_again", "leave_out_unexplained")),
         mistaken,
     ),
-    "judging-again": Mechanism(f"{PASSES}m.judge_again = {NOTHING}", mistaken),
-    "carving-again": Mechanism(f"{PASSES}m.carve_again = {NOTHING}", mistaken),
+    "judging-again": Mechanism(f"{METHOD}m.judge_again = {NOTHING}", mistaken),
+    "carving-again": Mechanism(f"{METHOD}m.carve_again = {NOTHING}", mistaken),
     "wrists-placed": Mechanism(f"{METHOD}m.place_wrists = {NOTHING}", jointed),
     "wrists-again": _option("deformation.refine_wrists=false", jointed),
     "shadow": _option("deformation.shadow=false"),

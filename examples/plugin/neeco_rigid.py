@@ -10,7 +10,6 @@ from neeco.methods.space_carving import CarvingSettings
 from neeco.methods.tissue_fit import carve_seeds
 from neeco.scene.canonical import join_bodies, seed_instrument
 from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Posed, state_of
-from neeco.training.session import gaussian_session
 
 OWNER = "owner"  # the per-Gaussian extra [N]: 0 tissue, else the instrument's number
 
@@ -43,8 +42,8 @@ class Rigid(LabelledByMotion):
     def initial_extras(self, canonical) -> dict[str, Tensor]:
         return {OWNER: canonical.means.new_zeros(len(canonical))}
 
-    def begin(self, training) -> None:
-        session, bodies = gaussian_session(training), [training.scene.canonical]
+    def begin(self, session) -> None:
+        bodies = [session.scene.canonical]
         with session.searching():
             carved = carve_seeds(session)
         for number, (points, radius) in enumerate(carved, start=1):
@@ -52,7 +51,7 @@ class Rigid(LabelledByMotion):
             body = seed_instrument(points @ pose[:3, :3].T + pose[:3, 3], radius)
             bodies.append(body.with_extras(**{OWNER: body.means.new_full((len(body),), number)}))
         joined = join_bodies(bodies)
-        training.scene.canonical = joined.map(lambda tensor: tensor, (len(joined),))
+        session.scene.canonical = joined.map(lambda tensor: tensor, (len(joined),))
 
     def pose(self, canonical, state, perturbation=UNPERTURBED) -> Posed:
         moved = nn.functional.pad(self.poses(state) @ self.rest.inverse(), (0, 0, 0, 0, 1, 0))

@@ -21,7 +21,7 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State, Uncertainty
 from neeco.methods.kinematic import discovery
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.methods.kinematic.state_passes import judge_states_again
+from neeco.methods.kinematic.deformation import judge_states_again
 from neeco.scene import Recorded
 from neeco.scene.training_views import TrainingViews
 from neeco.states.contradictions import (

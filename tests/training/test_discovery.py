@@ -19,8 +19,7 @@ from neeco.capture import read_capture
 from neeco.capture.model import Frame, InstrumentState, State
 from neeco.geometry.rotations import rigid_from_vector
 from neeco.methods.kinematic import discovery
-from neeco.methods.kinematic.hinge_search import find_hinges, search_hinge, unbend_seeds
-from neeco.methods.kinematic.hinges import Hinges
+from neeco.methods.kinematic.hinges import Hinges, find_hinges, search_hinge, unbend_seeds
 from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve, shape_around_frame
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
 from neeco.raster.reference import SH_C0

@@ -11,7 +11,7 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.geometry.rotations import rigid_from_vector
-from neeco.methods.kinematic.hinge_search import hinge_joints
+from neeco.methods.kinematic.hinges import hinge_joints
 from neeco.training.config import TrainConfig
 from neeco.training.initial import moving_joints
 

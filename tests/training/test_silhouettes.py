@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.geometry.camera import Camera
-from neeco.methods.kinematic.silhouette_evidence import observe_silhouettes
+from neeco.methods.kinematic.deformation import observe_silhouettes
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians

@@ -25,8 +25,7 @@ from neeco.methods.tissue_fit import carve_seeds
 from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
 from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Perturbation, Posed, floored_decay, state_of
-from neeco.scene.training_session import GaussianTraining
-from neeco.training.session import gaussian_session
+from neeco.training.session import GaussianSession
 
 # Units of the head's output. With unit features the first Adam step moves every output by about width * rate = 0.2;
 # without these units the first steps would move Gaussians across the scene.
@@ -187,9 +186,8 @@ class NPS(LabelledByMotion):
             return {}
         return {MEMBER_LOGITS: canonical.means.new_full((len(canonical), len(self.instruments)), -INITIAL_LOGIT)}
 
-    def begin(self, training: GaussianTraining) -> None:
+    def begin(self, session: GaussianSession) -> None:
         if self.settings.seeds:
-            session = gaussian_session(training)
             with session.searching():
                 found = carve_seeds(session)
             session.scene.canonical = self._with_seeds(session.scene.canonical, found)
@@ -210,9 +208,9 @@ class NPS(LabelledByMotion):
         joined = join_bodies(bodies)
         return joined.map(lambda tensor: tensor, (len(joined),))
 
-    def between_steps(self, training: GaussianTraining) -> None:
+    def between_steps(self, session: GaussianSession) -> None:
         if self.settings.anneal > 0:
-            self.opened.fill_(min(1.0, training.progress / self.settings.anneal))
+            self.opened.fill_(min(1.0, session.progress / self.settings.anneal))
 
     def _raw_state(self, state: State, kind: str | None = None) -> Tensor:
         """Return p before normalisation [S], or that of another `kind`: position mm, sign-continuous quaternion, joints
@@ -263,9 +261,9 @@ class NPS(LabelledByMotion):
         """The learned membership [N, I], or the moving Gaussians."""
         return members(canonical)[:, 1:] if self.settings.membership else super().label_channels(canonical)
 
-    def finish(self, training: GaussianTraining) -> None:
+    def finish(self, session: GaussianSession) -> None:
         if not self.settings.membership:
-            super().finish(training)
+            super().finish(session)
 
     def _encoded_state(self, state: State, noise: float) -> Tensor:
         """gamma(p) + Delta, Delta = N(0, noise^2) (the paper's compensation)."""

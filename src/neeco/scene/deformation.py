@@ -19,7 +19,6 @@ from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import ArticulatedMotion, Skeleton
 from neeco.scene.method import Method
-from neeco.scene.training_session import GaussianTraining
 
 FINAL_RATE = 0.03  # of the initial learning rate, at the end (3DGS: 0.01; runs here are shorter)
 MIN_MODULE_RATE = 0.3  # of the initial learning rate: joints keep learning to the end
@@ -75,7 +74,8 @@ class Deformation(nn.Module, Method):
 
     Training calls the hooks of any method: `fit_ranges` and `initial_extras`, then `begin`, in every step `perturb`,
     `training_channels` and `regularisation`, after it `between_steps` and, where an event of the schedule is due,
-    `act`, where density is controlled `prune_mask`, and at the end `finish`.
+    `act`, where density is controlled `prune_mask`, and at the end `finish`. Hooks with a `session` receive the run's
+    `neeco.training.session.GaussianSession`; this room is below, so its type is not stated here.
 
     `separates_instruments`: tissue and instruments are bodies of their own, and instruments of several scenes can be
     combined in one (`combined`, `fit_extras`).
@@ -146,7 +146,7 @@ class Deformation(nn.Module, Method):
         control carries them along."""
         return {}
 
-    def begin(self, training: GaussianTraining) -> None:
+    def begin(self, session: Any) -> None:
         """Called once before the first step of a new scene (not on resume); may replace the canonical Gaussians."""
 
     def perturb(
@@ -173,14 +173,14 @@ class Deformation(nn.Module, Method):
         1]."""
         return {}
 
-    def between_steps(self, training: GaussianTraining) -> None:
+    def between_steps(self, session: Any) -> None:
         """Called after every step, which may be several iterations (`batch_size`)."""
 
-    def act(self, training: GaussianTraining, action: str) -> None:
+    def act(self, session: Any, action: str) -> None:
         """Called after `between_steps` where an event of `schedule.events` is due, with its action, one of
         `actions`."""
 
-    def finish(self, training: GaussianTraining) -> None:
+    def finish(self, session: Any) -> None:
         """Called after the last step; may replace the canonical Gaussians."""
 
 
@@ -198,8 +198,8 @@ class LabelledByMotion(Deformation):
             return super().label_channels(canonical)
         return canonical.extras[MEMBERSHIP][:, None]
 
-    def finish(self, training: GaussianTraining) -> None:
-        scene = training.scene
+    def finish(self, session: Any) -> None:
+        scene = session.scene
         if self.instruments:
             scene.canonical = mark_moving(self, scene.canonical, list(scene.recorded.states[::MARKING_STRIDE]))
 

@@ -1,24 +1,19 @@
-"""Interface between methods and training, which is a room above: `neeco.training`.
-
-`Session` is one run in memory, of any method. `GaussianTraining` is the session of a method that deforms Gaussians, as
-far as the hooks of its deformation use it.
-"""
+"""`Session`: one run in memory, of any method. That of methods that deform Gaussians, which the hooks of their
+deformation receive, is a room above: `neeco.training.session.GaussianSession`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.raster.optimizer import Adam
-from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import DrawableScene
-from neeco.scene.training_views import TrainingViews
 
 UNLIMITED = 1_000_000_000  # iterations: minutes end the run long before
 Report = Callable[[str], None]  # shows the user one line
@@ -146,20 +141,3 @@ class Session:
 
     def finish(self) -> None:
         """Derive labels, verdicts and other results from the learned scene after the last step."""
-
-
-class CanonicalScene(DrawableScene, Protocol):
-    """The part of `GaussianScene` that a deformation's hooks use."""
-
-    canonical: CanonicalGaussians
-
-
-@dataclass
-class GaussianTraining(Session):
-    """A training session as far as a deformation's hooks use it."""
-
-    scene: CanonicalScene
-    views: TrainingViews
-    report: Report
-    batch_size: int  # frames per step
-    timed: bool = field(default=True, init=False)  # `State.time` is in seconds

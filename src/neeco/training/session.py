@@ -24,7 +24,7 @@ from neeco.raster.optimizer import Adam
 from neeco.scene.deformation import FINAL_RATE, Perturbation, floored_decay, log_linear
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
-from neeco.scene.training_session import GaussianTraining, Report, StepResult, check_finite, members, numbers
+from neeco.scene.training_session import Report, Session, StepResult, check_finite, members, numbers
 from neeco.scene.training_views import TrainingViews
 from neeco.states.prediction import predict_corrections
 from neeco.states.refinement import Refinement
@@ -36,10 +36,14 @@ from neeco.training.silhouettes import Silhouettes
 
 
 @dataclass(kw_only=True)
-class GaussianSession(GaussianTraining):
+class GaussianSession(Session):
     """One training run of any method that deforms Gaussians. Its hooks are `Deformation`'s."""
 
     scene: GaussianScene
+    views: TrainingViews
+    report: Report
+    batch_size: int  # frames per step
+    timed: bool = field(default=True, init=False)  # `State.time` is in seconds
     config: TrainConfig
     extent: float  # mm; positions' learning rates and the dense size scale with it
     pose_order: np.ndarray = field(init=False)
@@ -375,12 +379,6 @@ class GaussianSession(GaussianTraining):
         quality = quality_of(sum((label_counts(view, foreground) for view in views), np.zeros(4)))
         if quality is not None:
             self.scene.diagnostics[LABEL_QUALITY] = quality.as_json()
-
-
-def gaussian_session(training: GaussianTraining) -> GaussianSession:
-    """Return the session that a deformation's hooks are given, with its own type."""
-    assert isinstance(training, GaussianSession)
-    return training
 
 
 def new_session(

@@ -3,6 +3,15 @@
 Tissue is static, or moves with the breath where that was found. Each instrument's Gaussians live in its own tracked
 frame and move rigidly with its pose; joints move links about axes that are learned from the images, with soft
 assignment of Gaussians to links.
+
+The method in order: settings; `EVENTS`, what is searched or fitted between steps, and when; `Kinematic` with the hooks
+of training: `begin` (what is searched before the first step), `pose`, the losses, `act` (an event) and `finish`; then
+silhouettes and the states of the training frames.
+
+States of the training frames are unknowns of their true size. A tracker's errors are corrected by gradients alone
+(`Refinement`). Where a sample of frames shows larger ones, the prior on corrections is as wide, events fit every
+frame's state, and the instruments' shapes are carved anew from the fitted states: what wrong states taught is
+forgotten.
 """
 
 from __future__ import annotations
@@ -17,25 +26,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neeco.capture.model import Frame, Instrument, State
+from neeco.capture.model import Frame, Instrument, State, evenly_spaced
+from neeco.evidence.foreground import SETTINGS, Foreground
 from neeco.geometry.camera import Camera
 from neeco.methods.breathing import RATES as BREATHING_RATES
 from neeco.methods.breathing import BreathingTissue
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments, Articulation
-from neeco.methods.kinematic.discovery import find_instruments
+from neeco.methods.kinematic.discovery import carve_again, find_instruments
 from neeco.methods.kinematic.finish import conclude
-from neeco.methods.kinematic.hinge_search import hinge_joints
-from neeco.methods.kinematic.hinges import Hinges
+from neeco.methods.kinematic.hinges import Hinges, hinge_joints
 from neeco.methods.kinematic.lamp_search import find_shadow
-from neeco.methods.kinematic.silhouette_evidence import observe_silhouettes
-from neeco.methods.kinematic.state_passes import (
-    carve_from_states,
-    conclude_states,
-    fit_states,
-    judge_states,
-    judge_states_again,
-    size_states,
-)
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.kinematic.wrist import place_wrists, refine_wrists
 from neeco.methods.space_carving import CarvingSettings
@@ -53,13 +53,24 @@ from neeco.scene.deformation import (
 )
 from neeco.scene.drawable import ArticulatedMotion, Skeleton
 from neeco.scene.method import PLAIN_TRAINING
-from neeco.scene.training_session import GaussianTraining, Report
+from neeco.scene.training_session import Report
 from neeco.scene.visibility import extrapolate_tissue, outside_all_views
-from neeco.states.contradictions import describe_contradictions
+from neeco.states.contradictions import (
+    Misfits,
+    describe_contradictions,
+    fitted_anew,
+    judge_again,
+    leave_out_unexplained,
+    refit_outliers,
+)
+from neeco.states.refinement import Verdict
+from neeco.states.search import SEARCH, StateSearch
 from neeco.training.schedule import Event
-from neeco.training.session import GaussianSession, gaussian_session
+from neeco.training.session import GaussianSession
+from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
 
 PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared standard deviations
+N_SAMPLED = 20  # frames from which densities of silhouettes are learned
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,41 +107,6 @@ class Spin(Perturbation):
     shaft_roll: float = 0.0
 
 
-def _find_shadow(session: GaussianSession, kinematic: Kinematic) -> None:
-    if kinematic.settings.shadow:
-        with session.searching(as_learned=True):
-            find_shadow(session)
-
-
-def _observe_silhouettes(session: GaussianSession, kinematic: Kinematic) -> None:
-    with session.searching():
-        observe_silhouettes(session)
-
-
-def _place_wrists(session: GaussianSession, kinematic: Kinematic) -> None:
-    with session.searching():
-        place_wrists(session, kinematic)
-
-
-def _refine_wrists(session: GaussianSession, kinematic: Kinematic) -> None:
-    if kinematic.settings.refine_wrists:
-        with session.searching():
-            refine_wrists(session, kinematic)
-
-
-# what events of the schedule can have the method do
-ACTIONS: Mapping[str, Callable[[GaussianSession, Kinematic], None]] = {
-    "find_shadow": _find_shadow,
-    "observe_silhouettes": _observe_silhouettes,
-    "place_wrists": _place_wrists,
-    "refine_wrists": _refine_wrists,
-    "judge_states": judge_states,
-    "size_states": size_states,
-    "judge_states_again": judge_states_again,
-    "fit_states": fit_states,
-    "carve_from_states": carve_from_states,
-    "conclude_states": conclude_states,
-}
 EVENTS = (
     Event(0.1, "observe_silhouettes"),
     Event(0.12, "judge_states"),  # later, the scene has learned from wrong states
@@ -181,7 +157,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         "resolution.full_size_at": 0.55,
         "schedule.events": EVENTS,
     }
-    actions = tuple(ACTIONS)
+    actions = tuple(dict.fromkeys(event.action for event in EVENTS))
     extra_rates: ClassVar[Mapping[str, float]] = {LINK_LOGITS: 1e-2}
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: KinematicSettings | None = None) -> None:
@@ -298,8 +274,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
         return {LINK_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}
 
-    def begin(self, training: GaussianTraining) -> None:
-        session = gaussian_session(training)
+    def begin(self, session: GaussianSession) -> None:
         with session.searching():
             find_instruments(session, self)
 
@@ -346,11 +321,38 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             terms.append(settings.label_sharpness * (label * (1 - label)).mean())
         return sum(terms[1:], terms[0]) if terms else None
 
-    def act(self, training: GaussianTraining, action: str) -> None:
-        ACTIONS[action](gaussian_session(training), self)
+    def act(self, session: GaussianSession, action: str) -> None:
+        match action:
+            case "find_shadow":
+                if self.settings.shadow:
+                    with session.searching(as_learned=True):
+                        find_shadow(session)
+            case "observe_silhouettes":
+                with session.searching():
+                    observe_silhouettes(session)
+            case "place_wrists":
+                with session.searching():
+                    place_wrists(session, self)
+            case "refine_wrists":
+                if self.settings.refine_wrists:
+                    with session.searching():
+                        refine_wrists(session, self)
+            case "judge_states":
+                judge_states(session, self)
+            case "size_states":
+                size_states(session, self)
+            case "judge_states_again":
+                judge_states_again(session, self)
+            case "fit_states":
+                fit_states(session, self)
+            case "carve_from_states":
+                carve_from_states(session, self)
+            case "conclude_states":  # with the uncertainty of the fits; leaves out frames that no state explains
+                fit_states(session, self, last=True)
+            case _:
+                raise KeyError(action)
 
-    def finish(self, training: GaussianTraining) -> None:
-        session = gaussian_session(training)
+    def finish(self, session: GaussianSession) -> None:
         scene = session.scene
         conclude(session, self)
         if contradictions := describe_contradictions(session.refinement, session.recorded.names):
@@ -379,3 +381,104 @@ def articulation_of(instrument: Instrument) -> Articulation:
     from the images."""
     tree = instrument.kinematics
     return StatedLinks(tree) if tree is not None and tree.readings else Hinges(tuple(instrument.joints))
+
+
+@torch.no_grad()
+def observe_silhouettes(session: GaussianSession) -> None:
+    """Set the session's silhouettes from its scene as learned so far, where its tissue explains the images better than
+    when they were last observed, and well enough to tell anything."""
+    if not session.scene.instruments:
+        return
+    count = len(session.views.frames)
+    sampled = {index: session.compared(index) for index in evenly_spaced(count, N_SAMPLED)}
+    foreground, known = Foreground.learned(list(sampled.values())), session.silhouettes
+    if foreground is None or foreground.noise > SETTINGS.max_noise:
+        return
+    if known is not None and foreground.noise >= known.noise:
+        return
+    values = []
+    for index in range(count):
+        view = sampled[index] if index in sampled else session.compared(index)
+        certain = UNKNOWN + foreground.certainty(view, SETTINGS.reach) * (INSTRUMENT - UNKNOWN)
+        values.append(torch.from_numpy(certain.round().clip(0, 255)).to(torch.uint8))
+    session.silhouettes = Silhouettes(tuple(values), foreground.noise)
+
+
+def _corrects_states(session: GaussianSession) -> bool:
+    """Return whether there are states, and they are corrected."""
+    return bool(session.scene.instruments) and session.config.refine.frame_poses
+
+
+def _fits_states(session: GaussianSession) -> bool:
+    """Return whether states are corrected, their errors are larger than a tracker's, and one camera shows each instant:
+    gradients of several cameras' images determine an instant's state better than each image does."""
+    single = all(len(frames) == 1 for frames in session.refinement.frames_of_instant)
+    return _corrects_states(session) and bool(session.refinement.error_scale) and single
+
+
+@torch.no_grad()
+def judge_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Size the errors of the states of all training frames, and search for those that are wrong altogether."""
+    if _corrects_states(session) and not session.refinement.error_scale:
+        search = _search(session, articulated)
+        misfits = Misfits.of(search)
+        large = _size_errors(session, search, misfits.outliers)
+        refit_outliers(search, SEARCH.scale if large else SEARCH.large, misfits)
+
+
+@torch.no_grad()
+def size_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Size the errors of the states of all training frames, where they were not found large before."""
+    if _corrects_states(session) and not session.refinement.error_scale:
+        _size_errors(session, _search(session, articulated), ())
+
+
+@torch.no_grad()
+def judge_states_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Search again for wrong states, where errors are large or some states were found wrong before."""
+    suspected = bool(session.refinement.error_scale) or bool(session.refinement.verdicts.any())
+    if _corrects_states(session) and suspected:
+        judge_again(_search(session, articulated))
+
+
+@torch.no_grad()
+def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *, last: bool = False) -> None:
+    """Fit the states of all training frames to their images, where their errors are larger than a tracker's."""
+    if not _fits_states(session):
+        return
+    search, refinement = _search(session, articulated), session.refinement
+    explained: dict[int, float] = {}
+    for (index,) in refinement.frames_of_instant:
+        if not refinement.counts(index):
+            continue
+        wrong = refinement.verdict(index) is Verdict.REFITTED
+        about = search.state(index) if wrong else None
+        fit = fitted_anew(search, index) if wrong and last else search.fitted(index, SEARCH.scale, about)
+        if fit is not None:
+            # until the last fit, gradients go on with the uncertainty of recorded states
+            deviations = fit.deviations if last else search.deviations(index, SEARCH.scale)
+            refinement.set_state(index, session.recorded.states[index], fit.fit.state, deviations)
+            explained[index] = fit.fit.misfit
+    if last:
+        leave_out_unexplained(search, explained)
+
+
+@torch.no_grad()
+def carve_from_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Carve the instruments' shapes anew from fitted states."""
+    if _fits_states(session):
+        with session.searching():
+            carve_again(session, articulated)
+
+
+def _search(session: GaussianSession, articulated: ArticulatedInstruments) -> StateSearch:
+    shafts = [articulation.shaft()[1].detach().cpu().double() for articulation in articulated.articulations]
+    return StateSearch.of(session.scene, session.refinement, session.full_views.frames, shafts)
+
+
+def _size_errors(session: GaussianSession, search: StateSearch, outliers: Sequence[int]) -> bool:
+    """Size the errors of all states but `outliers`, and report whether they are larger than a tracker's."""
+    large = search.size_errors(outliers)
+    if large:
+        session.report("the states' errors are larger than a tracker's: they are corrected by the images")
+    return large

@@ -13,8 +13,7 @@ from neeco.capture.model import evenly_spaced
 from neeco.geometry.projection import project_world
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
-from neeco.methods.kinematic.hinge_search import start_hinges
-from neeco.methods.kinematic.hinges import Hinges
+from neeco.methods.kinematic.hinges import Hinges, start_hinges
 from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
