@@ -83,7 +83,8 @@ def widened(gaussians: Gaussians, camera: Camera) -> Gaussians:
     if scale <= 1:
         return gaussians
     pose = camera.world_from_camera.to(gaussians.means)
-    depths = ((gaussians.means - pose[:3, 3]) @ pose[:3, 2]).clamp_min(camera.near)
+    offsets = (gaussians.means - pose[:3, 3]) * pose[:3, 2]  # a matrix product may round by how many there are
+    depths = offsets.sum(1).clamp_min(camera.near)
     lacking = LOW_PASS * (scale**2 - 1) * (depths / camera.fx).square()  # [N] mm^2
     return replace(gaussians, scales=(gaussians.scales.square() + lacking[:, None]).sqrt())
 
