@@ -19,8 +19,15 @@ from neeco.capture import read_capture
 from neeco.capture.model import Frame, InstrumentState, State
 from neeco.geometry.rotations import rigid_from_vector
 from neeco.methods.kinematic import discovery
-from neeco.methods.kinematic.hinges import Hinges, find_hinges, search_hinge, unbend_seeds
-from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve, shape_around_frame
+from neeco.methods.kinematic.hinges import Hinges, search_hinge, start_hinges, unbend_seeds
+from neeco.methods.space_carving import (
+    CarvedShape,
+    CarvingSettings,
+    Evidence,
+    carve,
+    gather_evidence,
+    shape_around_frame,
+)
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
 from neeco.raster.reference import SH_C0
 from neeco.scene.training_views import TrainingViews
@@ -240,7 +247,7 @@ def test_a_hinge_as_learned_stays_where_another_shaft_is_carved() -> None:
         turned = torch.tensor([0.0, 0.0, 1.2, 0.0, 0.0, -4.0], dtype=torch.float64)
         hinges.base.copy_(rigid_from_vector(turned))
     session = SimpleNamespace(report=pytest.fail)
-    find_hinges(session, hinges, evidence, "tool", shape, learned)  # type: ignore[arg-type]
+    start_hinges(session, hinges, evidence, "tool", shape, learned, columns=3, generator=torch.Generator())  # type: ignore[arg-type]
     pivots, axes = hinges.axes()
     assert torch.allclose(pivots, learned[0], atol=1e-5)
     assert torch.allclose(axes, learned[1], atol=1e-5)
@@ -283,3 +290,18 @@ def test_instruments_of_dark_images_start_where_those_of_bright_ones_do_and_in_t
         assert float(shown[along < 2 * WRIST_MM].median()) < 0.4 * brightness  # the black shaft
         spans.append(along.quantile(torch.tensor([0.1, 0.5, 0.9])))
     assert torch.allclose(spans[1], spans[0], atol=2)  # mm
+
+
+def test_what_masks_leave_out_makes_no_image_dark(tmp_path: Path) -> None:
+    """As the black surroundings of an endoscope's round image."""
+    capture = read_capture(write_grasper(tmp_path / "capture", frames=6))
+    frames = capture.split("train")
+    views, scene = TrainingViews.read(frames), initial_scene(capture, frames, training_config("3dgs", {}), print)
+    images, masks = [image.clone() for image in views.images], []
+    for image in images:
+        image[:, :40] = 0
+        masks.append(torch.arange(image.shape[1]).expand(image.shape[:2]) >= 40)
+    bordered = gather_evidence(scene, TrainingViews(frames, tuple(images), tuple(masks)), CarvingSettings())
+    whole = gather_evidence(scene, views, CarvingSettings())
+    assert torch.equal(bordered.hits[:, :, 41:], whole.hits[:, :, 41:])  # residuals are averaged over 3 pixels
+    assert float(whole.hits[:, :, 41:].std()) > 0.1

@@ -10,6 +10,7 @@ the shaft's axis (which need not be the sensor's z), the tip, and seeds for the 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -39,6 +40,7 @@ class CarvingLimits:
     seed_spread: float = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
     darkest_shadow: float = 0.66  # of the tissue's sRGB values: 40 % of its light
     min_level: float = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
+    brightness: float = 0.25  # mean of images, below which the evidence's floor falls as they are darker
     color_frames: int = 20  # the most frames whose images give seeds their colours
     color_slice: float = 0.25  # of the shaft's radius: along it, seeds within have the same colour
     unseen_share: float = 1e-6  # of all evidence, which counts in every slice: some show none
@@ -57,7 +59,6 @@ class CarvingSettings:
     evidence_frames: int = 120  # the most training frames used
     evidence_floor: float = 0.04  # residual at which evidence begins (images in [0, 1])
     evidence_range: float = 0.06  # residual above that at which it saturates
-    brightness: float = 0.25  # mean of images, below which both are as much smaller as the images are darker
     grid: int = 48  # voxels per side
     fine_grid: int = 72  # voxels per side where `grid` finds too few of a thin instrument
     pose_shifts: int = 4  # exchanges of poses among frames that evidence is compared with
@@ -133,8 +134,7 @@ def gather_evidence(
     hits: list[Tensor] = []
     without_shadows: list[Tensor] = []
     depths: list[Tensor] = []
-    mean = sum(float(views.target(index).mean()) for index in picked) / len(picked)
-    darkness = min(1.0, max(mean, 1 / 255) / settings.brightness)
+    exposure = _exposure(views, picked)
     for index in picked:
         frame = frames[index]
         rendering = rasterize(scene.at(frame.state), frame.camera)
@@ -148,7 +148,7 @@ def gather_evidence(
             if mask is not None:
                 residual = residual * mask
             smooth = avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
-            found.append(((smooth / darkness - settings.evidence_floor) / settings.evidence_range).clamp(0, 1))
+            found.append(((smooth / exposure - settings.evidence_floor) / settings.evidence_range).clamp(0, 1))
         depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
     cameras, device = [frames[i].camera for i in picked], views.device
     return Evidence(
@@ -159,6 +159,16 @@ def gather_evidence(
         tuple(frames[i] for i in picked),
         pad_and_stack(without_shadows, 0.0) if unshaded else None,
     )
+
+
+def _exposure(views: TrainingViews, picked: Sequence[int]) -> float:
+    """Return how bright images are, without what masks leave out, as a share of `brightness`, in (0, 1]."""
+    means = []
+    for index in picked:
+        image, mask = views.target(index), views.mask(index)
+        means += [float(image.mean())] if mask is None else [float(image[mask].mean())] if bool(mask.any()) else []
+    mean = sum(means) / max(len(means), 1)
+    return min(1.0, max(mean, 1 / 255) / CARVING.brightness)
 
 
 def pad_and_stack(images: list[Tensor], padding: float) -> Tensor:

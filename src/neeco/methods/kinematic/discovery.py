@@ -62,8 +62,7 @@ def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -
         fitted = fit_tissue(scene, session.views, session.config, breathing=breathing)
         evidence = tissue_evidence(scene, session.views, session.config, fitted)
     if session.silhouettes is not None:
-        numbers = {frame.name: number for number, frame in enumerate(session.views.frames)}
-        hits = [session.silhouettes.instrument(numbers[frame.name]) for frame in evidence.frames]
+        hits = [session.silhouettes.instrument(number) for number in _view_numbers(session, evidence)]
         evidence = replace(evidence, hits=pad_and_stack(hits, 0.0).to(evidence.hits))
     evidence = _corrected_evidence(session, evidence)
     with torch.no_grad():
@@ -135,10 +134,10 @@ def _with_instruments(
 def _color_seeds(
     canonical: CanonicalGaussians, session: GaussianSession, articulated: ArticulatedInstruments, evidence: Evidence
 ) -> None:
-    """Color seeds by slices along each shaft, as images show those with most evidence. Those much brighter than images
-    turn transparent before they take on their colour; those beside an instrument would stay in the colour there."""
+    """Give all seeds in a slice of a shaft one colour, as images show those with most evidence. Seeds much brighter
+    than the images turn transparent before they darken; in colours of their own, those beside an instrument persist."""
     assert isinstance(articulated, Deformation)
-    pose, numbers = articulated.poser(canonical), {frame.name: k for k, frame in enumerate(session.views.frames)}
+    pose, numbers = articulated.poser(canonical), _view_numbers(session, evidence)
     total = canonical.means.new_zeros(len(canonical), 4)  # of colours, and of weights
     for place in evenly_spaced(len(evidence.frames), CARVING.color_frames):
         frame = evidence.frames[place]
@@ -146,7 +145,7 @@ def _color_seeds(
         column, row = points.nan_to_num().floor().long().unbind(-1)
         seen = (depths > 0) & (column >= 0) & (column < frame.camera.width) & (row >= 0) & (row < frame.camera.height)
         pixels = row[seen], column[seen]
-        weights, image = evidence.hits[place][pixels][:, None], session.views.target(numbers[frame.name])
+        weights, image = evidence.hits[place][pixels][:, None], session.views.target(numbers[place])
         total[seen] += torch.cat([weights * image[pixels], weights], 1)
     for index, articulation in enumerate(articulated.articulations):
         rows, base = canonical.body(index + 1), articulation.base
@@ -160,13 +159,17 @@ def _color_seeds(
 
 def _corrected_evidence(session: GaussianSession, evidence: Evidence) -> Evidence:
     """Return the evidence with the states as corrected so far, without frames that were left out."""
-    places = {frame.name: place for place, frame in enumerate(session.views.frames)}
-    scene, refinement = session.scene, session.refinement
-    numbers = [places[frame.name] for frame in evidence.frames]
+    scene, refinement, numbers = session.scene, session.refinement, _view_numbers(session, evidence)
     states = [scene.registered(refinement.state(k, f.state)) for k, f in zip(numbers, evidence.frames, strict=True)]
     frames = tuple(replace(frame, state=state) for frame, state in zip(evidence.frames, states, strict=True))
     remaining = [row for row, number in enumerate(numbers) if refinement.counts(number)]
     return replace(evidence, frames=frames).subset(torch.tensor(remaining))
+
+
+def _view_numbers(session: GaussianSession, evidence: Evidence) -> list[int]:
+    """Return the number of each of the evidence's frames among the session's views."""
+    numbers = {frame.name: number for number, frame in enumerate(session.views.frames)}
+    return [numbers[frame.name] for frame in evidence.frames]
 
 
 def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue: GaussianScene) -> GaussianScene:

@@ -300,25 +300,10 @@ def start_hinges(
     columns: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Set each joint to the best hypothesis of the search, or to its axis as `learned` (see `Articulation.axes`).
+    """Set each joint of `hinges`, whose shaft is in place, to the best hypothesis of the search, or to its axis as
+    `learned` (see `Articulation.axes`).
 
     Returns seeds [M, 3] mm and their link logits [M, columns]."""
-    find_hinges(session, hinges, evidence, name, shape, learned)
-    seeds = shape.seeds.to(hinges.base.device)
-    logits = seed_logits(hinges, seeds, columns, generator)
-    return unbend_seeds(hinges, seeds, logits), logits
-
-
-def find_hinges(
-    session: GaussianSession,
-    hinges: Hinges,
-    evidence: Evidence,
-    name: str,
-    shape: CarvedShape,
-    learned: tuple[Tensor, Tensor] | None = None,
-) -> None:
-    """Set each joint of `hinges`, whose shaft is in place, to the best hypothesis of the search, or to its axis as
-    `learned`."""
     for index, joint in enumerate(hinges.reading_names):
         with torch.no_grad():
             if learned is not None:
@@ -338,6 +323,9 @@ def find_hinges(
             hinges.offsets[index] = (hinges.middle[index] - min(readings)) * hinges.gains[index]
     if hinges.reading_names:
         hinges.wrist_start.fill_(float(hinges.hinge_depth[0].detach()) - 5 * shape.radius)
+    seeds = shape.seeds.to(hinges.base.device)
+    logits = seed_logits(hinges, seeds, columns, generator)
+    return unbend_seeds(hinges, seeds, logits), logits
 
 
 @torch.no_grad()
