@@ -242,10 +242,8 @@ def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray, *, l
             continue
         own, values = trial.problem.corrected(trial.fit)
         poses[state], readings[state] = own[best], values[best]
-        covariance, to_root = (
-            posterior(trial.problem, trial.fit, trial.cells, shared=False)[best],
-            trial.problem.to_root[best],
-        )
+        covariance = posterior(trial.problem, trial.fit, trial.cells, shared=False)[best]
+        to_root = trial.problem.to_root[best]
         covariances[state] = to_root @ covariance @ to_root.T
         known = np.sqrt(np.diagonal(covariance)) < sds_of(STATES.settled, slides)
         refitted[state] = trial.misfits[best] <= limit and bool(known.all())
