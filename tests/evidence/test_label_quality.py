@@ -24,7 +24,8 @@ def view(label: slice, seed: int, *, dark: bool = False) -> Comparison:
     shade[:, SHAFT] = rng.normal(0.55 if dark else 1.2, 0.1, (HEIGHT, width))
     rendered = np.zeros((HEIGHT, WIDTH))
     rendered[:, label] = 1
-    return Comparison(shade, residual, residual, rendered, np.ones((HEIGHT, WIDTH), bool))
+    everywhere = np.ones((HEIGHT, WIDTH))
+    return Comparison(shade, residual, residual, everywhere, rendered, everywhere > 0)
 
 
 def iou(label: slice) -> float:

@@ -215,7 +215,7 @@ def test_the_extent_is_where_the_solid_is(session: GaussianSession) -> None:
     assert tip == pytest.approx(20, abs=3)
 
 
-def shaft_of(length: float) -> tuple[CanonicalGaussians, Hinges]:
+def shaft_of(length: float, joints: tuple[str, ...] = ("jaw",)) -> tuple[CanonicalGaussians, Hinges]:
     """Ten tissue Gaussians, a tube of radius 2 mm along z from -length to 0, and ten Gaussians of another body."""
     along = torch.arange(-length, 0, 0.5).repeat_interleave(4)
     around = torch.tensor([0.0, 1.0, 2.0, 3.0]).repeat(len(along) // 4) * (math.pi / 2)
@@ -224,9 +224,10 @@ def shaft_of(length: float) -> tuple[CanonicalGaussians, Hinges]:
     canonical = join_bodies(
         [seed_gaussians(p, torch.full((len(p), 3), 0.4), torch.ones(len(p)), opacity=0.9) for p in bodies]
     )
-    hinges = Hinges(("jaw",))
+    hinges = Hinges(joints)
     with torch.no_grad():
         hinges.hinge_depth.fill_(2.0)
+        hinges.extent.copy_(torch.tensor([-length, 0.0]))
         hinges.wrist_start.fill_(0.0)
     return canonical, hinges
 
@@ -261,6 +262,25 @@ def test_a_shaft_cut_by_the_image_is_prolonged_by_copies_of_what_was_seen(sessio
     assert float(tube[:, :2].norm(dim=1).sub(2).abs().max()) < 1e-4  # straight on
     gaps = tube[:, 2].unique().diff()
     assert float(gaps.max()) < 1.01  # and without a gap
+
+
+def test_a_straight_instrument_is_prolonged_as_one_with_joints_is(session: GaussianSession) -> None:
+    canonical, straight = shaft_of(40, joints=())
+    longer = extend_shaft(canonical, 1, "tool", straight, recorded_at(session, -20.0), 60.0)
+    assert float(longer.means[longer.body(1)][:, 2].min()) < -70
+
+
+def test_what_a_single_frame_saw_of_a_shaft_and_what_lies_beside_it_is_not_copied(session: GaussianSession) -> None:
+    canonical, hinges = shaft_of(40)
+    near, far = recorded_at(session, -20.0), recorded_at(session, -35.0)
+    states = (*near.states * 3, far.states[0])  # one of 13 frames shows more of the shaft
+    few = Recorded(("a",) * 13, ("train",) * 13, states, (near.cameras[0],) * 13)
+    canonical.means[canonical.body(1).stop - 1] = torch.tensor([5.0, 0.0, -19.0])  # a stray Gaussian beside it
+    longer = extend_shaft(canonical, 1, "tool", hinges, few, 60.0)
+    tube = longer.means[longer.body(1)]
+    behind = tube[:, 2] < -20.5
+    assert float(tube[:, 2].min()) < -70
+    assert float(tube[behind, :2].norm(dim=1).max()) == pytest.approx(2, abs=1e-4)
 
 
 def test_a_shaft_whose_end_was_seen_stays_as_it_is(session: GaussianSession) -> None:

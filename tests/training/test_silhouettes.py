@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from neeco.capture import read_capture
@@ -74,6 +75,17 @@ def test_images_tell_instrument_from_shadow_and_tissue_where_the_scene_is_wrong(
     assert bool((middle[:, 38:59] == INSTRUMENT).all())
     assert int(middle[:, 63:66].max()) < 20  # its shadow, which the scene takes for the instrument
     assert int(middle[:, :33].max()) < 64
+
+
+def test_what_the_lens_mixes_at_an_outline_is_no_instrument_where_less_than_half_is() -> None:
+    session = session_of(Scene())
+    sharp = session.views.target(0).numpy()
+    blurred = torch.from_numpy(gaussian_filter(sharp, (1.0, 1.0, 0.0)))  # of an instrument in columns 36 .. 61
+    session.views.target = lambda index: blurred
+    observe_silhouettes(session)
+    claimed = session.silhouettes.instrument(0)[20:76] > 0
+    assert not bool(claimed[:, :36].any())
+    assert bool(claimed[:, 38:59].all())
 
 
 def test_a_tissue_that_explains_the_images_badly_tells_nothing() -> None:

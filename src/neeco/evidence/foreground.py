@@ -5,7 +5,8 @@ pixel is described by the factor that fits best (`shade`) and by what that leave
 (`residual`). Two densities of these two are learned from the images themselves: of tissue, where no instrument is near,
 lit as there or in any shade of a shadow; of the instruments, well inside of where they are rendered. Their ratio tells
 which of the two a pixel shows, and says nothing where both are alike: a black shaft is no shadow of dark cloth where
-its residuals differ from those of cloth, and undetermined where they do not.
+its residuals differ from those of cloth, and undetermined where they do not. At outlines a pixel shows both, mixed by
+the lens: it counts as the instrument's only where more than half of it is covered.
 """
 
 from __future__ import annotations
@@ -48,6 +49,8 @@ class ForegroundSettings:
     least_pixels: int = 200  # of each kind, below which nothing is said
     noise_quantile: float = 0.98  # of the tissue's residuals: its noise
     max_noise: float = 0.12  # above which the tissue is not learned well enough to train labels by it
+    covered: float = 0.5  # share of a pixel that an instrument covers, from which on it may be called one
+    outline_px: int = 2  # about a pixel, within which the largest difference from the tissue is one wholly covered
     reach: float = 0.075  # of the images' width: no instrument shows farther from a rendered one while it is learned
 
 
@@ -57,11 +60,13 @@ SETTINGS = ForegroundSettings()
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """An image beside a scene's tissue: shade and residual [H, W], the residual of each pixel alone `own` [H, W], the
-    label [H, W] in [0, 1] as rendered, and which pixels count, bool [H, W]."""
+    share `covered` of each pixel by what differs from the tissue [H, W], the label [H, W] in [0, 1] as rendered, and
+    which pixels count, bool [H, W]."""
 
     shade: np.ndarray
     residual: np.ndarray
     own: np.ndarray
+    covered: np.ndarray
     label: np.ndarray
     usable: np.ndarray
 
@@ -81,10 +86,13 @@ class Comparison:
         shade = over / np.maximum(under, 1e-6)
         likely = np.clip(shade, *settings.shadow)
         off = np.abs(shown - likely[..., None] * tissue).mean(-1)
+        difference = np.abs(shown - tissue).mean(-1)
+        around = np.ones((2 * settings.outline_px + 1,) * 2, np.uint8)
+        covered = difference / np.maximum(cv2.dilate(uniform_filter(difference, window), around), 1e-6)
         brightness = settings.dark + uniform_filter(likely * tissue.mean(-1), window)
         label = channels[..., 0].cpu().numpy()
         usable = np.ones(label.shape, bool) if mask is None else mask.cpu().numpy()
-        return Comparison(shade, uniform_filter(off, window) / brightness, off / brightness, label, usable)
+        return Comparison(shade, uniform_filter(off, window) / brightness, off / brightness, covered, label, usable)
 
     def near(self, share: float) -> np.ndarray:
         """bool [H, W]: pixels within `share` of the width of where an instrument may be rendered."""
@@ -128,7 +136,8 @@ class Foreground:
         instrument shows farther than `near` (share of the width) from a rendered one."""
         instrument, tissue = self._claims(view.residual, view.shade)
         alone, _ = self._claims(view.own, view.shade)  # averages reach beyond outlines
-        instrument = np.where(view.near(near), np.minimum(instrument, alone), 0)
+        may_be = view.near(near) & (view.covered > self.settings.covered)
+        instrument = np.where(may_be, np.minimum(instrument, alone), 0)
         return np.asarray(np.where(view.usable, instrument - tissue, 0))
 
     def log_ratio(self, residuals: np.ndarray, shades: np.ndarray) -> np.ndarray:

@@ -28,10 +28,13 @@ class FinishSettings:
     min_visible_share: float = 0.2  # of the pixels that a Gaussian covers of its instrument rendered alone
     min_pixels_alone: float = 0.05  # px covered there, in all frames together: below, its own instrument occludes it
     max_occlusion_frames: int = 64  # evenly spaced
-    min_coverage: float = 0.08  # share of training frames that must observe a position of the shaft for it to be copied
+    # training frames that must observe a position of the shaft for it to be copied: share, and number (half at most)
+    min_coverage: float = 0.08
+    min_frames: int = 6
     max_end_coverage: float = 0.3  # share of frames above which the observed rear end is the real end
     min_joint_explained: float = 0.35  # share of the moving parts' error that a found joint explains
     slab_radii: float = 1.5  # length of the repeated slab, in shaft radii
+    max_copied_radii: float = 1.3  # from the axis, in shaft radii: what is farther off is no surface of a shaft
 
 
 FINISH = FinishSettings()
@@ -191,19 +194,25 @@ def extend_shaft(
     rows = canonical.body(body)
     along = articulation.along_shaft(canonical.means[rows])  # [M]
     solid = torch.sigmoid(canonical.opacity_logits[rows]) > WRIST.solid_opacity
-    if not articulation.jointed or int(solid.sum()) < 50:
+    if int(solid.sum()) < 50:
         return canonical
-    rear, front = float(along[solid].quantile(0.01)), float(articulation.wrist_start)
+    rear = float(along[solid].quantile(0.01))
+    front = float(articulation.wrist_start if articulation.jointed else articulation.extent[1])
     if not rear < front:
         return canonical
     device = canonical.means.device
     positions = torch.linspace(rear, front, 40, device=device)
     coverage = shaft_coverage(positions, name, articulation, recorded)
-    if float(coverage[0]) > FINISH.max_end_coverage or not bool((coverage >= FINISH.min_coverage).any()):
+    observed = coverage >= max(FINISH.min_coverage, min(0.5, FINISH.min_frames / len(recorded.states)))
+    if float(coverage[0]) > FINISH.max_end_coverage or not bool(observed.any()):
         return canonical
-    start = float(positions[coverage >= FINISH.min_coverage][0])
-    slab = FINISH.slab_radii * _median_radius(canonical, rows, articulation, solid)
-    copied = torch.nonzero((along >= start) & (along < start + slab))[:, 0]
+    start = float(positions[observed][0])
+    across = articulation.across_shaft(canonical.means[rows])
+    behind = solid & (along < front)
+    radius = float(across[behind if bool(behind.any()) else solid].median())
+    slab = FINISH.slab_radii * radius
+    copied = (along >= start) & (along < start + slab) & (across < FINISH.max_copied_radii * radius)
+    copied = torch.nonzero(copied)[:, 0]
     if start + slab > front or len(copied) < 10:
         return canonical
     seen_part = torch.nonzero(along >= start)[:, 0]
@@ -230,12 +239,3 @@ def shaft_coverage(positions: Tensor, name: str, articulation: Articulation, rec
         pose = state.instruments[name].pose.to(points)
         counts += in_image(points @ pose[:3, :3].T + pose[:3, 3], camera)
     return counts / max(1, len(recorded.states))
-
-
-def _median_radius(canonical: CanonicalGaussians, rows: slice, articulation: Articulation, solid: Tensor) -> float:
-    """Return the median distance in mm of solid Gaussians behind the wrist from the axis."""
-    origin, direction = articulation.shaft()
-    arm = canonical.means[rows][solid] - origin
-    across = arm - (arm @ direction)[:, None] * direction
-    behind = (arm @ direction) < articulation.wrist_start
-    return float((across[behind] if bool(behind.any()) else across).norm(dim=1).median())
