@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Camera, Frame, InstrumentState, State
+from neeco.evidence.carving import Evidence
 from neeco.geometry.rotations import rigid, rigid_from_vector, rotate_about
-from neeco.methods.space_carving import Evidence
 
 PIVOT_MM, TIP_MM, RADIUS_MM = 8.0, 24.0, 3.0
 HINGE_ANGLE = 0.9  # rad about the shaft, in the true shaft frame

@@ -17,10 +17,7 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.capture.model import Frame, InstrumentState, State
-from neeco.geometry.rotations import rigid_from_vector
-from neeco.methods.kinematic import discovery
-from neeco.methods.kinematic.hinges import Hinges, search_hinge, start_hinges, unbend_seeds
-from neeco.methods.space_carving import (
+from neeco.evidence.carving import (
     CarvedShape,
     CarvingSettings,
     Evidence,
@@ -28,6 +25,9 @@ from neeco.methods.space_carving import (
     gather_evidence,
     shape_around_frame,
 )
+from neeco.geometry.rotations import rigid_from_vector
+from neeco.methods.kinematic import discovery
+from neeco.methods.kinematic.hinges import Hinges, search_hinge, start_hinges, unbend_seeds
 from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
 from neeco.raster.reference import SH_C0
 from neeco.scene.training_views import TrainingViews

@@ -15,7 +15,7 @@ from capture_files import PIVOT_MM, write_grasper
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
-from neeco.methods.space_carving import CarvingSettings, gather_evidence
+from neeco.evidence.carving import CarvingSettings, gather_evidence
 from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
 from neeco.synthesis.dataset import synthesize

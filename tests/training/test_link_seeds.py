@@ -15,11 +15,11 @@ from wristed_world import shifted
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import BaseUncertainty, Instrument, InstrumentState, State
+from neeco.evidence.carving import CarvedShape, CarvingSettings, Evidence, carve
 from neeco.geometry.rotations import rigid_from_vector, rotate_about
 from neeco.methods.kinematic.link_registration import base_root, correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, carve
 from neeco.scene.drawable import Recorded
 from neeco.states.refinement import RefineConfig, Refinement
 

@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument, State
+from neeco.evidence.carving import CarvingSettings
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
 from neeco.methods.networks import HALF_BY_DEFAULT, check_warm_up, encode, half_resolved, octave_weights, robust_bounds
-from neeco.methods.space_carving import CarvingSettings
 from neeco.methods.tissue_fit import carve_seeds
 from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument

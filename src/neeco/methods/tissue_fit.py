@@ -1,4 +1,4 @@
-"""A short fit of the tissue alone, whose residual is the evidence of instruments."""
+"""A short fit of the tissue alone, whose residual is the evidence of instruments, and the shapes carved from it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,18 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from neeco.base.errors import NeecoError
+from neeco.capture.model import HOW_TO_REGISTER
+from neeco.evidence.carving import (
+    CarvedShape,
+    Evidence,
+    carve,
+    gather_evidence,
+    posed_views,
+    score_points,
+    shape_around_frame,
+)
 from neeco.methods.breathing import Breathing
-from neeco.methods.space_carving import Evidence, carved_shape, gather_evidence
 from neeco.methods.static import Static
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
@@ -73,6 +83,45 @@ def fit_tissue(
         session.step()
     tissue.requires_grad_(False)
     return tissue
+
+
+def carved_shape(session: GaussianSession, evidence: Evidence, name: str, generator: torch.Generator) -> CarvedShape:
+    """Return the carved shape, or seeds around the tracked frame where the evidence does not move with the instrument.
+    Raises NeecoError without evidence."""
+    search = session.config.deformation.carving
+    shape = carve(evidence, name, generator, search)
+    if shape is None:
+        raise NeecoError(
+            f"instrument {name!r}: nothing in the images moves with its recorded pose; check that its poses are in mm "
+            f"and in the cameras' world frame (`neeco check`): {HOW_TO_REGISTER}; or train with --method nps"
+        )
+    if moves_with_pose(session, evidence, name, shape):
+        return shape
+    return shape_around_frame(shape, evidence.distance, search.seeds, generator)
+
+
+def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, shape: CarvedShape) -> bool:
+    """Whether the evidence moves with the instrument: with exchanged poses it must be weaker.
+
+    Where it is not (an instrument that hardly moves), carving cannot separate the instrument from static parts of the
+    scene. Reports that, and notes it in the scene's diagnostics.
+    """
+    search = session.config.deformation.carving
+    views = posed_views(evidence, name, search)
+    own, _ = score_points(evidence, views.own, shape.seeds)
+    other = views.exchanged_scores(shape.seeds)
+    moves = float(own.mean()) > search.motion_ratio * float(other.mean())
+    session.scene.diagnostics.setdefault("instruments", {})[name] = {
+        "evidence": round(float(own.mean()), 4),
+        "evidence_of_other_poses": round(float(other.mean()), 4),
+        "moves_with_its_pose": moves,
+    }
+    if not moves:
+        session.report(
+            f"warning: {name}: the images hardly depend on its recorded pose; its shape is searched around the "
+            f"tracked frame, and its labels may be wrong: record more motion, or register its poses ({HOW_TO_REGISTER})"
+        )
+    return moves
 
 
 def carve_seeds(session: GaussianSession) -> list[tuple[Tensor, float]]:

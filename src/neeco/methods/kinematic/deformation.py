@@ -27,6 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Frame, Instrument, State, evenly_spaced
+from neeco.evidence.carving import CarvingSettings
 from neeco.evidence.foreground import SETTINGS, Foreground
 from neeco.geometry.camera import Camera
 from neeco.methods.breathing import RATES as BREATHING_RATES
@@ -38,7 +39,6 @@ from neeco.methods.kinematic.hinges import Hinges, hinge_joints
 from neeco.methods.kinematic.lamp_search import find_shadow
 from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.kinematic.wrist import place_wrists, refine_wrists
-from neeco.methods.space_carving import CarvingSettings
 from neeco.raster.articulated import ArticulatedBody, pose_bodies
 from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import evenly_spaced
+from neeco.evidence.carving import CARVING, Evidence, carve_along, frame_along, pad_and_stack
 from neeco.geometry.projection import project_world
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
@@ -17,8 +18,7 @@ from neeco.methods.kinematic.hinges import Hinges, start_hinges
 from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.space_carving import CARVING, Evidence, carve_along, carved_shape, frame_along, pad_and_stack
-from neeco.methods.tissue_fit import fit_tissue, tissue_evidence
+from neeco.methods.tissue_fit import carved_shape, fit_tissue, tissue_evidence
 from neeco.raster.reference import SH_C0
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
 from neeco.scene.deformation import Deformation

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Frame, Instrument
+from neeco.evidence.carving import CarvedShape, CarvingSettings, Evidence, camera_from_instrument, center_line
 from neeco.geometry.rotations import rotate_about
 from neeco.methods.kinematic.articulation import Articulation
-from neeco.methods.space_carving import CarvedShape, CarvingSettings, Evidence, camera_from_instrument, center_line
 from neeco.scene.drawable import JointMotion, Skeleton
 from neeco.scene.training_session import Report
 from neeco.training.session import GaussianSession

@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from neeco.capture.model import BaseUncertainty, Instrument, evenly_spaced
+from neeco.evidence.carving import CarvedShape, Evidence, camera_from_instrument
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector, skew
 from neeco.methods.kinematic.link_search import doubted_readings, note_doubt
 from neeco.methods.kinematic.stated_links import OFFSET_SD, STATED, StatedLinks
-from neeco.methods.space_carving import CarvedShape, Evidence, camera_from_instrument
 from neeco.states.outline_fit import OUTLINES
 from neeco.training.session import GaussianSession
 

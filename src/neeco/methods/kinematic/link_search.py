@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument
-from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.space_carving import (
+from neeco.evidence.carving import (
     CARVING,
     CarvedShape,
     Evidence,
@@ -24,6 +23,7 @@ from neeco.methods.space_carving import (
     posed_views,
     score_points,
 )
+from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.training.session import GaussianSession
 
 

@@ -19,14 +19,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from neeco.base.errors import NeecoError
-from neeco.capture.model import HOW_TO_REGISTER, Frame, evenly_spaced
+from neeco.capture.model import Frame, evenly_spaced
+from neeco.evidence.shaft_search import SETTINGS as SHAFT
+from neeco.evidence.shaft_search import CylinderViews, find_shaft
 from neeco.geometry.projection import project
-from neeco.methods.shaft_search import SETTINGS as SHAFT
-from neeco.methods.shaft_search import CylinderViews, find_shaft
 from neeco.raster import rasterize
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
-from neeco.training.session import GaussianSession
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,45 +251,6 @@ def posed_views(evidence: Evidence, name: str, settings: CarvingSettings, moved:
     shifts = [round(len(poses) * (k + 0.1 * (k % 2)) / (count + 1)) for k in range(1, count + 1)]
     exchanged = torch.stack([(cameras @ poses.roll(shift, 0)).float() for shift in shifts])
     return PosedViews(evidence, own, exchanged, settings.motion_ratio)
-
-
-def carved_shape(session: GaussianSession, evidence: Evidence, name: str, generator: torch.Generator) -> CarvedShape:
-    """Return the carved shape, or seeds around the tracked frame where the evidence does not move with the instrument.
-    Raises NeecoError without evidence."""
-    search = session.config.deformation.carving
-    shape = carve(evidence, name, generator, search)
-    if shape is None:
-        raise NeecoError(
-            f"instrument {name!r}: nothing in the images moves with its recorded pose; check that its poses are in mm "
-            f"and in the cameras' world frame (`neeco check`): {HOW_TO_REGISTER}; or train with --method nps"
-        )
-    if moves_with_pose(session, evidence, name, shape):
-        return shape
-    return shape_around_frame(shape, evidence.distance, search.seeds, generator)
-
-
-def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, shape: CarvedShape) -> bool:
-    """Whether the evidence moves with the instrument: with exchanged poses it must be weaker.
-
-    Where it is not (an instrument that hardly moves), carving cannot separate the instrument from static parts of the
-    scene. Reports that, and notes it in the scene's diagnostics.
-    """
-    search = session.config.deformation.carving
-    views = posed_views(evidence, name, search)
-    own, _ = score_points(evidence, views.own, shape.seeds)
-    other = views.exchanged_scores(shape.seeds)
-    moves = float(own.mean()) > search.motion_ratio * float(other.mean())
-    session.scene.diagnostics.setdefault("instruments", {})[name] = {
-        "evidence": round(float(own.mean()), 4),
-        "evidence_of_other_poses": round(float(other.mean()), 4),
-        "moves_with_its_pose": moves,
-    }
-    if not moves:
-        session.report(
-            f"warning: {name}: the images hardly depend on its recorded pose; its shape is searched around the "
-            f"tracked frame, and its labels may be wrong: record more motion, or register its poses ({HOW_TO_REGISTER})"
-        )
-    return moves
 
 
 def shape_around_frame(shape: CarvedShape, distance: float, count: int, generator: torch.Generator) -> CarvedShape:
