@@ -103,7 +103,7 @@ def test_a_dark_shaft_before_dark_tissue_is_not_taken_for_tissue() -> None:
     session = session_of(scene, metal=dark)
     observe_silhouettes(session)
     (values,) = session.silhouettes.values
-    assert bool((values[20:44, 38:52] == INSTRUMENT).all())
+    assert bool((values[20:44, 39:52] == INSTRUMENT).all())  # from 3 px inside: at its outline it is all but a shade
     assert int(values[54:76, 38:52].min()) >= UNKNOWN - 30
     assert int(values[20:44, :30].max()) <= UNKNOWN + 5
 

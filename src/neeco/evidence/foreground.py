@@ -6,7 +6,7 @@ pixel is described by the factor that fits best (`shade`) and by what that leave
 lit as there or in any shade of a shadow; of the instruments, well inside of where they are rendered. Their ratio tells
 which of the two a pixel shows, and says nothing where both are alike: a black shaft is no shadow of dark cloth where
 its residuals differ from those of cloth, and undetermined where they do not. At outlines a pixel shows both, mixed by
-the lens: it counts as the instrument's only where more than half of it is covered.
+the lens: it counts as the instrument's only where more than half of it is covered, and as tissue where less is.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ForegroundSettings:
     least_pixels: int = 200  # of each kind, below which nothing is said
     noise_quantile: float = 0.98  # of the tissue's residuals: its noise
     max_noise: float = 0.12  # above which the tissue is not learned well enough to train labels by it
-    covered: float = 0.5  # share of a pixel that an instrument covers, from which on it may be called one
+    covered: float = 0.5  # share of a pixel that an instrument covers, from which on it may be one, or else tissue
     outline_px: int = 2  # about a pixel, within which the largest difference from the tissue is one wholly covered
     reach: float = 0.075  # of the images' width: no instrument shows farther from a rendered one while it is learned
 
@@ -86,9 +86,8 @@ class Comparison:
         shade = over / np.maximum(under, 1e-6)
         likely = np.clip(shade, *settings.shadow)
         off = np.abs(shown - likely[..., None] * tissue).mean(-1)
-        difference = np.abs(shown - tissue).mean(-1)
-        around = np.ones((2 * settings.outline_px + 1,) * 2, np.uint8)
-        covered = difference / np.maximum(cv2.dilate(uniform_filter(difference, window), around), 1e-6)
+        # by both: a shadow may differ more than an instrument does, and a dark instrument is nearly a shade
+        covered = np.minimum(*(_coverage(each, settings) for each in (np.abs(shown - tissue).mean(-1), off)))
         brightness = settings.dark + uniform_filter(likely * tissue.mean(-1), window)
         label = channels[..., 0].cpu().numpy()
         usable = np.ones(label.shape, bool) if mask is None else mask.cpu().numpy()
@@ -135,9 +134,10 @@ class Foreground:
         """Return of every pixel of a view [H, W]: 1 certainly an instrument, -1 certainly tissue, 0 not known. No
         instrument shows farther than `near` (share of the width) from a rendered one."""
         instrument, tissue = self._claims(view.residual, view.shade)
-        alone, _ = self._claims(view.own, view.shade)  # averages reach beyond outlines
-        may_be = view.near(near) & (view.covered > self.settings.covered)
-        instrument = np.where(may_be, np.minimum(instrument, alone), 0)
+        instrument_alone, tissue_alone = self._claims(view.own, view.shade)  # averages reach beyond outlines
+        covered = view.covered > self.settings.covered
+        instrument = np.where(covered & view.near(near), np.minimum(instrument, instrument_alone), 0)
+        tissue = np.where(covered, tissue, np.maximum(tissue, tissue_alone))
         return np.asarray(np.where(view.usable, instrument - tissue, 0))
 
     def log_ratio(self, residuals: np.ndarray, shades: np.ndarray) -> np.ndarray:
@@ -152,6 +152,12 @@ class Foreground:
             for sign, (least, most) in ((1, self.settings.instrument), (-1, self.settings.tissue))
         )
         return instrument, tissue
+
+
+def _coverage(differences: np.ndarray, settings: ForegroundSettings) -> np.ndarray:
+    """Return differences from the tissue [H, W] as shares of the largest one within `outline_px`."""
+    around = np.ones((2 * settings.outline_px + 1,) * 2, np.uint8)
+    return differences / np.maximum(cv2.dilate(uniform_filter(differences, settings.window_px), around), 1e-6)
 
 
 def _bins(residuals: np.ndarray, shades: np.ndarray, settings: ForegroundSettings) -> tuple[np.ndarray, np.ndarray]:
