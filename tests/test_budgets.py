@@ -26,7 +26,7 @@ ROOMS = {
     "methods": (5030, 3500),
     "training": (2010, 1700),
     "states": (3370, 2600),
-    "evidence": (900, 1200),
+    "evidence": (910, 1200),
     "scene": (1970, 1800),
     "capture": (4980, 3900),
     "raster": (4060, 3800),

@@ -12,6 +12,7 @@ from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, State, Uncertainty
 from neeco.geometry.camera import Camera
 from neeco.scene.drawable import Recorded
+from neeco.states.contradictions import describe_contradictions
 from neeco.states.refinement import RefineConfig, Refinement, Verdict
 
 CPU = torch.device("cpu")
@@ -262,3 +263,14 @@ def test_standard_deviations_stay_where_nothing_was_corrected() -> None:
     shares = refinement.prior_shares().tolist()
     assert max(shares[:2]) < 0.1
     assert shares[2] == 1.0  # readings are not learned
+
+
+def test_the_report_names_frames_that_were_fitted_anew_and_those_left_out_with_the_reason() -> None:
+    refinement = Refinement(RefineConfig(frame_poses=True), sliding_frames(), (Instrument("rod"),), CPU)
+    names = [f"frame {letter}" for letter in "abcdef"]
+    assert describe_contradictions(refinement, names) == ""
+    refinement.judge(1, Verdict.REFITTED)
+    refinement.judge(3, Verdict.EXCLUDED)
+    line = describe_contradictions(refinement, names)
+    assert "1 fitted to their images from other states (frame b)" in line
+    assert "1 left out, as no state explains their images (frame d)" in line

@@ -277,16 +277,16 @@ def describe_contradictions(refinement: Refinement, names: Sequence[str]) -> str
     """Return a line on training states that contradict the others and what became of them; empty without any. names:
     of all frames."""
     firsts = [frames[0] for frames in refinement.frames_of_instant]
-    contradicting = sorted(names[index] for index in firsts if refinement.verdict(index) is not Verdict.ACCEPTED)
-    if not contradicting:
-        return ""
-    excluded = sum(not refinement.counts(index) for index in firsts)
-    named = ", ".join(contradicting[: JUDGE.max_named])
-    more = f" and {len(contradicting) - JUDGE.max_named} more" if len(contradicting) > JUDGE.max_named else ""
-    return (
-        f"{len(contradicting)} of {len(firsts)} states contradict the others: {named}{more}; "
-        f"{len(contradicting) - excluded} were fitted to their images from other states, {excluded} left out"
-    )
+    outcomes = {
+        Verdict.REFITTED: "fitted to their images from other states",
+        Verdict.EXCLUDED: "left out, as no state explains their images",
+    }
+    parts = []
+    for verdict, outcome in outcomes.items():
+        judged = sorted(names[index] for index in firsts if refinement.verdict(index) is verdict)
+        more = f" and {len(judged) - JUDGE.max_named} more" if len(judged) > JUDGE.max_named else ""
+        parts += [f"{len(judged)} {outcome} ({', '.join(judged[: JUDGE.max_named])}{more})"] if judged else []
+    return f"of {len(firsts)} states, some contradict the others: {'; '.join(parts)}" if parts else ""
 
 
 def _other_starts(search: StateSearch, index: int, others: Sequence[State]) -> list[State]:
