@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -63,9 +65,16 @@ def test_nothing_is_said_of_images_without_an_instrument() -> None:
 
 
 def test_labels_of_pixels_that_tell_nothing_are_less_certain() -> None:
-    """Most of these are shadows and fringes: of a label that is as large, fewer pixels show an instrument."""
-    certain, partly = quality_of(np.array([1000, 0, 0, 0])), quality_of(np.array([1000, 0, 0, 500]))
-    assert certain is not None
-    assert partly is not None
-    assert (certain.iou, certain.recall, partly.recall) == (1, 1, 1)
-    assert 1000 / 1500 < partly.iou < 0.9
+    """Off outlines, most of these are shadows and fringes; at outlines they show what covers them by half."""
+    views = [view(SHAFT, seed) for seed in range(3)]
+    foreground = Foreground.learned(views)
+    assert foreground is not None
+    certain = label_counts(views[0], foreground)
+    unsure = replace(foreground, ratio=np.zeros_like(foreground.ratio))
+    shares = []
+    for covered in (0.1, 0.4, 1.0):
+        partly = label_counts(replace(views[0], covered=np.full((HEIGHT, WIDTH), covered)), unsure)
+        assert partly[:2].tolist() == [0, 0]
+        assert partly.sum() == pytest.approx(certain[[0, 2, 3]].sum())
+        shares.append(partly[3] / partly.sum())
+    assert shares == pytest.approx([0.2, 0.8, 0.4])

@@ -22,7 +22,7 @@ class QualitySettings:
     reach: float = 0.2  # of the images' width: how far from a rendered instrument one may show that is not labelled
     labelled: float = 0.5  # rendered share of a pixel from which it is labelled
     certain: float = 0.25  # certainty from which a pixel counts
-    unknown: float = 0.4  # share of labelled pixels of which nothing is certain that show an instrument
+    unknown: float = 0.4  # share of labelled pixels, of which nothing is certain off outlines, that show an instrument
     least_iou: float = 0.8  # estimated, below which labels are doubtful
     least_shown: int = 600  # px of an instrument in one image; of a smaller one, edges are too large a part
 
@@ -72,19 +72,21 @@ def learned_foreground(scene: GaussianScene, frames: Sequence[Frame]) -> Foregro
 
 
 def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
-    """Count pixels of a view [4]: certain instrument that is labelled, that is not, certain tissue that is labelled,
-    and pixels that are labelled of which nothing is certain."""
+    """Count pixels of a view [4]: certain instrument that is labelled, that is not, and of the other labelled pixels
+    tissue, and instrument. Of those that are neither for certain, each counts as both: at outlines, as an instrument by
+    how near it is to being covered by half."""
     certainty, label = foreground.certainty(view, QUALITY.reach), view.usable & (view.label > QUALITY.labelled)
     instrument, tissue = certainty > QUALITY.certain, certainty < -QUALITY.certain
-    masks = instrument & label, instrument & ~label, tissue & label, label & ~instrument & ~tissue
-    return np.array([mask.sum() for mask in masks])
+    share = view.covered / foreground.settings.covered
+    share = np.where(tissue, 0, np.where(share > 1, QUALITY.unknown, share))
+    other = share[label & ~instrument]
+    return np.array([(instrument & label).sum(), (instrument & ~label).sum(), (1 - other).sum(), other.sum()])
 
 
 def quality_of(counts: np.ndarray, least: int = SETTINGS.least_pixels) -> LabelQuality | None:
     """Return the quality of labels with such counts [4], summed over their images; None where these show fewer than
     `least` pixels of an instrument for certain."""
-    both, missed, wrong, unknown = counts.tolist()
+    both, missed, wrong, likely = counts.tolist()
     if both + missed < least:
         return None
-    right = both + QUALITY.unknown * unknown
-    return LabelQuality(both / (both + missed), right / max(1, both + wrong + unknown))
+    return LabelQuality(both / (both + missed), (both + likely) / max(1, both + wrong + likely))
