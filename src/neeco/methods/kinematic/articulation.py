@@ -81,12 +81,6 @@ class Articulation(nn.Module):
         origin, direction = self.shaft()
         return (points - origin) @ direction
 
-    def across_shaft(self, points: Tensor) -> Tensor:
-        """Return the distance [M] mm of points [M, 3] from the shaft's axis."""
-        origin, direction = self.shaft()
-        arm = points - origin
-        return (arm - (arm @ direction)[:, None] * direction).norm(dim=1)
-
     def first_joint(self) -> Tensor:
         """Return the position [] mm of the rearmost joint along the shaft, without gradient; 0 without joints."""
         raise NotImplementedError

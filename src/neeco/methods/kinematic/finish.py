@@ -34,7 +34,6 @@ class FinishSettings:
     max_end_coverage: float = 0.3  # share of frames above which the observed rear end is the real end
     min_joint_explained: float = 0.35  # share of the moving parts' error that a found joint explains
     slab_radii: float = 1.5  # length of the repeated slab, in shaft radii
-    max_copied_radii: float = 1.3  # from the axis, in shaft radii: what is farther off is no surface of a shaft
 
 
 FINISH = FinishSettings()
@@ -207,12 +206,11 @@ def extend_shaft(
     if float(coverage[0]) > FINISH.max_end_coverage or not bool(observed.any()):
         return canonical
     start = float(positions[observed][0])
-    across = articulation.across_shaft(canonical.means[rows])
     behind = solid & (along < front)
-    radius = float(across[behind if bool(behind.any()) else solid].median())
-    slab = FINISH.slab_radii * radius
-    copied = (along >= start) & (along < start + slab) & (across < FINISH.max_copied_radii * radius)
-    copied = torch.nonzero(copied)[:, 0]
+    origin, direction = articulation.shaft()
+    across = canonical.means[rows] - origin - along[:, None] * direction
+    slab = FINISH.slab_radii * float(across[behind if bool(behind.any()) else solid].norm(dim=1).median())
+    copied = torch.nonzero((along >= start) & (along < start + slab))[:, 0]
     if start + slab > front or len(copied) < 10:
         return canonical
     seen_part = torch.nonzero(along >= start)[:, 0]
@@ -225,7 +223,6 @@ def extend_shaft(
     counts = list(canonical.counts)
     counts[body] = len(index)
     extended = canonical.map(lambda tensor: tensor[whole].contiguous(), tuple(counts))
-    _, direction = articulation.shaft()
     extended.means[extended.body(body)] += shift[:, None] * direction
     return extended
 
