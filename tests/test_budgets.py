@@ -23,7 +23,7 @@ ROOMS = {
     "synthesis": (4340, 3200),
     "evaluation": (1400, 1200),
     "labels": (920, 800),
-    "methods": (5030, 3500),
+    "methods": (5070, 3500),
     "training": (2010, 1700),
     "states": (3370, 2600),
     "evidence": (910, 1200),

@@ -15,7 +15,9 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.geometry.camera import Camera
+from neeco.geometry.projection import project_world
 from neeco.methods.kinematic.deformation import observe_silhouettes
+from neeco.methods.kinematic.finish import drop_refuted
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
@@ -165,3 +167,24 @@ def test_a_checkpoint_brings_them_back(capture: Path) -> None:
     assert back is not None
     assert back.noise == 0.0125
     assert all(torch.equal(a, b) for a, b in zip(back.values, frames, strict=True))
+
+
+@pytest.mark.parametrize(("deviation_mm", "dropped"), [(0.0, True), (5.0, False)])
+def test_what_training_images_refute_is_dropped_within_the_uncertainty_of_their_states(
+    deviation_mm: float, dropped: bool
+) -> None:
+    session = session_of(Scene())
+    session.frames_along_poses = lambda count: [0, 1]
+    session.refinement = SimpleNamespace(
+        counts=lambda index: True, instants=[0, 1], pose_sd=torch.full((2, 1, 6), deviation_mm)
+    )
+    canonical = session.scene.canonical
+    left = drop_refuted(session)
+    assert torch.equal(left.means[left.body(0)], canonical.means[canonical.body(0)])
+    columns, kept = (
+        project_world(means[means[:, 1].abs() < 20], CAMERA)[0][:, 0]  # in the image
+        for means in (canonical.means[canonical.body(1)], left.means[left.body(1)])
+    )
+    assert (float(columns.min()), float(columns.max())) == pytest.approx((32.5, 62.0), abs=1)
+    assert (float(kept.min()) > 33.5) == dropped  # the image shows the instrument in columns 36 .. 61
+    assert int(((columns > 38) & (columns < 59)).sum()) == int(((kept > 38) & (kept < 59)).sum())

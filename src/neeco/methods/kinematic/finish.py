@@ -6,14 +6,20 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
 from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
-from neeco.geometry.projection import in_image
+from neeco.evidence.foreground import Foreground
+from neeco.evidence.label_quality import QUALITY
+from neeco.geometry.camera import Camera
+from neeco.geometry.projection import in_image, project_world
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments, Articulation
 from neeco.methods.kinematic.wrist import WRIST, color_boundary, solid_extent, solid_gaussians
 from neeco.raster import rasterize
+from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
@@ -28,6 +34,11 @@ class FinishSettings:
     min_visible_share: float = 0.2  # of the pixels that a Gaussian covers of its instrument rendered alone
     min_pixels_alone: float = 0.05  # px covered there, in all frames together: below, its own instrument occludes it
     max_occlusion_frames: int = 64  # evenly spaced
+    # frames that show tissue in a Gaussian's place, from which on it is no instrument: number, and share of those that
+    # show either for certain
+    refuting_frames: int = 2
+    refuting_share: float = 0.1
+    behind: float = 1.02  # of the tissue's depth, behind which a Gaussian is hidden
     # training frames that must observe a position of the shaft for it to be copied: share, and number (half at most)
     min_coverage: float = 0.08
     min_frames: int = 6
@@ -45,6 +56,7 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
     into `scene.diagnostics`. Warn of an instrument of which hardly anything was learned.
     """
     session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
+    session.scene.canonical = drop_refuted(session)
     session.scene.canonical = finalise_links(drop_occluded(session.scene), articulated)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
@@ -157,6 +169,48 @@ def _with_reading(state: State, instrument: str, joint: str, reading: float) -> 
     given = state.instruments[instrument]
     changed = InstrumentState(given.pose, {**given.joints, joint: reading})
     return replace(state, instruments={**state.instruments, instrument: changed})
+
+
+def drop_refuted(session: GaussianSession) -> CanonicalGaussians:
+    """Return the canonical Gaussians without those of instruments in whose place training images show tissue.
+
+    An instrument hides the tissue behind it in every frame. What one or two frames taught does not, and it would be
+    labelled in new states. Tissue within the standard deviation of a frame's state does not count.
+    """
+    canonical, refinement = session.scene.canonical, session.refinement
+    indices = [k for k in session.frames_along_poses(FINISH.max_occlusion_frames) if refinement.counts(k)]
+    views = [session.compared(index) for index in indices]
+    foreground = Foreground.learned(views)
+    if foreground is None or foreground.noise > foreground.settings.max_noise:
+        return canonical
+    refuting, confirming = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))  # frames [N]
+    for index, view in zip(indices, views, strict=True):
+        state, camera = session.corrected(index)
+        posed = session.scene.at(state)
+        shown, pixels = _in_front(posed, canonical.of_instruments, camera)
+        if not bool(shown.any()):
+            continue
+        distance = float(project_world(posed.means[shown], camera)[1].median())
+        deviation = float(refinement.pose_sd[refinement.instants[index], :, 3:].max())
+        margin = 2 * int(deviation * camera.fx / distance) + 1
+        certainty = foreground.certainty(view, foreground.settings.reach)
+        tissue = cv2.erode((certainty < -QUALITY.certain).astype(np.uint8), np.ones((margin, margin), np.uint8))
+        for votes, where in ((refuting, tissue > 0), (confirming, certainty > QUALITY.certain)):
+            votes += shown & torch.from_numpy(where).to(shown.device)[pixels]
+    refuted = (refuting >= FINISH.refuting_frames) & (refuting > FINISH.refuting_share * (refuting + confirming))
+    counts = tuple(int((~refuted[canonical.body(body)]).sum()) for body in range(len(canonical.counts)))
+    return canonical.map(lambda tensor: tensor[~refuted], counts)
+
+
+def _in_front(posed: Gaussians, instruments: Tensor, camera: Camera) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Return which posed Gaussians are the instruments' and not behind the tissue in the image [N], and the rows and
+    columns [N] px of all."""
+    pixels, depths = project_world(posed.means, camera)
+    column, row = pixels.nan_to_num().long().unbind(-1)
+    places = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
+    tissue = rasterize(posed.select(~instruments), camera)
+    before = (depths < FINISH.behind * tissue.depth[places]) | (tissue.alpha[places] < 0.5)
+    return instruments & in_image(posed.means, camera) & before, places
 
 
 def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
