@@ -50,6 +50,7 @@ class ForegroundSettings:
     noise_quantile: float = 0.98  # of the tissue's residuals: its noise
     max_noise: float = 0.12  # above which the tissue is not learned well enough to train labels by it
     covered: float = 0.5  # share of a pixel that an instrument covers, from which on it may be one, or else tissue
+    lit: float = 0.6  # shade of a pixel that is tissue by itself: a darker one may be mixed with a black instrument
     outline_px: int = 2  # about a pixel, within which the largest difference from the tissue is one wholly covered
     reach: float = 0.075  # of the images' width: no instrument shows farther from a rendered one while it is learned
 
@@ -137,7 +138,8 @@ class Foreground:
         instrument_alone, tissue_alone = self._claims(view.own, view.shade)  # averages reach beyond outlines
         covered = view.covered > self.settings.covered
         instrument = np.where(covered & view.near(near), np.minimum(instrument, instrument_alone), 0)
-        tissue = np.where(covered, tissue, np.maximum(tissue, tissue_alone))
+        lit = view.shade > self.settings.lit
+        tissue = np.where(~covered & lit, np.maximum(tissue, tissue_alone), tissue)
         return np.asarray(np.where(view.usable, instrument - tissue, 0))
 
     def log_ratio(self, residuals: np.ndarray, shades: np.ndarray) -> np.ndarray:

@@ -37,7 +37,7 @@ class FinishSettings:
     # frames that show tissue in a Gaussian's place, from which on it is no instrument: number, and share of those that
     # show either for certain
     refuting_frames: int = 2
-    refuting_share: float = 0.1
+    refuting_share: float = 0.25
     behind: float = 1.02  # of the tissue's depth, behind which a Gaussian is hidden
     # training frames that must observe a position of the shaft for it to be copied: share, and number (half at most)
     min_coverage: float = 0.08
