@@ -37,7 +37,7 @@ from neeco.synthesis.generator import (
     format_counts,
 )
 from neeco.synthesis.parallel import draw_in_workers
-from neeco.synthesis.samplers import N_SIMILAR, states_fingerprint
+from neeco.synthesis.samplers import SAMPLING, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import (
@@ -114,7 +114,7 @@ def synthesize(
     identity = settings.identity() | {
         **settings.image_identity(recorded.width, recorded.height),
         "states_sha256": states_fingerprint(settings.states),
-        "similar_views": N_SIMILAR,
+        "similar_views": SAMPLING.n_similar,
         "camera_effects": effects,
         **folders,
     }
