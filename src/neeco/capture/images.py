@@ -26,8 +26,8 @@ warnings.simplefilter("error", Image.DecompressionBombWarning)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureSettings:
-    """Thresholds of what pictures show."""
+class PixelSettings:
+    """Thresholds of what an image's pixels show."""
 
     # Levels of 255, mean and largest, by which a picture differs that is coded again: 0.07 and 19 by H.264 at its
     # coarsest; 0.4 and 40 or more where a camera or an instrument moves
@@ -39,7 +39,7 @@ class PictureSettings:
     min_lit: float = 0.02  # share of an image: with fewer lit pixels it is not counted
 
 
-PICTURES = PictureSettings()
+PIXELS = PixelSettings()
 PNG_NONE, PNG_SUB, PNG_AVERAGE = 8, 16, 64  # filters of a PNG's rows: the best of labels, of depths, and of images
 FORMATS = ("PNG", "JPEG")  # that are opened, whatever a file's name says: Pillow's other decoders stay unused
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -190,7 +190,7 @@ def is_repeated(before: np.ndarray, picture: np.ndarray) -> bool:
     if before.shape != picture.shape:
         return False
     change = cv2.absdiff(before, picture)
-    return bool(change.mean() < PICTURES.repeated_mean and change.max() < PICTURES.repeated_max)
+    return bool(change.mean() < PIXELS.repeated_mean and change.max() < PIXELS.repeated_max)
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -250,8 +250,8 @@ class Hidden:
 def measure_hidden(pixels: np.ndarray, mask: np.ndarray, camera: Camera | None, points: np.ndarray) -> Hidden:
     """Count what a loss mask bool [H, W], False where ignored, hides of an image [H, W, 3], uint8 or in [0, 1], and of
     points [P, 3] mm in its camera (None: not known)."""
-    lit, ignored = pixels.max(-1) > PICTURES.lit * (255 if pixels.dtype == np.uint8 else 1), ~mask
-    share = float(ignored[lit].mean()) if lit.mean() > PICTURES.min_lit else None
+    lit, ignored = pixels.max(-1) > PIXELS.lit * (255 if pixels.dtype == np.uint8 else 1), ~mask
+    share = float(ignored[lit].mean()) if lit.mean() > PIXELS.min_lit else None
     if camera is None or not len(points):
         return Hidden(share, 0, 0)
     with np.errstate(all="ignore"):  # points on the camera's plane

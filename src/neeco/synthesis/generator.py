@@ -22,8 +22,9 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import State, evenly_spaced
 from neeco.geometry.camera import Camera
 from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends_of
-from neeco.labels.drawing import MAX_UNOBSERVED, LayeredDrawing, draw_layers
+from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
+from neeco.labels.settings import LABELS
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.scene.io import load_gaussians
 from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, split
@@ -116,7 +117,7 @@ class Acceptance:
             return LEAVES_IMAGE
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
-        unobserved = drawing.unobserved.numpy() > MAX_UNOBSERVED
+        unobserved = drawing.unobserved.numpy() > LABELS.max_unobserved
         if unobserved.mean(dtype=np.float32) > ACCEPTED.max_unobserved_share:
             return UNOBSERVED_TISSUE
         labelled = drawing.parts.numpy() > 0

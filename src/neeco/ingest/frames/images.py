@@ -15,7 +15,7 @@ import torch
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_unsynced
-from neeco.capture.images import PICTURES, encoded_rgb, is_repeated, open_image, write_labels
+from neeco.capture.images import PIXELS, encoded_rgb, is_repeated, open_image, write_labels
 from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
@@ -136,7 +136,7 @@ def frozen_frames(features: FrameFeatures, usable: np.ndarray, states: np.ndarra
     source = np.maximum.accumulate(np.where(features.repeats, 0, np.arange(len(states))))
     change = states - states[source]
     shifts, turns = np.linalg.norm(change[:, :3], axis=1), np.linalg.norm(change[:, 3:], axis=1)
-    moved = (shifts > PICTURES.visible_mm) | (turns > PICTURES.visible_rad)
+    moved = (shifts > PIXELS.visible_mm) | (turns > PIXELS.visible_rad)
     return np.flatnonzero(moved & usable & usable[source])
 
 

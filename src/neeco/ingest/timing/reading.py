@@ -16,7 +16,7 @@ from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_r
 from neeco.ingest.recording.base import STATED
 from neeco.ingest.recording.compatibility import check_recordings, episode_names, refusal
 from neeco.ingest.recording.model import STILL, Recording
-from neeco.ingest.timing.clock_search import GIVEN, SEARCH, ClockOffset
+from neeco.ingest.timing.clock_search import CLOCK, GIVEN, ClockOffset
 from neeco.ingest.timing.episodes import PAUSE_S, Episode, Episodes, Notes, assumed_clock
 
 MIN_FPS, MAX_FPS = 0.01, 10_000.0
@@ -173,7 +173,7 @@ def require_lens(recording: Recording, lens: Lens | None) -> None:
 def _check_video(recording: Recording, video: VideoSource) -> None:
     """Raise NeecoError for times that no recording has, and for frames too small."""
     rate, length = 1 / float(np.median(np.diff(video.times))), video.times[-1] - video.times[0]
-    if not (MIN_FPS < rate < MAX_FPS and length < SEARCH.max_length_s):
+    if not (MIN_FPS < rate < MAX_FPS and length < CLOCK.max_length_s):
         raise NeecoError(
             f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
             "cannot be; correct fps or the times' unit"
