@@ -105,7 +105,7 @@ def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
 def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path) -> tuple[list[Frame], list[str]]:
     """Return the frames with loss masks that ignore the tool, and notes on the masks.
 
-    White is the tool, as EndoNeRF writes it, unless that would be more than MAX_HIDDEN of the lit pixels of most
+    White is the tool, as EndoNeRF writes it, unless that would be more than `max_hidden` of the lit pixels of most
     images: then black is the tool, as in StereoMIS. Raises NeecoError for a damaged mask.
     """
     sizes = [(frame.camera.width, frame.camera.height) for frame in frames]

@@ -11,11 +11,10 @@ class LabelSettings:
 
     # The instrument's moving shadow is learned with labels of 0.3 to 0.5, so that 0.5 is too low; 0.65 to 0.7 is best.
     threshold: float = 0.65
-    shadowed_threshold: float = (
-        0.55  # where the scene models that shadow: 0.65 loses as much of the silhouette's border
-    )
-    # A share below the first is clearly tissue, one above the second clearly instrument. Measured by what a U-Net learns
-    # from the rest: a band from 0.15 leaves out mostly tissue, so that it over-segments (IoU 0.93 instead of 0.96).
+    # where the scene models that shadow: 0.65 then loses as much of the silhouette's border
+    shadowed_threshold: float = 0.55
+    # A share below the first is clearly tissue, one above the second clearly instrument. Measured by what a U-Net
+    # learns from the rest: a band from 0.15 leaves out mostly tissue, so that it over-segments (IoU 0.93, not 0.96).
     clear_shares: tuple[float, float] = (0.5, 0.9)
     min_brightness: float = 0.1  # RGB norm above which a pixel of the instrument rendered alone is the instrument
     n_threshold_states: int = 24  # recorded states for Otsu's method

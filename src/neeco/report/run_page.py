@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 
 from neeco.base.files import read_bytes
 from neeco.capture.model import Capture, Frame, State
-from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, overlay_parts, part_color
+from neeco.evaluation.image_metrics import COMPARISON, overlay_outline, overlay_parts, part_color
 from neeco.evaluation.mask_folders import load_reference
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
@@ -117,7 +117,7 @@ def write_report(
         notes=[*(f"Doubtful: {doubt}" for doubt in evaluation.get("doubts", ())), *evaluation.get("notes", ())],
         figures=frame_figures(evaluation, capture, scene, kind),
         pose_kind=KIND_NAMES[kind],
-        full_scale=FULL_SCALE,
+        full_scale=COMPARISON.full_scale,
         tints=_tints(scene),
         curves=[chart for chart in curves if chart],
         verdicts=_verdicts(getattr(scene, "diagnostics", {})),
