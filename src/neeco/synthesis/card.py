@@ -162,7 +162,7 @@ class PreviewSettings:
     tiles: int = 8
     columns: int = 2
     tile_width: int = 360
-    pair_width: int = 2 * 360 + 4  # the plain image, and the same with its labels
+    pair_width: int = 2 * tile_width + 4  # the plain image, and the same with its labels
     gap: int = 14
     caption_line: int = 17
     caption_fonts: tuple[int, int] = (13, 12)  # px
