@@ -10,7 +10,7 @@ import pytest
 
 from neeco.base.errors import NeecoError
 from neeco.cli import _progress
-from neeco.cli._progress import Bars, counting
+from neeco.cli._progress import Bars, ProgressSettings, counting
 from neeco.studies.study import JobEvent
 from neeco.training.train import ProgressRow
 
@@ -25,7 +25,7 @@ def test_a_progress_bar_says_nothing_before_there_is_news(capsys):
 
 
 def test_a_file_gets_a_line_at_intervals_with_what_how_far_and_how_long_still(capsys, monkeypatch):
-    monkeypatch.setattr("neeco.cli._progress.LINE_INTERVAL_S", 0.02)
+    monkeypatch.setattr("neeco.cli._progress.PROGRESS", ProgressSettings(line_interval_s=0.02))
     row = ProgressRow(
         iteration=1234, loss=0.1, psnr=30.04, num_gaussians=23456, phase=1, progress=0.25, seconds=0.4, prepared=0.1
     )
@@ -40,7 +40,7 @@ def test_a_file_gets_a_line_at_intervals_with_what_how_far_and_how_long_still(ca
 
 
 def test_a_stage_that_reports_nothing_is_told_too_and_an_error_alone_ends_it(capsys, monkeypatch):
-    monkeypatch.setattr(_progress, "LINE_INTERVAL_S", 0.02)
+    monkeypatch.setattr(_progress, "PROGRESS", ProgressSettings(line_interval_s=0.02))
 
     def work() -> None:
         with Bars() as bars:
@@ -55,7 +55,7 @@ def test_a_stage_that_reports_nothing_is_told_too_and_an_error_alone_ends_it(cap
 
 
 def test_the_time_left_counts_down_between_two_news_and_leaves_preparation_out(capsys, monkeypatch):
-    monkeypatch.setattr(_progress, "LINE_INTERVAL_S", 0.02)
+    monkeypatch.setattr(_progress, "PROGRESS", ProgressSettings(line_interval_s=0.02))
     clock = iter(np.arange(0.0, 1e6, 5.0))  # s: every look at it is 5 s later
     with Bars() as bars:
         monkeypatch.setattr(bars.bar, "get_time", lambda: next(clock))
@@ -82,7 +82,7 @@ def test_jobs_that_all_ended_have_said_so_and_leave_no_last_line(capsys):
 
 
 def test_work_of_some_length_ends_with_its_total_time(capsys, monkeypatch):
-    monkeypatch.setattr(_progress, "MIN_SHOWN_S", 0.0)
+    monkeypatch.setattr(_progress, "PROGRESS", ProgressSettings(min_shown_s=0.0))
     with Bars() as bars:
         bars.stage("reading", 1, 1)
     assert capsys.readouterr().err.splitlines()[-1] == "total: 0:00:00"

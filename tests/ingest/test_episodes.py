@@ -19,7 +19,7 @@ from neeco.ingest.recording.compatibility import episode_names, separate
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import Recording
 from neeco.ingest.sources import sources_of
-from neeco.ingest.timing.episodes import PAUSE_S
+from neeco.ingest.timing.episodes import EPISODES
 from neeco.ingest.timing.reading import read_episodes
 
 BEGINS = (0.0, 2.0, 4.5)  # s of the bar's motion
@@ -60,7 +60,7 @@ def test_recordings_of_a_still_scope_become_one_capture_with_every_pose_in_its_p
     assert capture.still
     assert capture.registered
     theatre = Theatre(tmp_path)
-    length = (FRAMES - 1) / RATE + PAUSE_S
+    length = (FRAMES - 1) / RATE + EPISODES.pause_s
     seen = set()
     for frame in capture.frames:
         episode, number = int(frame.name[5]), int(frame.name[-6:])
@@ -157,7 +157,7 @@ def test_logs_on_the_joint_timeline_say_what_each_says_on_its_own(tmp_path: Path
             poses_at(part.poses["bar"], part.times + number, 0.0)[0] for number, part in enumerate(data.parts)
         ]), atol=1e-9,
     )  # fmt: skip
-    between = times[FRAMES - 1] + PAUSE_S / 2
+    between = times[FRAMES - 1] + EPISODES.pause_s / 2
     assert not poses_at(log, np.array([between]))[1].any()
 
 

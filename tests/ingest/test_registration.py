@@ -14,8 +14,8 @@ from neeco.base.errors import NeecoError
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.registration.hand_eye import register_with_laparoscope
 from neeco.ingest.timing.clock_search import (
+    CLOCK,
     GIVEN,
-    SEARCH,
     ClockOffset,
     best_rate,
     clock_from_instrument,
@@ -181,21 +181,19 @@ def test_the_instruments_motion_tells_another_frame_rate(rate: float) -> None:
 def test_rates_are_found_in_long_recordings_too() -> None:
     length = 150.0
     known = np.random.default_rng(2).normal(size=int(length / 0.5))
-    speed = np.abs(np.interp(np.arange(0, length, SEARCH.step_s), np.arange(len(known)) * 0.5, known))
-    video = np.interp(np.arange(0, 120, SEARCH.step_s) * 1.01 + 20, np.arange(0, length, SEARCH.step_s), speed)
+    speed = np.abs(np.interp(np.arange(0, length, CLOCK.step_s), np.arange(len(known)) * 0.5, known))
+    video = np.interp(np.arange(0, 120, CLOCK.step_s) * 1.01 + 20, np.arange(0, length, CLOCK.step_s), speed)
     rate, lags, scores = best_rate(video, speed)
     assert rate == pytest.approx(1.01, abs=0.001)
-    assert lags[scores.argmax()] * SEARCH.step_s == pytest.approx(20, abs=0.1)
+    assert lags[scores.argmax()] * CLOCK.step_s == pytest.approx(20, abs=0.1)
 
 
 def test_a_correlation_counts_by_how_many_independent_samples_it_has() -> None:
     """Six seconds of smooth motion fit by chance at one of many offsets; a minute of the same correlation does not."""
     rng = np.random.default_rng(1)
-    one, other = (
-        np.interp(np.arange(0, 60, SEARCH.step_s), np.arange(181) / 3, rng.normal(size=181)) for _ in range(2)
-    )
+    one, other = (np.interp(np.arange(0, 60, CLOCK.step_s), np.arange(181) / 3, rng.normal(size=181)) for _ in range(2))
     short = significance(one[:300], other[:300], 0, 0.64)
-    assert 1 < short < SEARCH.min_significance < 2 * short < significance(one, other, 0, 0.64)
+    assert 1 < short < CLOCK.min_significance < 2 * short < significance(one, other, 0, 0.64)
 
 
 def test_a_trackers_slow_errors_count_in_where_the_cameras_stand() -> None:

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from neeco.labels.drawing import EDGE_WIDTH, uncertain_edge, without_components
-from neeco.labels.labellers import CLEAR_SHARES, LABEL_THRESHOLD
+from neeco.labels.drawing import uncertain_edge, without_components
+from neeco.labels.settings import LABELS
 
 HEIGHT, WIDTH = 120, 160
-REACH_PX = EDGE_WIDTH * np.hypot(HEIGHT, WIDTH)  # 1.6
+REACH_PX = LABELS.edge_width * np.hypot(HEIGHT, WIDTH)  # 1.6
 
 
 def disc(radius: float, x: float = 60.0, y: float = 50.0) -> np.ndarray:
@@ -15,8 +15,8 @@ def disc(radius: float, x: float = 60.0, y: float = 50.0) -> np.ndarray:
 
 
 def soft(inside: np.ndarray, width: float) -> np.ndarray:
-    """A share that falls from 1 to 0 over `width` px, LABEL_THRESHOLD at the circle."""
-    return np.clip(LABEL_THRESHOLD + inside / width, 0, 1).astype(np.float32)
+    """A share that falls from 1 to 0 over `width` px, LABELS.threshold at the circle."""
+    return np.clip(LABELS.threshold + inside / width, 0, 1).astype(np.float32)
 
 
 def test_where_the_share_jumps_the_band_is_a_pixel_at_either_side():
@@ -40,7 +40,7 @@ def test_the_band_holds_what_is_unclear_near_the_border_and_nothing_far_from_it(
     inside = disc(30)
     share = soft(inside, width=16)
     band = uncertain_edge(share, inside > 0)
-    unclear = (share > CLEAR_SHARES[0]) & (share < CLEAR_SHARES[1])
+    unclear = (share > LABELS.clear_shares[0]) & (share < LABELS.clear_shares[1])
     assert band[unclear & (np.abs(inside) < REACH_PX)].all()
     assert not band[np.abs(inside) > REACH_PX + np.sqrt(2)].any()
     narrow = uncertain_edge((inside > 0).astype(np.float32), inside > 0)

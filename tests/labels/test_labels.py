@@ -9,7 +9,6 @@ from neeco.geometry.camera import Camera
 from neeco.labels.annotation import annotate, place_in_image, visibility
 from neeco.labels.drawing import draw, draw_layers
 from neeco.labels.labellers import (
-    LABEL_THRESHOLD,
     CompositedLabels,
     DeltaThresholds,
     ThresholdLabels,
@@ -17,6 +16,7 @@ from neeco.labels.labellers import (
     find_thresholds,
     otsu_of_magnitudes,
 )
+from neeco.labels.settings import LABELS
 from neeco.raster import Rendering, rasterize
 from neeco.synthesis.generator import UNOBSERVED_SIDE, UNOBSERVED_TISSUE, Acceptance
 
@@ -201,7 +201,7 @@ def test_no_gaussian_over_the_thresholds_means_an_empty_mask(scene, state, camer
 def test_the_share_is_the_sum_of_the_label_channels_and_the_mask_is_where_it_exceeds_the_threshold(
     scene, state, camera
 ):
-    for threshold in (LABEL_THRESHOLD, 0.3):
+    for threshold in (LABELS.threshold, 0.3):
         drawing, _ = labelled(scene, state(), camera, CompositedLabels(scene, threshold))
         channels = rasterize(scene.at(state()), camera, channels=scene.label_channels()).channels
         assert (drawing.share == channels.sum(dim=-1).clamp(0, 1)).all()

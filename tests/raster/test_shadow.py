@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neeco.raster import Camera, Gaussians, Headlight, depth_maps, kernels, rasterize
 from neeco.raster.native import Family, set_threads
-from neeco.raster.shadow import GAMMA, MIN_WINDOW_SD, Casting, blocked, blocked_reference, blur, light_camera
+from neeco.raster.shadow import GAMMA, SHADOWS, Casting, blocked, blocked_reference, blur, light_camera
 from neeco.raster.types import Layer, Shadow
 
 CAMERA = Camera(torch.eye(4), fx=80.0, fy=80.0, cx=40.0, cy=32.0, width=80, height=64)
@@ -280,7 +280,7 @@ def test_a_blur_moves_light_and_loses_none(height: int, width: int, sigma: float
     out = blur(image, torch.tensor(sigma, dtype=torch.float64))
     assert float(out.sum()) == pytest.approx(1)
     spread = (out.sum(0) * (torch.arange(width) - width // 2) ** 2).sum().sqrt()
-    assert float(spread) <= max(sigma, MIN_WINDOW_SD) + 1e-9
+    assert float(spread) <= max(sigma, SHADOWS.min_window_sd) + 1e-9
     assert torch.equal(out, out.clamp(0, 1))
 
 

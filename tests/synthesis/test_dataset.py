@@ -13,7 +13,7 @@ from pycocotools.coco import COCO
 from neeco.base.errors import NeecoError
 from neeco.base.files import LOCK, TEMPORARY
 from neeco.capture.writer import state_to_json
-from neeco.labels.labellers import LABEL_THRESHOLD
+from neeco.labels.settings import LABELS
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import Acceptance, SampleGenerator, draw_to_folder
 from neeco.synthesis.rendered_views import render, split_views, state_views
@@ -62,8 +62,8 @@ def test_soft_and_ignore_lie_beside_the_mask(made):
     mask, soft, ignore = (pixels(made / folder / "000002.png") for folder in ("masks", "soft", "ignore"))
     assert soft.dtype == ignore.dtype == np.uint8
     share = soft * info["soft"]["share_per_count"]
-    rounded = np.abs(share - LABEL_THRESHOLD) <= info["soft"]["share_per_count"]
-    assert ((share > LABEL_THRESHOLD) == (mask > 0))[~rounded].all()
+    rounded = np.abs(share - LABELS.threshold) <= info["soft"]["share_per_count"]
+    assert ((share > LABELS.threshold) == (mask > 0))[~rounded].all()
     assert {0, 255} < set(np.unique(soft))
     assert set(np.unique(ignore)) == {0, info["ignore"]["ignored"]}
     unclear = (share > info["ignore"]["clear_shares"][0]) & (share < info["ignore"]["clear_shares"][1])

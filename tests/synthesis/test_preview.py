@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFont
 
-from neeco.synthesis.card import BOX, PAIR_WIDTH, TILE_WIDTH, draw_name, draw_tile, wrap
+from neeco.synthesis.card import PREVIEW, draw_name, draw_tile, wrap
 
 ITEMS = ["arm1 16% seen", "arm1_shaft 99% seen", "arm2 0% seen", "arm2_shaft 97% seen", "camera_holder 5% seen"]
 
@@ -32,17 +32,17 @@ def test_items_share_a_line_where_they_fit(items, width, lines):
     assert wrap(items, width, 12) == lines
 
 
-@pytest.mark.parametrize("x", [10.0, TILE_WIDTH - 5.0])
+@pytest.mark.parametrize("x", [10.0, PREVIEW.tile_width - 5.0])
 def test_a_name_beside_the_right_edge_is_read_whole(x):
-    image = Image.new("RGB", (TILE_WIDTH, 60))
+    image = Image.new("RGB", (PREVIEW.tile_width, 60))
     draw_name(ImageDraw.Draw(image), x, 40, "arm1_shaft")
-    columns = np.flatnonzero((np.asarray(image)[24:40] == BOX).all(-1).any(0))
+    columns = np.flatnonzero((np.asarray(image)[24:40] == PREVIEW.box).all(-1).any(0))
     assert columns[-1] - columns[0] >= ImageFont.load_default(11).getlength("arm1_shaft") + 6
 
 
 def test_a_tile_has_the_plain_image_beside_the_one_with_labels(tmp_path, monkeypatch):
-    pixels = np.full((30, TILE_WIDTH, 3), 90, np.uint8)
-    parts = np.zeros((30, TILE_WIDTH), np.uint8)
+    pixels = np.full((30, PREVIEW.tile_width, 3), 90, np.uint8)
+    parts = np.zeros((30, PREVIEW.tile_width), np.uint8)
     parts[10:20, 50:90] = 1
     for folder, array in (("images", pixels), ("parts", parts)):
         (tmp_path / folder).mkdir()
@@ -58,7 +58,7 @@ def test_a_tile_has_the_plain_image_beside_the_one_with_labels(tmp_path, monkeyp
         "instruments": [{"joints": joints}],
     }
     tile = np.asarray(draw_tile(tmp_path, record))[:30]
-    assert (tile[:, :TILE_WIDTH] == 90).all()
-    labelled = tile[:, PAIR_WIDTH - TILE_WIDTH :]
+    assert (tile[:, : PREVIEW.tile_width] == 90).all()
+    labelled = tile[:, PREVIEW.pair_width - PREVIEW.tile_width :]
     assert np.array_equal((labelled != 90).any(-1), parts == 1)
     assert captions == ["000000 · train · jaw_angle 30° · depth 2.5 mm"]

@@ -18,7 +18,8 @@ from torch.utils.data import DataLoader
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State
-from neeco.labels.annotation import LABELS, LabelledImage, draw_labelled
+from neeco.labels.annotation import LabelledImage, draw_labelled
+from neeco.labels.settings import LABELS
 from neeco.raster.native import torch_threads
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import StatesRefused

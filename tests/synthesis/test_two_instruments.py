@@ -8,7 +8,8 @@ from rod_world import CAMERA
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers
-from neeco.labels.labellers import LABEL_THRESHOLD, CompositedLabels, ThresholdLabels
+from neeco.labels.labellers import CompositedLabels, ThresholdLabels
+from neeco.labels.settings import LABELS
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.deformation import UNPERTURBED, Deformation, Posed
 from neeco.synthesis.states import InterpolatedStates
@@ -81,7 +82,7 @@ def test_where_one_instrument_meets_another_all_is_instrument_and_no_edge(bars, 
     middle = drawing.parts[24].numpy()
     meeting = np.flatnonzero((middle[:-1] != middle[1:]) & (middle[:-1] > 0) & (middle[1:] > 0))
     assert len(meeting) == 2  # level, upright, level
-    assert (drawing.share[24, meeting] > LABEL_THRESHOLD).all()
+    assert (drawing.share[24, meeting] > LABELS.threshold).all()
     assert not drawing.ignored[24, meeting].any()
     for part in (1, 2):  # at the edges of both
         assert (drawing.ignored & (drawing.parts == part)).any()
@@ -89,12 +90,12 @@ def test_where_one_instrument_meets_another_all_is_instrument_and_no_edge(bars, 
 
 def test_both_cast_a_shadow_on_the_tissue_and_none_on_each_other_or_in_the_labels(bars, camera):
     state = at(60, 70)
-    bright = draw_layers(bars, CompositedLabels(bars, LABEL_THRESHOLD), state, camera, 0.01)
+    bright = draw_layers(bars, CompositedLabels(bars, LABELS.threshold), state, camera, 0.01)
     with torch.no_grad():
         bars.shadow_offsets[0] = torch.tensor([15.0, 15.0, 0.0])
         bars.shadow_strengths[0] = 0.8
     try:
-        shaded = draw_layers(bars, CompositedLabels(bars, LABEL_THRESHOLD), state, camera, 0.01)
+        shaded = draw_layers(bars, CompositedLabels(bars, LABELS.threshold), state, camera, 0.01)
     finally:
         with torch.no_grad():
             bars.shadow_strengths.zero_()

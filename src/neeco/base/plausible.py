@@ -6,27 +6,39 @@ Each function returns what is wrong and what to do, or None. Poses: `neeco.geome
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 Fault = tuple[str, str]  # what is wrong, what to do
 
-MAX_SIZE_PX = 65_535  # px along a side of an image
-MIN_FOCAL, MAX_FOCAL = 0.1, 50.0  # focal length of any lens, in lengths of the image's longer side
-MAX_ANAMORPHIC = 2.5  # ratio of the two focal lengths: single fields of interlaced video have 2
-MAX_OFF_MIDDLE = 0.08  # of the sides, distance of a principal point from the middle by a lens's own tolerances
-MAX_MIDDLE_ERROR = 0.03  # of the sides, the same once intrinsics of another image size are scaled
-FULL_TURN = 2 * math.pi  # rad; a joint without stated limits turns no farther
-MAX_SLIDE_MM = 1000.0  # mm; nor slides farther
-LIMIT_TOLERANCE = 1e-3  # rad (mm of sliding joints) by which rounding and noise may exceed a limit
-MAX_TIME_S = 1e10  # s, beyond the seconds since 1970 that clocks give
-FEW_TRAIN_FRAMES = 20  # fewer: expect little
-MAX_HIDDEN = 0.5  # share of the lit pixels of most images that a loss mask may hide
-MAX_POINTS_HIDDEN = 0.8  # share of the projected sparse points that loss masks may hide
+
+@dataclass(frozen=True, kw_only=True)
+class PlausibleLimits:
+    """Limits of plausible values."""
+
+    max_size_px: int = 65_535  # px along a side of an image
+    min_focal: float = 0.1  # focal length of any lens, in lengths of the image's longer side
+    max_focal: float = 50.0  # the same, at most
+    max_anamorphic: float = 2.5  # ratio of the two focal lengths: single fields of interlaced video have 2
+    max_off_middle: float = (
+        0.08  # of the sides, distance of a principal point from the middle by a lens's own tolerances
+    )
+    max_middle_error: float = 0.03  # of the sides, the same once intrinsics of another image size are scaled
+    full_turn: float = 2 * math.pi  # rad; a joint without stated limits turns no farther
+    max_slide_mm: float = 1000.0  # mm; nor slides farther
+    limit_tolerance: float = 1e-3  # rad (mm of sliding joints) by which rounding and noise may exceed a limit
+    max_time_s: float = 1e10  # s, beyond the seconds since 1970 that clocks give
+    few_train_frames: int = 20  # fewer: expect little
+    max_hidden: float = 0.5  # share of the lit pixels of most images that a loss mask may hide
+    max_points_hidden: float = 0.8  # share of the projected sparse points that loss masks may hide
+
+
+PLAUSIBLE = PlausibleLimits()
 
 
 def size_fault(width: float, height: float) -> Fault | None:
     """Check the size of an image, px."""
     sides = (width, height)
-    if not all(math.isfinite(side) and side % 1 == 0 and 1 <= side <= MAX_SIZE_PX for side in sides):
+    if not all(math.isfinite(side) and side % 1 == 0 and 1 <= side <= PLAUSIBLE.max_size_px for side in sides):
         return f"image size {width:g} x {height:g} is not usable", "give whole numbers of pixels"
     return None
 
@@ -35,8 +47,8 @@ def focal_fault(fx: float, fy: float, width: float, height: float) -> Fault | No
     """Check focal lengths in px on an image of width x height px."""
     if not all(math.isfinite(focal) and focal > 0 for focal in (fx, fy)):
         return f"focal lengths {fx:g} and {fy:g} px are not positive numbers", "give them in pixels"
-    fits = all(MIN_FOCAL < focal / max(width, height) < MAX_FOCAL for focal in (fx, fy))
-    if not fits or max(fx, fy) > MAX_ANAMORPHIC * min(fx, fy):
+    fits = all(PLAUSIBLE.min_focal < focal / max(width, height) < PLAUSIBLE.max_focal for focal in (fx, fy))
+    if not fits or max(fx, fy) > PLAUSIBLE.max_anamorphic * min(fx, fy):
         message = f"focal lengths {fx:g} and {fy:g} px fit no lens on a {width:g}x{height:g} image"
         return message, "give them in pixels of this image (not in mm, nor as shares of its size)"
     return None
@@ -63,7 +75,8 @@ def center_fault(cx: float, cy: float, width: float, height: float) -> Fault | N
 def other_size_fault(cx: float, cy: float, width: float, height: float) -> Fault | None:
     """Check whether one factor brings a principal point far from the middle there: intrinsics of another image size."""
     scale = cx / width + cy / height  # of the image whose middle it is
-    if abs(scale - 1) <= 2 * MAX_OFF_MIDDLE or abs(cx / width - cy / height) > 2 * MAX_MIDDLE_ERROR * scale:
+    off = 2 * PLAUSIBLE.max_middle_error * scale
+    if abs(scale - 1) <= 2 * PLAUSIBLE.max_off_middle or abs(cx / width - cy / height) > off:
         return None
     message = (
         f"principal point ({cx:g}, {cy:g}) is the middle of a {width * scale:.0f}x{height * scale:.0f} image, not of "
@@ -74,14 +87,15 @@ def other_size_fault(cx: float, cy: float, width: float, height: float) -> Fault
 
 def time_fault(time: float) -> Fault | None:
     """Check a time in s."""
-    if abs(time) <= MAX_TIME_S:  # NaN compares false
+    if abs(time) <= PLAUSIBLE.max_time_s:  # NaN compares false
         return None
     return f"is {time:g} s", "give seconds (not milli- or nanoseconds)"
 
 
 def exceeds_limits(value: float, limits: tuple[float, float] | None) -> bool:
     """Return True if a joint's value exceeds its limits by more than rounding."""
-    return limits is not None and not limits[0] - LIMIT_TOLERANCE <= value <= limits[1] + LIMIT_TOLERANCE
+    slack = PLAUSIBLE.limit_tolerance
+    return limits is not None and not limits[0] - slack <= value <= limits[1] + slack
 
 
 def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool, slack: float = 0.0) -> Fault | None:
@@ -95,7 +109,7 @@ def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool, 
         message = f"is {value:g} {unit}, outside its limits {limits[0]:g} .. {limits[1]:g}"
         remedy = "repair the reading or the limits" if slides else "repair the reading (radians?) or the limits"
         return (message, remedy) if exceeds_limits(value, limits) else None
-    if abs(value) > (MAX_SLIDE_MM if slides else FULL_TURN) * (1 + slack):
+    if abs(value) > (PLAUSIBLE.max_slide_mm if slides else PLAUSIBLE.full_turn) * (1 + slack):
         if slides:
             return f"is {value:g} mm, farther than any instrument slides", "give mm, or state the joint's limits"
         remedy = "give radians; state the joint's limits in the header if it does turn that far"
@@ -105,7 +119,7 @@ def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool, 
 
 def limits_fault(limits: tuple[float, float], slides: bool) -> Fault | None:
     """Check a joint's stated limits, rad or mm."""
-    if slides or max(map(abs, limits)) <= 2 * FULL_TURN:
+    if slides or max(map(abs, limits)) <= 2 * PLAUSIBLE.full_turn:
         return None
     return f"{limits[0]:g} .. {limits[1]:g} rad: degrees?", "give radians"
 
@@ -114,9 +128,9 @@ def mask_fault(pixels: float, points: float | None) -> Fault | None:
     """Check loss masks by the shares that they hide: of the lit pixels in most images, and of the projected sparse
     points (None: there are none)."""
     hides = []
-    if pixels > MAX_HIDDEN:
+    if pixels > PLAUSIBLE.max_hidden:
         hides.append(f"{pixels:.0%} of most images")
-    if points is not None and points > MAX_POINTS_HIDDEN:
+    if points is not None and points > PLAUSIBLE.max_points_hidden:
         hides.append(f"{points:.0%} of the sparse points in view")
     if not hides:
         return None

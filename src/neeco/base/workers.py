@@ -28,11 +28,19 @@ from typing import Any, Literal
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.placeholders import read_head
 
-MAX_RETRIES = 3  # of a task whose worker died
-CONNECT_S = 5.0  # that a cluster's head gets to answer
-PROBE_S = 60.0  # that a cluster's nodes get to start a worker and look at a folder
-POLL_S = 1.0  # between two looks at running tasks
-TASKS_PER_WORKER = 2  # submitted to a cluster, so that no worker waits for the next
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerSettings:
+    """Times and numbers of tasks that workers share."""
+
+    max_retries: int = 3  # of a task whose worker died
+    connect_s: float = 5.0  # that a cluster's head gets to answer
+    probe_s: float = 60.0  # that a cluster's nodes get to start a worker and look at a folder
+    poll_s: float = 1.0  # between two looks at running tasks
+    tasks_per_worker: int = 2  # submitted to a cluster, so that no worker waits for the next
+
+
+LIMITS = WorkerSettings()
 
 # (what all tasks share, a task, threads that it may use) -> its result; pickled, so it is a function of a module
 TaskFunction = Callable[[Any, Any, int], Any]
@@ -44,7 +52,7 @@ Stage = Literal["started", "done", "failed", "died", "abandoned"]
 class TaskEvent:
     """Progress of one task: `value` is its result once it is done, or the reason why it failed or its worker died.
 
-    A task whose worker died is begun again, MAX_RETRIES times at most; then it is abandoned.
+    A task whose worker died is begun again, LIMITS.max_retries times at most; then it is abandoned.
     """
 
     index: int
@@ -90,7 +98,7 @@ def check_workers(count: int) -> None:
     if "/" in given or not (host and port.isdecimal()):  # ray://..., auto, local: for Ray to understand
         return
     try:
-        socket.create_connection((host, int(port)), CONNECT_S).close()
+        socket.create_connection((host, int(port)), LIMITS.connect_s).close()
     except (OSError, OverflowError) as error:
         raise NeecoError(
             f"RAY_ADDRESS: no Ray cluster answers at {given} ({error}); start it, or unset RAY_ADDRESS to work here"
@@ -125,7 +133,7 @@ def run_tasks(
                     yield TaskEvent(index, "started")
                 for index, outcome, value in pool.finished():
                     deaths[index] += outcome == "died"
-                    given_up = deaths[index] > MAX_RETRIES
+                    given_up = deaths[index] > LIMITS.max_retries
                     if outcome == "died" and not given_up:
                         waiting.insert(0, index)
                     yield TaskEvent(index, "abandoned" if given_up else outcome, value)
@@ -171,9 +179,9 @@ class Processes:
             worker.connection.send(task)
 
     def finished(self) -> list[tuple[int, Outcome, Any]]:
-        """Return what ended within POLL_S."""
+        """Return what ended within LIMITS.poll_s."""
         found: list[tuple[int, Outcome, Any]] = []
-        for connection in wait(list(self.running), POLL_S):
+        for connection in wait(list(self.running), LIMITS.poll_s):
             worker, index = self.running.pop(connection)
             try:
                 stage, value = worker.connection.recv()
@@ -264,7 +272,7 @@ class RayTasks:
         options: dict[str, Any] = {"num_cpus": threads, "num_gpus": share, "max_retries": 0}
         if workers.fresh:
             options["max_calls"] = 1
-        self.capacity = workers.count * (1 if workers.fresh else TASKS_PER_WORKER)
+        self.capacity = workers.count * (1 if workers.fresh else LIMITS.tasks_per_worker)
         self._ray, self._stop_s = ray, workers.stop_s
         self._remote = ray.remote(**options)(work_on_node)
         self._arguments = function, ray.put(shared), threads, os.getcwd()
@@ -276,9 +284,9 @@ class RayTasks:
         self.running[self._remote.remote(function, shared, task, threads, folder)] = index
 
     def finished(self) -> list[tuple[int, Outcome, Any]]:
-        """Return what ended within POLL_S."""
+        """Return what ended within LIMITS.poll_s."""
         found: list[tuple[int, Outcome, Any]] = []
-        for reference in self._ray.wait(list(self.running), timeout=POLL_S)[0]:
+        for reference in self._ray.wait(list(self.running), timeout=LIMITS.poll_s)[0]:
             index = self.running.pop(reference)
             try:
                 found.append((index, "done", self._ray.get(reference)))
@@ -351,7 +359,7 @@ def require_shared(ray: Any, file: Path, inputs: Collection[Path]) -> None:
                 probe = ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=there)(node_problem)
                 name = f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
                 probes[probe.remote(file, token, tuple(inputs))] = name
-        answered, silent = ray.wait(list(probes), num_returns=len(probes), timeout=PROBE_S)
+        answered, silent = ray.wait(list(probes), num_returns=len(probes), timeout=LIMITS.probe_s)
         for probe in answered:
             try:
                 problem = ray.get(probe)
@@ -360,7 +368,8 @@ def require_shared(ray: Any, file: Path, inputs: Collection[Path]) -> None:
             if problem:
                 raise NeecoError(f"RAY_ADDRESS: node {probes[probe]} {problem}")
         if silent:
-            raise NeecoError(f"RAY_ADDRESS: node {probes[silent[0]]} does not answer within {PROBE_S:.0f} s; remove it")
+            node, limit = probes[silent[0]], LIMITS.probe_s
+            raise NeecoError(f"RAY_ADDRESS: node {node} does not answer within {limit:.0f} s; remove it")
     finally:
         file.unlink(missing_ok=True)
 

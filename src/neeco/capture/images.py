@@ -24,10 +24,22 @@ from neeco.geometry.projection import project_world
 # Pillow warns of images beyond 90 million pixels, and refuses them beyond twice that: both are refused here
 warnings.simplefilter("error", Image.DecompressionBombWarning)
 
-# Levels of 255, mean and largest, by which a picture differs that is coded again: 0.07 and 19 by H.264 at its coarsest;
-# 0.4 and 40 or more where a camera or an instrument moves
-REPEATED_MEAN, REPEATED_MAX = 0.2, 24
-VISIBLE_MM, VISIBLE_RAD = 1.0, 0.03  # changes that a picture shows: of a position; of an angle, or a rotation's entries
+
+@dataclass(frozen=True, kw_only=True)
+class PixelSettings:
+    """Thresholds of what an image's pixels show."""
+
+    # Levels of 255, mean and largest, by which a picture differs that is coded again: 0.07 and 19 by H.264 at its
+    # coarsest; 0.4 and 40 or more where a camera or an instrument moves
+    repeated_mean: float = 0.2
+    repeated_max: int = 24
+    visible_mm: float = 1.0  # change that a picture shows of a position
+    visible_rad: float = 0.03  # the same of an angle, or a rotation's entries
+    lit: float = 0.12  # brightness in [0, 1] of a pixel's brightest channel: a dark border around the field has less
+    min_lit: float = 0.02  # share of an image: with fewer lit pixels it is not counted
+
+
+PIXELS = PixelSettings()
 PNG_NONE, PNG_SUB, PNG_AVERAGE = 8, 16, 64  # filters of a PNG's rows: the best of labels, of depths, and of images
 FORMATS = ("PNG", "JPEG")  # that are opened, whatever a file's name says: Pillow's other decoders stay unused
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -178,7 +190,7 @@ def is_repeated(before: np.ndarray, picture: np.ndarray) -> bool:
     if before.shape != picture.shape:
         return False
     change = cv2.absdiff(before, picture)
-    return bool(change.mean() < REPEATED_MEAN and change.max() < REPEATED_MAX)
+    return bool(change.mean() < PIXELS.repeated_mean and change.max() < PIXELS.repeated_max)
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -226,10 +238,6 @@ def _to_rgb(image: Image.Image, background: float) -> np.ndarray:
     return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255)
 
 
-LIT = 0.12  # brightness in [0, 1] of a pixel's brightest channel: a round field of view's dark border has less
-MIN_LIT = 0.02  # share of an image: with fewer lit pixels it is not counted
-
-
 @dataclass(frozen=True)
 class Hidden:
     """Content hidden by one loss mask."""
@@ -242,8 +250,8 @@ class Hidden:
 def measure_hidden(pixels: np.ndarray, mask: np.ndarray, camera: Camera | None, points: np.ndarray) -> Hidden:
     """Count what a loss mask bool [H, W], False where ignored, hides of an image [H, W, 3], uint8 or in [0, 1], and of
     points [P, 3] mm in its camera (None: not known)."""
-    lit, ignored = pixels.max(-1) > LIT * (255 if pixels.dtype == np.uint8 else 1), ~mask
-    share = float(ignored[lit].mean()) if lit.mean() > MIN_LIT else None
+    lit, ignored = pixels.max(-1) > PIXELS.lit * (255 if pixels.dtype == np.uint8 else 1), ~mask
+    share = float(ignored[lit].mean()) if lit.mean() > PIXELS.min_lit else None
     if camera is None or not len(points):
         return Hidden(share, 0, 0)
     with np.errstate(all="ignore"):  # points on the camera's plane

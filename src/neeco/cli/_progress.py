@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,21 +27,29 @@ if TYPE_CHECKING:
     from neeco.training.config import TrainConfig
     from neeco.training.train import ProgressRow
 
-LINE_INTERVAL_S = 30.0  # between two lines about the same work, where no terminal shows bars
-WIDE = 100  # characters of a terminal on which bars are long
-MIN_SHOWN_S = 1.0  # what took less has no last line
-EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
+
+@dataclass(frozen=True, kw_only=True)
+class ProgressSettings:
+    """Times and sizes of bars and lines."""
+
+    line_interval_s: float = 30.0  # between two lines about the same work, where no terminal shows bars
+    wide: int = 100  # characters of a terminal on which bars are long
+    min_shown_s: float = 1.0  # what took less has no last line
+    evaluation_share: float = 0.1  # of a job's bar; the rest is training
+
+
+PROGRESS = ProgressSettings()
 
 
 class Bars:
-    """A bar for each count and each running job on a terminal; elsewhere a line for each every LINE_INTERVAL_S. None
+    """A bar for each count and each running job on a terminal; elsewhere a line for each every `line_interval_s`. None
     before there is progress, so that bad input prints its one line alone."""
 
     def __init__(self) -> None:
         console = whole_lines(stderr=True)
         columns = (
             TextColumn("{task.description}"),
-            BarColumn(bar_width=20 if console.width >= WIDE else 5),
+            BarColumn(bar_width=20 if console.width >= PROGRESS.wide else 5),
             TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(),
             _TimeLeft(),
@@ -65,10 +73,10 @@ class Bars:
             self.lines.join()
             if kind is None:
                 shown = [task for task in self.bar.tasks if task.visible]  # none where all were jobs that ended
-                for task in [task for task in shown[:-1] if (task.elapsed or 0) >= MIN_SHOWN_S] + shown[-1:]:
+                for task in [task for task in shown[:-1] if (task.elapsed or 0) >= PROGRESS.min_shown_s] + shown[-1:]:
                     self._print(_line(task))
         passed = time.monotonic() - self.began
-        if kind is None and self.tasks and passed >= MIN_SHOWN_S:
+        if kind is None and self.tasks and passed >= PROGRESS.min_shown_s:
             self._print(f"total: {_duration(passed)}")
 
     def stage(self, what: str, done: int, total: int | None) -> None:
@@ -109,9 +117,9 @@ class Bars:
             line = f"{title}: {news.stage}: {words} ({len(self.ended)} of {news.total} ended)"
             self._print(line, style="red" if news.stage == "failed" else "")
             return
-        share = news.share * (1 - EVALUATION_SHARE)
+        share = news.share * (1 - PROGRESS.evaluation_share)
         if news.stage == "evaluating":
-            share = 1 - EVALUATION_SHARE * (1 - news.share)
+            share = 1 - PROGRESS.evaluation_share * (1 - news.share)
         self._update(task, share, f"{news.stage} {news.text}".rstrip())
 
     def _task(self, title: str, total: float | None = 1.0) -> TaskID:
@@ -140,7 +148,7 @@ class Bars:
         self.bar.update(task, completed=total, total=total)
 
     def _print_lines(self) -> None:
-        while not self.left.wait(LINE_INTERVAL_S):
+        while not self.left.wait(PROGRESS.line_interval_s):
             for task in [task for task in self.bar.tasks if task.visible and not task.finished]:
                 self._print(_line(task))
 

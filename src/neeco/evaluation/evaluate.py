@@ -20,7 +20,7 @@ from neeco.capture.checks.truth import SHADOW_FOLDER
 from neeco.capture.images import read_mask
 from neeco.capture.model import Capture, Frame, State
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
-from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
+from neeco.evaluation.image_metrics import COMPARISON, WEIGHTS_VARIABLE, Lpips, psnr, ssim
 from neeco.evaluation.mask_folders import load_reference, truth_names
 from neeco.evaluation.mask_metrics import (
     PartTally,
@@ -224,7 +224,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
     target, mask = frame.load_image(), frame.load_mask()
     counted = torch.ones(target.shape[:2], dtype=torch.bool, device=target.device) if mask is None else mask
     tissue_pixels = int((tissue & counted).sum())
-    networks = context.networks if min(target.shape[:2]) >= MIN_SIZE else {}
+    networks = context.networks if min(target.shape[:2]) >= COMPARISON.min_size else {}
     features = {name: network.features(target) for name, network in networks.items()}
     shafts = [number for number, part in truth_names(context.capture.root).items() if part == "shaft"]
     true_shaft = None

@@ -21,16 +21,27 @@ from torch.nn.functional import adaptive_avg_pool2d, conv2d, interpolate, max_po
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import require_content
+from neeco.raster.losses import C1, C2, WINDOW_PX, WINDOW_SD
 from neeco.raster.native import torch_threads
 
 Pixels = NDArray[np.uint8]  # [H, W, 3]
 
-SSIM_WINDOW = 11  # px
-SSIM_SIGMA = 1.5  # px
-_C1, _C2 = 0.01**2, 0.03**2  # Wang et al. 2004, eq. 13, for a dynamic range of 1
 WEIGHTS_VARIABLE = "NEECO_LPIPS_WEIGHTS"
-MIN_SIZE = 32  # px; below it the pooled maps vanish
-FULL_SCALE = 0.25  # mean absolute difference shown in the brightest colour; fixed, so that maps can be compared
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonSettings:
+    """Settings of pictures of differences, and of what LPIPS can compare."""
+
+    min_size: int = 32  # px; below it the pooled maps vanish
+    # mean absolute difference shown in the brightest colour; fixed, so that maps can be compared
+    full_scale: float = 0.25
+    legend_height: int = 14  # px
+    legend_font: int = 10  # px
+    legend_margin: int = 5  # px
+
+
+COMPARISON = ComparisonSettings()
 # black - violet - red - yellow - white: dark is right, bright is wrong; lightness rises evenly, for grey print
 _COLORS = np.array(
     [[0, 0, 4], [60, 15, 110], [150, 38, 103], [221, 81, 58], [251, 165, 10], [252, 255, 200]], np.float64
@@ -44,7 +55,6 @@ PART_COLORS = np.array(
     ],
     np.float64,
 )
-LEGEND_HEIGHT, LEGEND_FONT, LEGEND_MARGIN = 14, 10, 5  # px
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
@@ -74,17 +84,17 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     x = image.permute(2, 0, 1)  # [3, H, W]
     y = target.permute(2, 0, 1).to(x.dtype)
     planes = torch.cat([x, y, x * x, y * y, x * y])  # [15, H, W]
-    offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
-    weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
-    window, pad = (weights / weights.sum()).to(planes), SSIM_WINDOW // 2
+    offsets = torch.arange(WINDOW_PX, dtype=torch.float64) - WINDOW_PX // 2
+    weights = torch.exp(-(offsets**2) / (2 * WINDOW_SD**2))
+    window, pad = (weights / weights.sum()).to(planes), WINDOW_PX // 2
     rows = conv2d(planes[:, None], window.view(1, 1, -1, 1), padding=(pad, 0))  # separable: two passes of 11 taps
     blurred = conv2d(rows, window.view(1, 1, 1, -1), padding=(0, pad))[:, 0]
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = blurred.split(3)
     var_x = mean_xx - mean_x * mean_x
     var_y = mean_yy - mean_y * mean_y
     covariance = mean_xy - mean_x * mean_y
-    numerator = (2 * mean_x * mean_y + _C1) * (2 * covariance + _C2)
-    denominator = (mean_x * mean_x + mean_y * mean_y + _C1) * (var_x + var_y + _C2)
+    numerator = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
+    denominator = (mean_x * mean_x + mean_y * mean_y + C1) * (var_x + var_y + C2)
     values = (numerator / denominator).permute(1, 2, 0)  # [H, W, 3]
     if mask is not None:
         values = values[mask]
@@ -210,11 +220,11 @@ def load_lpips(path: Path, network: str) -> Lpips:
 
 
 def difference_map(
-    image: np.ndarray, target: np.ndarray, full_scale: float = FULL_SCALE, legend: bool = True
+    image: np.ndarray, target: np.ndarray, full_scale: float = COMPARISON.full_scale, legend: bool = True
 ) -> Pixels:
     """Return |image - target| averaged over colours as uint8 colours; both inputs are [H, W, 3] floats in [0, 1].
 
-    Differences of `full_scale` and above take the brightest colour. legend: adds a labelled scale of LEGEND_HEIGHT px.
+    Differences of `full_scale` and above take the brightest colour. legend: adds a labelled scale, `legend_height` px.
     """
     difference = np.abs(np.asarray(image, np.float64) - np.asarray(target, np.float64)).mean(axis=2)
     colored = _colored(difference / full_scale)
@@ -257,13 +267,14 @@ def _colored(fraction: np.ndarray) -> Pixels:
 
 
 def _legend(width: int, full_scale: float) -> Pixels:
-    """Return a strip [LEGEND_HEIGHT, width, 3]: the colour scale with its ends and middle labelled."""
-    strip = Image.new("RGB", (width, LEGEND_HEIGHT))
+    """Return a strip [H, width, 3]: the colour scale with its ends and middle labelled."""
+    height, margin = COMPARISON.legend_height, COMPARISON.legend_margin
+    strip = Image.new("RGB", (width, height))
     strip.paste(Image.fromarray(_colored(np.linspace(0, 1, width)[None].repeat(4, 0))), (0, 1))
-    pen, font = ImageDraw.Draw(strip), ImageFont.load_default(LEGEND_FONT)
+    pen, font = ImageDraw.Draw(strip), ImageFont.load_default(COMPARISON.legend_font)
     for place, anchor in ((0.0, "ls"), (0.5, "ms"), (1.0, "rs")):
         pen.text(
-            (round(LEGEND_MARGIN + place * (width - 2 * LEGEND_MARGIN)), LEGEND_HEIGHT - 2),
+            (round(margin + place * (width - 2 * margin)), height - 2),
             f"{place * full_scale:.3g}",
             "white",
             font,

@@ -20,7 +20,7 @@ from neeco.capture.readers.endonerf import MASKS, folder_images
 from neeco.capture.readers.parsed import Parsed
 from neeco.capture.writer import write_capture
 from neeco.geometry.lens import Border, Lens
-from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
+from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
 from neeco.ingest.staging import staged
 
 
@@ -76,7 +76,7 @@ def _inverted_masks(capture: Capture) -> list[str]:
     """Return notes on loss masks that may be inverted."""
     masked = [frame for frame in capture.frames if frame.mask_path is not None]
     points, found = measured_sample(capture.points), []
-    for index in evenly_spaced(len(masked), MAX_BORDER_FRAMES, floor=True):
+    for index in evenly_spaced(len(masked), BORDERS.max_frames, floor=True):
         frame, mask = masked[index], masked[index].load_mask_pixels()
         assert mask is not None
         found.append(measure_hidden(frame.load_pixels(), mask, frame.camera, points))
@@ -89,7 +89,7 @@ def _shared_border(frames: Sequence[Frame]) -> Border | None:
     NeecoError when an image cannot be read."""
     if len({(frame.camera.width, frame.camera.height) for frame in frames}) != 1:
         return None
-    chosen = evenly_spaced(len(frames), MAX_BORDER_FRAMES, floor=True)
+    chosen = evenly_spaced(len(frames), BORDERS.max_frames, floor=True)
     return find_border(frames[index].load_image_bytes().numpy() for index in chosen)
 
 
@@ -105,12 +105,12 @@ def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
 def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path) -> tuple[list[Frame], list[str]]:
     """Return the frames with loss masks that ignore the tool, and notes on the masks.
 
-    White is the tool, as EndoNeRF writes it, unless that would be more than MAX_HIDDEN of the lit pixels of most
+    White is the tool, as EndoNeRF writes it, unless that would be more than `max_hidden` of the lit pixels of most
     images: then black is the tool, as in StereoMIS. Raises NeecoError for a damaged mask.
     """
     sizes = [(frame.camera.width, frame.camera.height) for frame in frames]
     white = []
-    for index in evenly_spaced(len(frames), MAX_BORDER_FRAMES, floor=True):
+    for index in evenly_spaced(len(frames), BORDERS.max_frames, floor=True):
         tool = read_mask(masks[index], sizes[index])
         white.append(measure_hidden(frames[index].load_pixels(), ~tool.numpy(), None, np.zeros((0, 3))))
     fault = masks_fault(white)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from neeco.base.plausible import FEW_TRAIN_FRAMES
+from neeco.base.plausible import PLAUSIBLE
 from neeco.capture.documents import Problem
 from neeco.capture.model import HOW_TO_REGISTER, UNKNOWN_DEG, Capture
 from neeco.geometry.lines import frame_about
@@ -319,8 +319,8 @@ def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
             fact = f"{_lower(known).rstrip('.')} (usual: {LIMITS.clock_mm:g} or less)"
             found.append(_Evidence.measured(fact, moved, LIMITS.clock_mm, known))
     train = len(capture.split("train"))
-    fact = f"{train} frames to train on (usual: {FEW_TRAIN_FRAMES} or more)"
-    few = train < FEW_TRAIN_FRAMES
+    fact = f"{train} frames to train on (usual: {PLAUSIBLE.few_train_frames} or more)"
+    few = train < PLAUSIBLE.few_train_frames
     found.append(_Evidence(fact, 2 if few else 0, f"Only {train} frames are left to train on."))
     found.append(_Evidence(f"{result.points:,} tissue points (usual: {LIMITS.min_points} or more)", 0))
     return found

@@ -20,6 +20,7 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_local
 from neeco.labels.drawing import LayeredDrawing, draw_layers, keypoint_arrays, shows_any, surface_depth, to_numpy
 from neeco.labels.labellers import CompositedLabels, instruments_of
+from neeco.labels.settings import LABELS
 from neeco.scene.gaussian_scene import require_gaussians
 
 if TYPE_CHECKING:
@@ -27,21 +28,6 @@ if TYPE_CHECKING:
 
 SHAFT_ENDS = ("shaft_far", "shaft_near")  # keypoints; all others are of the working end
 OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2  # OUTSIDE: of the image, or the instrument is not rendered at all
-MAGNIFICATION = 4  # at which contours along pixel edges are found
-
-
-@dataclass(frozen=True, kw_only=True)
-class LabelSettings:
-    """Limits of the labels of an image."""
-
-    occlusion_mm: float = 1.0  # a surface of something else this much nearer than a keypoint hides it
-    self_occlusion_mm: float = 6.0  # the same of the instrument's own surface, inside which its keypoints lie
-    simplify_px: float = 0.8  # the pixels of a straight edge deviate less than this from its line
-    max_area_change: float = 0.02  # share by which a simpler polygon may change the area
-    min_component: float = 0.01  # of an instrument's largest: smaller ones are not labelled, as by `synthesize`
-
-
-LABELS = LabelSettings()
 
 
 @dataclass(frozen=True)
@@ -272,19 +258,19 @@ def _outer_loops(mask: np.ndarray) -> tuple[list[np.ndarray], list[int]]:
     if not width:
         return [], []
     inside = mask[y : y + height, x : x + width].astype(np.uint8)
-    fine = inside.repeat(MAGNIFICATION, 0).repeat(MAGNIFICATION, 1)
+    fine = inside.repeat(LABELS.magnification, 0).repeat(LABELS.magnification, 1)
     upper_left, upper_right = inside[:-1, :-1], inside[:-1, 1:]
     lower_left, lower_right = inside[1:, :-1], inside[1:, 1:]
     touching = (upper_left == lower_right) & (upper_right == lower_left) & (upper_left != upper_right)
-    for row, column in MAGNIFICATION * (np.argwhere(touching) + 1):
+    for row, column in LABELS.magnification * (np.argwhere(touching) + 1):
         fine[row - 1 : row + 1, column - 1 : column + 1] = 0
     contours, hierarchy = cv2.findContours(fine, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     loops, holes = [], set()
     for contour, (*_, parent) in zip(contours[::-1], hierarchy[0][::-1], strict=True):
         if parent >= 0:  # a hole, along the pixels about it
-            holes.add(y + int(contour[:, 0, 1].min() + 1) // MAGNIFICATION + 1)
+            holes.add(y + int(contour[:, 0, 1].min() + 1) // LABELS.magnification + 1)
             continue
-        corners = (contour[::-1, 0] + MAGNIFICATION // 2) // MAGNIFICATION  # clockwise in the image
+        corners = (contour[::-1, 0] + LABELS.magnification // 2) // LABELS.magnification  # clockwise in the image
         corners = corners[(corners != np.roll(corners, 1, axis=0)).any(1)]
         first = np.lexsort(corners.T)[0]  # the leftmost of the top row
         loops.append(np.roll(corners, -first, axis=0) + np.array([x, y], dtype=float))

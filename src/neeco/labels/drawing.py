@@ -17,18 +17,14 @@ from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.geometry.camera import Camera
-from neeco.labels.labellers import CLEAR_SHARES, Labeller, composited_parts, instruments_of, threshold_of
+from neeco.labels.labellers import Labeller, composited_parts, instruments_of, threshold_of
+from neeco.labels.settings import LABELS
 from neeco.raster import rasterize
 from neeco.raster.types import Layer, Rendering
 
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
 
-MAX_UNOBSERVED = 0.5  # of a pixel, above which it is ignored
-SURFACE_ALPHA = 0.5  # a pixel less opaque than this shows no surface
-# Of the image's diagonal: 3 px of 320 x 256. Without it, on two rendered captures, the band has 36% and 66% more
-# pixels, nearly all of them rightly labelled (the instrument's shadow on the tissue, mostly).
-EDGE_WIDTH = 0.008
 NEIGHBOURS = np.ones((3, 3), np.uint8)  # with corners: else the band of a slanted border is thinner than a pixel
 
 
@@ -67,7 +63,7 @@ class LayeredDrawing(Drawing):
     def ignored(self) -> Tensor:
         """[H, W] bool: pixels that a loss should ignore: the instruments' `uncertain_edge`, and unobserved pixels."""
         edge = torch.from_numpy(uncertain_edge(self.share.numpy(), self.parts.numpy() > 0))
-        return edge | (self.unobserved > MAX_UNOBSERVED)
+        return edge | (self.unobserved > LABELS.max_unobserved)
 
 
 @torch.no_grad()
@@ -143,7 +139,7 @@ def extended_silhouettes(
 
 def surface_depth(rendering: Rendering | Layer) -> np.ndarray:
     """Return the expected depth [H, W] mm where the rendering is opaque, 0 elsewhere."""
-    return to_numpy(rendering.depth * (rendering.alpha > SURFACE_ALPHA))
+    return to_numpy(rendering.depth * (rendering.alpha > LABELS.surface_alpha))
 
 
 def keypoint_arrays(scene: GaussianScene, state: State) -> dict[str, dict[str, np.ndarray]]:
@@ -163,18 +159,18 @@ def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return bool [H, W]: pixels at the edge of a mask (bool [H, W]) whose label is uncertain.
 
     These touch the border from either side, since a border may be a pixel off even where the share of instrument
-    ([H, W] in [0, 1]) jumps, or are within EDGE_WIDTH of it with a share between CLEAR_SHARES. The image's own border
-    is not an edge.
+    ([H, W] in [0, 1]) jumps, or are within `edge_width` of it with a share between `clear_shares`. The image's own
+    border is not an edge.
     """
     edge = np.zeros(mask.shape, dtype=bool)
-    reach = float(EDGE_WIDTH * np.hypot(*mask.shape))
+    reach = float(LABELS.edge_width * np.hypot(*mask.shape))
     x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
     margin = math.ceil(reach) + 1  # the border is up to a pixel outside
     near = slice(max(0, y - margin), y + height + margin), slice(max(0, x - margin), x + width + margin)
     pixels = mask[near].astype(np.uint8)
     border = cv2.dilate(pixels, NEIGHBOURS) != cv2.erode(pixels, NEIGHBOURS) if width else pixels.astype(bool)
     if border.any():
-        unclear = (share[near] > CLEAR_SHARES[0]) & (share[near] < CLEAR_SHARES[1])
+        unclear = (share[near] > LABELS.clear_shares[0]) & (share[near] < LABELS.clear_shares[1])
         edge[near] = border | (unclear & (distances_to(border) <= reach))
     return edge
 
@@ -229,7 +225,7 @@ def without_components(share: np.ndarray, remaining: np.ndarray, dropped: np.nda
     """
     if not dropped.any():
         return share
-    fading = ~remaining & (share < CLEAR_SHARES[1]) & (distances_to(dropped) < distances_to(remaining))
+    fading = ~remaining & (share < LABELS.clear_shares[1]) & (distances_to(dropped) < distances_to(remaining))
     return np.where(dropped | fading, np.float32(0), share)
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from neeco.base.errors import NeecoError
 from neeco.capture.model import State, evenly_spaced
 from neeco.geometry.camera import Camera
+from neeco.labels.settings import LABELS
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians, Rendering
 from neeco.scene.deformation import otsu
@@ -25,21 +26,12 @@ from neeco.scene.deformation import otsu
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
 
-# The instrument's moving shadow is learned with labels of 0.3 to 0.5, so that 0.5 is too low; 0.65 to 0.7 is best.
-LABEL_THRESHOLD = 0.65
-SHADOWED_THRESHOLD = 0.55  # where the scene models that shadow: 0.65 then loses as much of the silhouette's border
-# A share below the first is clearly tissue, one above the second clearly instrument. Measured by what a U-Net learns
-# from the rest: a band from 0.15 leaves out mostly tissue, so that it over-segments (IoU 0.93 instead of 0.96).
-CLEAR_SHARES = 0.5, 0.9
-
-MIN_BRIGHTNESS = 0.1  # RGB norm above which a pixel of the instrument rendered alone is the instrument
-N_THRESHOLD_STATES = 24  # recorded states for Otsu's method
 DELTAS = ("means", "quats", "scales")
 
 
 def threshold_of(scene: DrawableScene) -> float:
     """Return the share of a pixel above which it is labelled instrument in a scene."""
-    return SHADOWED_THRESHOLD if scene.casts_shadow else LABEL_THRESHOLD
+    return LABELS.shadowed_threshold if scene.casts_shadow else LABELS.threshold
 
 
 def instruments_of(names: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
@@ -184,7 +176,7 @@ class ThresholdLabels:
         instruments = rasterize(gaussians.select(moved), camera, channels=shares)
         assert instruments.channels is not None
         ids = instruments.channels.argmax(dim=2) + 1
-        lit = instruments.color.norm(dim=2) > MIN_BRIGHTNESS
+        lit = instruments.color.norm(dim=2) > LABELS.min_brightness
         channels = None if unobserved is None else unobserved[:, None]
         rendering = rasterize(gaussians, camera, channels=channels, alone=alone)
         return rendering, torch.where(lit, ids, 0).to(torch.uint8), instruments.alpha
@@ -206,7 +198,8 @@ def find_thresholds(scene: GaussianScene) -> DeltaThresholds:
     Raises NeecoError when no kind of delta separates Gaussians, as in a scene in which nothing moves.
     """
     states = scene.recorded.states
-    found = [delta_magnitudes(scene, states[k]) for k in evenly_spaced(len(states), N_THRESHOLD_STATES, floor=True)]
+    chosen = evenly_spaced(len(states), LABELS.n_threshold_states, floor=True)
+    found = [delta_magnitudes(scene, states[k]) for k in chosen]
     limits = {
         kind: otsu_of_magnitudes(torch.cat([magnitudes[kind].cpu() for magnitudes in found])) if found else None
         for kind in DELTAS

@@ -22,13 +22,23 @@ from neeco.raster.devices import constant
 from neeco.raster.native import all_run_native, native
 from neeco.raster.types import Gaussians, Layer, Shadow
 
-MAP_SCALE = 0.5  # resolution of the map relative to the image
-MAP_MARGIN = 0.15  # of the image's size, to each side: casters may be outside the image
+
+@dataclass(frozen=True, kw_only=True)
+class ShadowSettings:
+    """Resolution of shadow maps, and what counts in them."""
+
+    map_scale: float = 0.5  # resolution of the map relative to the image
+    map_margin: float = 0.15  # of the image's size, to each side: casters may be outside the image
+    min_light: float = 0.01  # share of the light that reaches any Gaussian
+    min_opacity: float = 1e-4  # of the blurred map: less casts no shadow
+    min_depth: float = 1e-6  # mm, and smallest opacity that depths are divided by
+    min_distance: float = 1e-3  # mm
+    max_taps: int = 6  # pixels to each side of the window's middle, where it is cut off
+    min_window_sd: float = 0.3  # px
+
+
+SHADOWS = ShadowSettings()
 GAMMA = 2.2  # of stored images, approximately
-MIN_LIGHT = 0.01  # share of the light that reaches any Gaussian
-MIN_OPACITY = 1e-4  # of the blurred map: less casts no shadow
-MIN_DEPTH = 1e-6  # mm, and smallest opacity that depths are divided by
-MIN_DISTANCE = 1e-3  # mm
 
 Draw = Callable[[Gaussians, Sequence[Camera]], Sequence[Layer]]  # as `depth_maps`
 
@@ -60,13 +70,13 @@ def _left_by(
     if every or not some or not any(shines):
         return None
     shares = blocked(Casting.of(gaussians, casters, camera, others), shadow.width, shadow.offsets, draw, shines)
-    return (1 - shadow.strengths @ shares).clamp_min(MIN_LIGHT) ** (1 / GAMMA)
+    return (1 - shadow.strengths @ shares).clamp_min(SHADOWS.min_light) ** (1 / GAMMA)
 
 
 def _relative_to_camera(falloff: Tensor, means: Tensor, camera: Camera, world_from_lamps: Tensor) -> Tensor:
     """Return the brightness [N] of the headlight at lamps elsewhere, relative to one at the camera."""
     places = (pose[:3, 3].detach().to(means) for pose in (camera.world_from_camera, world_from_lamps))
-    own, lamps = ((means.detach() - place).norm(dim=1).clamp_min(MIN_DISTANCE).log() for place in places)
+    own, lamps = ((means.detach() - place).norm(dim=1).clamp_min(SHADOWS.min_distance).log() for place in places)
     return torch.exp(falloff * (own - lamps))
 
 
@@ -124,14 +134,15 @@ def blocked_reference(
         pose = among.camera.world_from_camera.to(among.means)
         points = (among.means - pose[:3, 3]) @ pose[:3, :3]  # [N, 3] mm, in the camera's frame
         pixels = torch.stack(
-            project(points - offset, *focus, nearest=MIN_DISTANCE), 1
+            project(points - offset, *focus, nearest=SHADOWS.min_distance), 1
         )  # [N, 2]; those behind project outside
         weight, sums = _look_up(summed, pixels, at_light).unbind(1)
-        before = (sums / weight.clamp_min(MIN_DEPTH)).clamp_min(MIN_DEPTH)  # [N] mm, depth of the casters there
-        hit = (weight > MIN_OPACITY) & (points[:, 2] - offset[2] > before) & ~among.casters
+        least = SHADOWS.min_depth
+        before = (sums / weight.clamp_min(least)).clamp_min(least)  # [N] mm, depth of the casters there
+        hit = (weight > SHADOWS.min_opacity) & (points[:, 2] - offset[2] > before) & ~among.casters
     few = hit.nonzero()[:, 0]  # gradients are needed for these alone
     points, before = points[few], before[few]
-    pixels = torch.stack(project(points - offset, *focus, nearest=MIN_DISTANCE), 1)
+    pixels = torch.stack(project(points - offset, *focus, nearest=SHADOWS.min_distance), 1)
     pixels = pixels + _parallax(offset, pixels.detach(), before, at_light)
     return torch.zeros_like(among.means[:, 0]).masked_scatter(hit, _look_up(opacity[..., None], pixels, at_light)[:, 0])
 
@@ -150,7 +161,8 @@ class _Blocked(torch.autograd.Function):
         cameras = [light_camera(among.camera, offsets[lamp]) for lamp in lamps]
         for lamp, at_light, from_light in zip(lamps, cameras, draw(among.bare, cameras), strict=True):
             maps = torch.empty(3, at_light.height, at_light.width)
-            focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy, float(width) * at_light.fx, MIN_DISTANCE)
+            intrinsics = (at_light.fx, at_light.fy, at_light.cx, at_light.cy)
+            focus = (*intrinsics, float(width) * at_light.fx, SHADOWS.min_distance)
             given = torch.tensor([*view, *offsets[lamp].tolist(), *focus], dtype=torch.float32)
             wanted = ctx.needs_input_grad[0]
             alpha, depth = (image.detach().contiguous() for image in (from_light.alpha, from_light.depth))
@@ -176,14 +188,15 @@ def light_camera(camera: Camera, offset: Tensor) -> Camera:
     """Return a small camera at the light with the orientation of `camera` and a slightly larger field."""
     pose = camera.world_from_camera.detach().clone()
     pose[:3, 3] += pose[:3, :3] @ offset.to(pose)
-    width, height = (max(1, round(MAP_SCALE * (1 + 2 * MAP_MARGIN) * size)) for size in (camera.width, camera.height))
-    wide, high = MAP_MARGIN * camera.width, MAP_MARGIN * camera.height
+    scale, margin = SHADOWS.map_scale, SHADOWS.map_margin
+    width, height = (max(1, round(scale * (1 + 2 * margin) * size)) for size in (camera.width, camera.height))
+    wide, high = margin * camera.width, margin * camera.height
     return Camera(
         pose,
-        fx=camera.fx * MAP_SCALE,
-        fy=camera.fy * MAP_SCALE,
-        cx=(camera.cx + wide) * MAP_SCALE,
-        cy=(camera.cy + high) * MAP_SCALE,
+        fx=camera.fx * scale,
+        fy=camera.fy * scale,
+        cx=(camera.cx + wide) * scale,
+        cy=(camera.cy + high) * scale,
         width=width,
         height=height,
         near=camera.near,
@@ -208,13 +221,9 @@ def _look_up(image: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
     return grid_sample(image.permute(2, 0, 1)[None], place, align_corners=False)[0, :, 0].T
 
 
-MAX_TAPS = 6  # pixels to each side of the window's middle, where it is cut off
-MIN_WINDOW_SD = 0.3  # px
-
-
 def blur(image: Tensor, sigma: Tensor) -> Tensor:
-    """Blur `image` [H, W] by a Gaussian window of standard deviation `sigma` [] px, cut off after MAX_TAPS pixels, with
-    zero padding. Any float type and device; gradients reach both."""
+    """Blur `image` [H, W] by a Gaussian window of standard deviation `sigma` [] px, cut off after `max_taps` pixels,
+    with zero padding. Any float type and device; gradients reach both."""
     down, across = (_window_matrix(size, sigma) for size in image.shape)
     return down @ image @ across
 
@@ -223,5 +232,5 @@ def _window_matrix(size: int, sigma: Tensor) -> Tensor:
     """Return the matrix [size, size] that blurs a line of pixels; its middle row sums to 1."""
     places = torch.arange(size, dtype=sigma.dtype, device=sigma.device)
     steps = (places[:, None] - places).abs()
-    weights = torch.exp(-0.5 * (steps / sigma.clamp_min(MIN_WINDOW_SD)).square()) * (steps <= MAX_TAPS)
+    weights = torch.exp(-0.5 * (steps / sigma.clamp_min(SHADOWS.min_window_sd)).square()) * (steps <= SHADOWS.max_taps)
     return weights / weights[size // 2].sum()

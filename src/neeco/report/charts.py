@@ -23,13 +23,22 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
 
-SIZE, SMALL = (460, 270), (420, 190)  # view box units; the page scales them
-COLORS = 7
-# of lines, which tell them apart in grey print
-DASHES = ((), (7, 3), (2, 3), (10, 3, 2, 3), (14, 4), (5, 2, 1, 2, 1, 2), (1, 2, 6, 2))
+
+@dataclass(frozen=True, kw_only=True)
+class ChartSettings:
+    """Sizes and lines of charts."""
+
+    size: tuple[int, int] = (460, 270)  # view box units; the page scales them
+    small: tuple[int, int] = (420, 190)  # the same, of a chart among others
+    colors: int = 7
+    # of lines, which tell them apart in grey print
+    dashes: tuple[tuple[int, ...], ...] = ((), (7, 3), (2, 3), (10, 3, 2, 3), (14, 4), (5, 2, 1, 2, 1, 2), (1, 2, 6, 2))
+
+
+CHARTS = ChartSettings()
 MARKS = ("o", "s", "^", "x", "D", "+", "v")
 
-VARIABLES = ("ink", "soft", "edge", "accent", "phase", "good", "bad", *(f"m{order}" for order in range(COLORS)))
+VARIABLES = ("ink", "soft", "edge", "accent", "phase", "good", "bad", *(f"m{order}" for order in range(CHARTS.colors)))
 PALETTE = {name: f"#0101{index:02x}" for index, name in enumerate(VARIABLES)}  # of the style sheet's variables
 STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
@@ -120,7 +129,7 @@ def line_chart(
     note: str = "",
     logarithmic: bool = False,
     over_logarithmic: bool = False,
-    size: tuple[int, int] = SIZE,
+    size: tuple[int, int] = CHARTS.size,
 ) -> str:
     """Lines and marks over a shared x axis as inline SVG; "" when nothing has two points.
 
@@ -145,7 +154,7 @@ def line_chart(
         for line in item.faint:
             _draw_line(axes, item.order, line, linewidth=0.7, alpha=0.55)
     for item in series:  # above all that is faint
-        _draw_line(axes, item.order, item.main, linewidth=2, dashes=DASHES[item.order % len(DASHES)])
+        _draw_line(axes, item.order, item.main, linewidth=2, dashes=CHARTS.dashes[item.order % len(CHARTS.dashes)])
     for order, value in levels:
         axes.axhline(value, color=_color(order), linewidth=1.1, dashes=(4, 4), gid="level")
     if over_logarithmic:
@@ -187,7 +196,7 @@ def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, Markup
         if name in shown:
             axes = new_axes((46, 14), 0, 0, 0, 0)
             axes.set_axis_off()
-            _draw_line(axes, order, ((1, 7), (45, 7)), linewidth=2, dashes=DASHES[order % len(DASHES)])
+            _draw_line(axes, order, ((1, 7), (45, 7)), linewidth=2, dashes=CHARTS.dashes[order % len(CHARTS.dashes)])
             axes.plot(23, 7, **_mark(order))
             axes.set(xlim=(0, 46), ylim=(0, 14))
             entries.append((name, inline_svg(axes, f"line of {name}")))
@@ -209,7 +218,7 @@ def short(value: float) -> str:
 
 def _color(order: int) -> str:
     """A method's colour, as the style sheet has it."""
-    return PALETTE[f"m{order % COLORS}"]
+    return PALETTE[f"m{order % CHARTS.colors}"]
 
 
 def _mark(order: int, size: float = 6.4) -> dict[str, Any]:

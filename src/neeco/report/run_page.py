@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -17,15 +17,26 @@ from PIL import Image, ImageDraw
 
 from neeco.base.files import read_bytes
 from neeco.capture.model import Capture, Frame, State
-from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, overlay_parts, part_color
+from neeco.evaluation.image_metrics import COMPARISON, overlay_outline, overlay_parts, part_color
 from neeco.evaluation.mask_folders import load_reference
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
-from neeco.report.charts import SMALL, Series, line_chart, short
+from neeco.report.charts import CHARTS, Series, line_chart, short
 from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
 from neeco.scene import DrawableScene
 
-MAX_POINTS = 300  # of a training curve
+
+@dataclass(frozen=True, kw_only=True)
+class RunPageSettings:
+    """Settings of what the pages of a run show."""
+
+    max_points: int = 300  # of a training curve
+    max_frames: int = 60  # frames: the page has to stay a file one can mail
+    # of the instruments, in turn
+    outlines: tuple[tuple[int, int, int], ...] = ((255, 230, 0), (0, 230, 255), (255, 90, 200), (120, 255, 80))
+
+
+SETTINGS = RunPageSettings()
 
 
 class Score(NamedTuple):
@@ -106,7 +117,7 @@ def write_report(
         notes=[*(f"Doubtful: {doubt}" for doubt in evaluation.get("doubts", ())), *evaluation.get("notes", ())],
         figures=frame_figures(evaluation, capture, scene, kind),
         pose_kind=KIND_NAMES[kind],
-        full_scale=FULL_SCALE,
+        full_scale=COMPARISON.full_scale,
         tints=_tints(scene),
         curves=[chart for chart in curves if chart],
         verdicts=_verdicts(getattr(scene, "diagnostics", {})),
@@ -260,19 +271,18 @@ def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: 
     points = [(float(row["iteration"]), float(row[key])) for row in known if row[key] > 0 or not logarithmic]
     if len(points) < 2:
         return ""
-    if (run := -(-len(points) // MAX_POINTS)) > 1:  # means of equally many, so that a noisy curve reads as its trend
+    # means of equally many, so that a noisy curve reads as its trend
+    if (run := -(-len(points) // SETTINGS.max_points)) > 1:
         groups = [points[start : start + run] for start in range(0, len(points), run)]
         points = [(group[-1][0], sum(y for _, y in group) / len(group)) for group in groups]
     series = [Series(0, tuple(points))]
     note = f"{short(points[-1][1])} at the end"
     changes = [after for before, after in pairwise(rows) if after.get("phase") not in (before.get("phase"), None)]
     starts = [(float(row["iteration"]), f"phase {row['phase']}") for row in changes]
-    return line_chart(title, "iterations", series, starts=starts, note=note, logarithmic=logarithmic, size=SMALL)
+    return line_chart(title, "iterations", series, starts=starts, note=note, logarithmic=logarithmic, size=CHARTS.small)
 
 
 PAGE = "annotate.html"
-SHOWN = 60  # frames: the page has to stay a file one can mail
-OUTLINES = ((255, 230, 0), (0, 230, 255), (255, 90, 200), (120, 255, 80))  # of the instruments, in turn
 
 
 def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], capture: Capture, min_trust: float) -> Path:
@@ -295,10 +305,10 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
             (f"{median(record['trust']['value'] for record in records):.3f}", "trust, median"),
             (f"{min_trust:g}", "trust asked for"),
         ],
-        figures=[_annotated_figure(records[k], capture.frames[k]) for k in ranked[:SHOWN]],
+        figures=[_annotated_figure(records[k], capture.frames[k]) for k in ranked[: SETTINGS.max_frames]],
         total=len(records),
         instruments=[
-            ("#{:02x}{:02x}{:02x}".format(*OUTLINES[k % len(OUTLINES)]), item.name)
+            ("#{:02x}{:02x}{:02x}".format(*SETTINGS.outlines[k % len(SETTINGS.outlines)]), item.name)
             for k, item in enumerate(capture.instruments)
         ],
     )
@@ -312,7 +322,7 @@ def _annotated_figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:
     for k, label in enumerate(record["labels"]):
         for polygon in label.get("polygons", ()):
             points = [tuple(point) for point in polygon]
-            pen.line([*points, points[0]], fill=OUTLINES[k % len(OUTLINES)], width=1)
+            pen.line([*points, points[0]], fill=SETTINGS.outlines[k % len(SETTINGS.outlines)], width=1)
     return {
         "name": frame.name,
         "split": record["recorded_split"],

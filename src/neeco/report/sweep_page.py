@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, psnr
+from neeco.evaluation.image_metrics import COMPARISON, overlay_outline, psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.drawing import draw
 from neeco.report.charts import Series, legend, line_chart
@@ -46,8 +46,8 @@ def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
     if pictures := _pictures(plan, rows):
         text = (
             "The middle frame of each split, by the first seed of each. Below each rendering its difference to the "
-            f"recorded image, full scale {FULL_SCALE:g} of the range; in yellow, where known, the true outline of the "
-            "instrument."
+            f"recorded image, full scale {COMPARISON.full_scale:g} of the range; in yellow, where known, the true "
+            "outline of the instrument."
         )
         sections += [Section(title="The same frame by every configuration", text=text), *pictures]
     if failed := failures(rows):

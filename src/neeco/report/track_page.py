@@ -12,7 +12,7 @@ from typing import Any
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.evaluation.image_metrics import overlay_parts
 from neeco.labels.drawing import draw
-from neeco.report.charts import SMALL, Series, line_chart
+from neeco.report.charts import CHARTS, Series, line_chart
 from neeco.report.page import jpeg, to_bytes, write_page
 from neeco.tracking.track import Tracked, state_of
 
@@ -71,8 +71,8 @@ def _charts(tracked: Tracked) -> list[str]:
     trust = Series(0, tuple(zip(times, (record["trust"]["value"] for record in records), strict=True)))
     misfit = Series(1, tuple((t, r["misfit"]) for t, r in zip(times, records, strict=True) if r["how"] != "lost"))
     charts = [
-        line_chart("trust", "s", [trust], levels=[(1, tracked.min_trust)], note="dashed: asked for", size=SMALL),
-        line_chart("misfit of pixels", "s", [misfit], size=SMALL),
+        line_chart("trust", "s", [trust], levels=[(1, tracked.min_trust)], note="dashed: asked for", size=CHARTS.small),
+        line_chart("misfit of pixels", "s", [misfit], size=CHARTS.small),
     ]
     rows = [k for k, record in enumerate(records) if record["how"] != "lost"]
     at = [times[k] for k in rows]
@@ -88,7 +88,7 @@ def _charts(tracked: Tracked) -> list[str]:
             )
             title = f"{item.name}: {name}, {'mm' if item.slides(name) else 'deg'}"
             line = tuple(zip(at, values, strict=True))
-            charts.append(line_chart(title, "s", [Series(0, line, bands)], size=SMALL))
+            charts.append(line_chart(title, "s", [Series(0, line, bands)], size=CHARTS.small))
     return charts
 
 

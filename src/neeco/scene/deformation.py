@@ -20,11 +20,19 @@ from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import ArticulatedMotion, Skeleton
 from neeco.scene.method import Method
 
-FINAL_RATE = 0.03  # of the initial learning rate, at the end (3DGS: 0.01; runs here are shorter)
-MIN_MODULE_RATE = 0.3  # of the initial learning rate: joints keep learning to the end
+
+@dataclass(frozen=True, kw_only=True)
+class DeformationSettings:
+    """Decay of learning rates, and what counts as moving."""
+
+    final_rate: float = 0.03  # of the initial learning rate, at the end (3DGS: 0.01; runs here are shorter)
+    min_module_rate: float = 0.3  # of the initial learning rate: joints keep learning to the end
+    min_motion_mm: float = 1e-6  # a Gaussian that moves less is static
+    marking_stride: int = 4  # every fourth recorded state is used to find moving Gaussians
+
+
+DEFORMATION = DeformationSettings()
 MEMBERSHIP = "membership"  # the per-Gaussian extra [N] in {0, 1} that `mark_moving` stores
-MIN_MOTION_MM = 1e-6  # a Gaussian that moves less is static
-MARKING_STRIDE = 4  # every fourth recorded state is used to find moving Gaussians
 
 
 @dataclass(frozen=True)
@@ -201,7 +209,8 @@ class LabelledByMotion(Deformation):
     def finish(self, session: Any) -> None:
         scene = session.scene
         if self.instruments:
-            scene.canonical = mark_moving(self, scene.canonical, list(scene.recorded.states[::MARKING_STRIDE]))
+            states = list(scene.recorded.states[:: DEFORMATION.marking_stride])
+            scene.canonical = mark_moving(self, scene.canonical, states)
 
 
 @torch.no_grad()
@@ -210,8 +219,8 @@ def mark_moving(deformation: Deformation, canonical: CanonicalGaussians, states:
     threshold of its logarithm."""
     moved = torch.stack([deformation.deltas(canonical, state).means for state in states])  # [F, N, 3]
     spread = (moved - moved.mean(0)).square().sum(-1).mean(0).sqrt()
-    size = spread.clamp_min(MIN_MOTION_MM).log()
-    evaluated = spread > MIN_MOTION_MM  # those that nothing moves would be a second cluster of their own
+    size = spread.clamp_min(DEFORMATION.min_motion_mm).log()
+    evaluated = spread > DEFORMATION.min_motion_mm  # those that nothing moves would be a second cluster of their own
     threshold = otsu(size[evaluated]) if evaluated.any() else math.inf
     return canonical.with_extras(**{MEMBERSHIP: (size > threshold).float()})
 
@@ -238,8 +247,8 @@ def log_linear(first: float, last: float, progress: float) -> float:
 
 
 def floored_decay(progress: float) -> float:
-    """Return the factor of a learning rate that decays as the positions' does, but not below MIN_MODULE_RATE."""
-    return max(log_linear(1.0, FINAL_RATE, progress), MIN_MODULE_RATE)
+    """Return the factor of a learning rate that decays as the positions' does, but not below `min_module_rate`."""
+    return max(log_linear(1.0, DEFORMATION.final_rate, progress), DEFORMATION.min_module_rate)
 
 
 def state_of(instrument: Instrument, state: State) -> InstrumentState:

@@ -4,7 +4,7 @@ where its joints are."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -14,10 +14,19 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.geometry.rotations import rigid_from_vector
 from neeco.raster.devices import CachedPredicate
 
-MAX_ANCHORS = 64  # states that a correction is interpolated between
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectionSettings:
+    """Size of the regression, and units of its features."""
+
+    max_anchors: int = 64  # states that a correction is interpolated between
+    position_mm: float = 10.0  # of a difference that counts as one
+    angle_rad: float = 0.17  # the same of an angle, also of revolute joints
+    slide_mm: float = 10.0  # the same of prismatic ones
+
+
+CORRECTIONS = CorrectionSettings()
 N_POSE_FEATURES = 12  # position and rotation matrix
-# of differences that count as one: mm; rad, also of revolute joints; mm of prismatic ones
-POSITION_UNIT_MM, ANGLE_UNIT, SLIDE_UNIT_MM = 10.0, 0.17, 10.0
 
 
 class StateCorrections(nn.Module):
@@ -25,8 +34,8 @@ class StateCorrections(nn.Module):
     from all of them are not corrected.
 
     An instrument's increments are six of its pose in its own frame (rotation vector in rad, translation in mm), then
-    one of each recorded reading of its stated kinematics (rad or mm). Buffers: `anchors` [I, MAX_ANCHORS, F] features
-    of states (see `features`), `weights` [I, MAX_ANCHORS, 6 + R], `lengths` [I] of the kernels, in units of features.
+    one of each recorded reading of its stated kinematics (rad or mm). Buffers: `anchors` [I, A, F] features
+    of states (see `features`), `weights` [I, A, 6 + R], `lengths` [I] of the kernels, in units of features.
     All weights are zero until errors are found that depend on the state.
     """
 
@@ -38,13 +47,13 @@ class StateCorrections(nn.Module):
         super().__init__()
         self.names = tuple(item.name for item in instruments)
         self.readings = tuple(recorded_readings(item) for item in instruments)
-        units = [[SLIDE_UNIT_MM if item.slides(reading) else ANGLE_UNIT for reading in readings]
+        units = [[CORRECTIONS.slide_mm if item.slides(reading) else CORRECTIONS.angle_rad for reading in readings]
                  for item, readings in zip(instruments, self.readings, strict=True)]  # fmt: skip
         self._units = units
         most = max(map(len, self.readings), default=0)
         zeros = partial(torch.zeros, device=device)
-        self.register_buffer("anchors", zeros(len(units), MAX_ANCHORS, N_POSE_FEATURES + most))
-        self.register_buffer("weights", zeros(len(units), MAX_ANCHORS, 6 + most))
+        self.register_buffer("anchors", zeros(len(units), CORRECTIONS.max_anchors, N_POSE_FEATURES + most))
+        self.register_buffer("weights", zeros(len(units), CORRECTIONS.max_anchors, 6 + most))
         self.register_buffer("lengths", zeros(len(units)) + 1)
         self._corrects = CachedPredicate(lambda weights: weights.any())
 
@@ -54,8 +63,8 @@ class StateCorrections(nn.Module):
         joints = [float(torch.as_tensor(given.joints[reading]).detach()) / unit
                   for reading, unit in zip(self.readings[index], self._units[index], strict=True)]  # fmt: skip
         joints += [0.0] * (self.anchors.shape[2] - N_POSE_FEATURES - len(joints))
-        rotation = pose[:3, :3].flatten() / (2**0.5 * ANGLE_UNIT)
-        return torch.cat([pose[:3, 3] / POSITION_UNIT_MM, rotation, pose.new_tensor(joints)])
+        rotation = pose[:3, :3].flatten() / (2**0.5 * CORRECTIONS.angle_rad)
+        return torch.cat([pose[:3, 3] / CORRECTIONS.position_mm, rotation, pose.new_tensor(joints)])
 
     def increments(self, index: int, given: InstrumentState) -> Tensor:
         """Return the increments [6 + R] of a state of instrument `index`."""

@@ -39,21 +39,30 @@ DIRECTIONS = tuple(  # the corners of an icosahedron, unit
     for b in (-GOLDEN_RATIO, GOLDEN_RATIO)
     for corner in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))
 )
-SHARPNESS = 4  # power of the cosine by which a view counts for a direction: half at 33 degrees
-HALF_VISIBILITY = 0.002  # share of the average Gaussian's visibility at which one is half unobserved
-MIN_PIXELS = 1e-6  # visibility of the average Gaussian, at least
-MAX_FRAMES = 128  # evenly spaced and reduced to REFERENCE_PIXELS; neighbouring frames observe the same
 
-# extrapolation
-CELL = 1 / 40  # spacing of extrapolated Gaussians, in image widths
-MAX_DISTANCE = 0.4  # of extrapolated tissue from the recorded border, in image widths
-GRID_MARGIN = 1.5  # of the grid to each side of the middle camera's image, in its size
-DEPTH_FACTOR = 1.1  # of extrapolated depths, so that observed tissue stays in front
-CELL_SD = 0.7  # standard deviation of an extrapolated Gaussian, in cells
-OPACITY = 0.98  # of an extrapolated Gaussian
-MIN_FRAME_SHARE = 0.05  # of the frames, that must observe the source tissue
-SMOOTHING_CELLS = (1.5, 3.0, 6.0, 12.0, 24.0)  # standard deviations, tried until MIN_KNOWN_SHARE is reached
-MIN_KNOWN_SHARE = 0.05  # of the cells around one, that must be known
+
+@dataclass(frozen=True, kw_only=True)
+class VisibilitySettings:
+    """Settings of what counts as observed, and of tissue extrapolated beyond it."""
+
+    sharpness: int = 4  # power of the cosine by which a view counts for a direction: half at 33 degrees
+    half_visibility: float = 0.002  # share of the average Gaussian's visibility at which one is half unobserved
+    min_pixels: float = 1e-6  # visibility of the average Gaussian, at least
+    max_frames: int = 128  # evenly spaced and reduced to REFERENCE_PIXELS; neighbouring frames observe the same
+    # extrapolation
+    cell: float = 1 / 40  # spacing of extrapolated Gaussians, in image widths
+    max_distance: float = 0.4  # of extrapolated tissue from the recorded border, in image widths
+    grid_margin: float = 1.5  # of the grid to each side of the middle camera's image, in its size
+    depth_factor: float = 1.1  # of extrapolated depths, so that observed tissue stays in front
+    cell_sd: float = 0.7  # standard deviation of an extrapolated Gaussian, in cells
+    opacity: float = 0.98  # of an extrapolated Gaussian
+    min_frame_share: float = 0.05  # of the frames, that must observe the source tissue
+    # standard deviations, tried until `min_known_share` is reached
+    smoothing_cells: tuple[float, ...] = (1.5, 3.0, 6.0, 12.0, 24.0)
+    min_known_share: float = 0.05  # of the cells around one, that must be known
+
+
+SETTINGS = VisibilitySettings()
 
 
 def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Callable[[State], Gaussians]) -> Tensor:
@@ -61,7 +70,7 @@ def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Ca
     `DIRECTIONS`, relative to the average Gaussian; zero for extrapolated tissue."""
     pixels = canonical.means.new_zeros((), dtype=torch.float64)
     visibility = canonical.means.new_zeros(len(canonical), len(DIRECTIONS))
-    for index in evenly_spaced(len(recorded.cameras), MAX_FRAMES):
+    for index in evenly_spaced(len(recorded.cameras), SETTINGS.max_frames):
         camera = recorded.cameras[index].within(REFERENCE_PIXELS)
         with torch.no_grad():
             posed = at(recorded.states[index])
@@ -69,7 +78,7 @@ def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Ca
         observed = visible_pixels(posed, camera)
         pixels += observed.sum()
         visibility += observed[:, None] * toward
-    visibility = visibility / max(float(pixels) / len(visibility), MIN_PIXELS)
+    visibility = visibility / max(float(pixels) / len(visibility), SETTINGS.min_pixels)
     if EXTRAPOLATED in canonical.extras:  # its border reaches into recorded images
         visibility *= 1 - canonical.extras[EXTRAPOLATED][:, None]
     return visibility
@@ -82,7 +91,7 @@ def unobserved_share(visibility: Tensor, posed: Gaussians, camera: Camera) -> Te
     if all_run_native(visibility, posed.means) and not torch.is_grad_enabled():
         frames = None if posed.sh_frames is None else posed.sh_frames.contiguous()
         centre = camera.world_from_camera[:3, 3].cpu().float()
-        numbers = torch.cat([centre, torch.tensor([HALF_VISIBILITY])])
+        numbers = torch.cat([centre, torch.tensor([SETTINGS.half_visibility])])
         share = torch.empty(len(visibility))
         native().unobserved(
             posed.means.contiguous(), frames, visibility.contiguous(), _directions("cpu"), numbers, share
@@ -90,7 +99,7 @@ def unobserved_share(visibility: Tensor, posed: Gaussians, camera: Camera) -> Te
         return share
     toward = _toward(posed, camera)
     share = (visibility * toward).sum(1) / toward.sum(1)
-    return HALF_VISIBILITY / (share + HALF_VISIBILITY)
+    return SETTINGS.half_visibility / (share + SETTINGS.half_visibility)
 
 
 def _toward(posed: Gaussians, camera: Camera) -> Tensor:
@@ -100,7 +109,7 @@ def _toward(posed: Gaussians, camera: Camera) -> Tensor:
     outward = normalize(camera.world_from_camera[:3, 3].to(means) - means, dim=1)  # [N, 3]
     if posed.sh_frames is not None:
         outward = torch.einsum("nji,nj->ni", quat_to_matrix(posed.sh_frames), outward)
-    return (outward @ _directions(outward.device).T).clamp_min(0) ** SHARPNESS
+    return (outward @ _directions(outward.device).T).clamp_min(0) ** SETTINGS.sharpness
 
 
 def _directions(device: torch.device | str) -> Tensor:
@@ -140,14 +149,14 @@ def outside_all_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 @torch.no_grad()
 def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> CanonicalGaussians:
-    """Return canonical Gaussians with tissue (body 0) extrapolated by MAX_DISTANCE beyond the border of what `cameras`
-    observed, in the mean depth and colour of its neighbourhood; unchanged without observed tissue."""
+    """Return canonical Gaussians with tissue (body 0) extrapolated by `max_distance` beyond the border of what
+    `cameras` observed, in the mean depth and colour of its neighbourhood; unchanged without observed tissue."""
     grid = _Grid(_middle_camera(cameras))
     rows = canonical.body(0)
     means, colors = canonical.means[rows], canonical.sh_dc[rows][:, 0]  # [T, 3] both
     cells, depths = grid.cells(means)
     weights = torch.sigmoid(canonical.opacity_logits[rows]).double() * grid.holds(cells)
-    weights *= (depths > grid.camera.near) & (count_views(means, cameras) >= MIN_FRAME_SHARE * len(cameras))
+    weights *= (depths > grid.camera.near) & (count_views(means, cameras) >= SETTINGS.min_frame_share * len(cameras))
     known = grid.sums(cells, weights, torch.cat([1 / depths[:, None], colors], 1).double())  # [rows, columns, 1 + 4]
     if not known[..., 0].any():
         return canonical
@@ -155,31 +164,31 @@ def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera])
     positions = grid.positions(1 / filled[..., 0])  # [rows, columns, 3]
     outside = outside_all_views(positions.reshape(-1, 3), cameras).reshape(positions.shape[:2]).cpu()
     distance = distance_transform_edt(outside.numpy()) * grid.cell
-    chosen = outside & torch.from_numpy(distance < MAX_DISTANCE * grid.camera.width)
+    chosen = outside & torch.from_numpy(distance < SETTINGS.max_distance * grid.camera.width)
     points, colors = positions[chosen], filled[chosen][:, 1:]
-    added = seed_gaussians(points, colors, grid.spacing(points), opacity=OPACITY)
+    added = seed_gaussians(points, colors, grid.spacing(points), opacity=SETTINGS.opacity)
     return _append_tissue(canonical, replace(added, sh_dc=colors[:, None].clone()))
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """Cells of the middle camera's image, extended by GRID_MARGIN to each side."""
+    """Cells of the middle camera's image, extended by `grid_margin` to each side."""
 
     camera: Camera
 
     @property
     def cell(self) -> float:
         """Side of a cell, px."""
-        return CELL * self.camera.width
+        return SETTINGS.cell * self.camera.width
 
     @property
     def shape(self) -> tuple[int, int]:
         """Number of rows and columns."""
-        extended = (1 + 2 * GRID_MARGIN) / self.cell
+        extended = (1 + 2 * SETTINGS.grid_margin) / self.cell
         return round(extended * self.camera.height), round(extended * self.camera.width)
 
     def _corner(self, like: Tensor) -> Tensor:
-        return like.new_tensor([self.camera.width, self.camera.height]) * -GRID_MARGIN
+        return like.new_tensor([self.camera.width, self.camera.height]) * -SETTINGS.grid_margin
 
     def cells(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return (row, column) [P, 2] and depth [P] mm of points [P, 3] mm of the world, also outside the grid."""
@@ -202,11 +211,11 @@ class _Grid:
     def positions(self, depths: Tensor) -> Tensor:
         """Return points [rows, columns, 3] mm of the world behind the cells' centres, at depths [rows, columns] mm."""
         pixels = pixel_centers(*self.shape).to(depths) * self.cell + self._corner(depths)
-        return unproject_world(pixels, DEPTH_FACTOR * depths, self.camera)
+        return unproject_world(pixels, SETTINGS.depth_factor * depths, self.camera)
 
     def spacing(self, points: Tensor) -> Tensor:
         """Return the standard deviation [P] mm of Gaussians at points [P, 3] mm of the world that fill their cells."""
-        return CELL_SD * self.cell * project_world(points, self.camera)[1] / self.camera.fx
+        return SETTINGS.cell_sd * self.cell * project_world(points, self.camera)[1] / self.camera.fx
 
 
 def _middle_camera(cameras: Sequence[Camera]) -> Camera:
@@ -225,9 +234,9 @@ def _filled(known: np.ndarray) -> np.ndarray:
     found = np.zeros((*known.shape[:2], known.shape[2] - 1))
     left = np.ones(known.shape[:2], dtype=bool)
     is_known = (known[..., 0] > 0).astype(float)
-    for sigma in SMOOTHING_CELLS:
+    for sigma in SETTINGS.smoothing_cells:
         blurred = gaussian_filter(known, (sigma, sigma, 0), mode="constant")
-        here = left & (gaussian_filter(is_known, sigma, mode="constant") > MIN_KNOWN_SHARE)
+        here = left & (gaussian_filter(is_known, sigma, mode="constant") > SETTINGS.min_known_share)
         found[here] = blurred[here][:, 1:] / blurred[here][:, :1]
         left &= ~here
     mean = known.sum((0, 1))

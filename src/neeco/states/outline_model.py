@@ -53,12 +53,14 @@ class OutlineModelSettings:
     max_along: float = 0.9  # cosine between a joint's axis and the shaft, above which it turns the shaft about itself
     min_motion: float = 0.02  # standard deviation of a joint's value, rad, from which it bends
     min_slide_mm: float = 0.5  # standard deviation of a prismatic joint's value, from which it moves
+    # of outline points, from the tube's end
+    tube_stations_mm: tuple[int, ...] = (1, 3, 6, 9, 13, 18, 24, 31, 40, 50, 62, 75, 90)
 
 
 MODEL = OutlineModelSettings()
 
 STATIONS = np.array([0.04, 0.15, 0.3, 0.5, 0.7, 0.85, 0.96])  # along a cone, of outline points
-TUBE_STATIONS = 1 - np.array([1, 3, 6, 9, 13, 18, 24, 31, 40, 50, 62, 75, 90]) / MODEL.tube_mm
+TUBE_STATIONS = 1 - np.array(MODEL.tube_stations_mm) / MODEL.tube_mm
 CAP_ANGLES = np.radians([-80, -50, -25, 0, 25, 50, 80])  # about a cone's outer end
 
 

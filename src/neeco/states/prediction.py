@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Frame, evenly_spaced
-from neeco.scene.state_corrections import MAX_ANCHORS, StateCorrections, kernel
+from neeco.scene.state_corrections import CORRECTIONS, StateCorrections, kernel
 from neeco.states.refinement import Refinement
 
 
@@ -77,7 +77,7 @@ def predict_corrections(
             found[part] = Prediction(explained=explained, applied=explained >= PREDICTION.min_explained)
             applied[places] = float(found[part].applied)
         learned, anchors = features[usual_rows], features[usual_rows]
-        anchors = anchors[evenly_spaced(len(anchors), MAX_ANCHORS)]
+        anchors = anchors[evenly_spaced(len(anchors), CORRECTIONS.max_anchors)]
         weights = _weights(learned, rows[usual_rows], anchors, length, noise) * applied
         corrections.anchors[index, : len(anchors)] = anchors.to(corrections.anchors)
         corrections.weights[index, : len(anchors), : weights.shape[1]] = weights.to(corrections.weights)
@@ -107,7 +107,7 @@ def _best(features: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, float, float]
             error = torch.zeros_like(usual)
             for out, rest in left:
                 mean = rows[rest].mean(0)
-                anchors = features[rest][evenly_spaced(int(rest.sum()), MAX_ANCHORS)]
+                anchors = features[rest][evenly_spaced(int(rest.sum()), CORRECTIONS.max_anchors)]
                 weights = _weights(features[rest], rows[rest] - mean, anchors, length, noise)
                 error += (rows[out] - mean - kernel(features[out], anchors, length) @ weights).square().sum(0)
             tried.append((float(error.sum()), length, noise, error))

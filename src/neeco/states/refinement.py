@@ -34,7 +34,6 @@ STATE = (
     "error_scale",
 )  # tensors of a checkpoint, without the moments
 ON_CPU = ("frame_steps", "fitted", "verdicts", "error_scale")  # read in every step
-MM_PER_RAD = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +47,7 @@ class RefinementLimits:
     uncorrected: float = 1.2  # times what was corrected: errors, as some remain that corrections do not explain
     max_neighbour_s: float = 1.0  # s between instants whose unrecorded joints are similar
     max_velocity_s: float = 0.5  # s between frames that velocities are taken from
+    mm_per_rad: float = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
 
 
 LIMITS = RefinementLimits()
@@ -144,7 +144,7 @@ class Refinement:
         priors = _pose_priors(first, tuple(item.name for item in items), usual_pose_sd)  # [P, I, 6]
         self.camera_sigma, self.pose_sd = usual_pose_sd.to(device), priors.to(device)
         slides = [slides for item in items for slides in item.slides]
-        per_rad = torch.tensor([MM_PER_RAD if each else 1.0 for each in slides], device=device)
+        per_rad = torch.tensor([LIMITS.mm_per_rad if each else 1.0 for each in slides], device=device)
         usual_joint_sd = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
         self.usual_joint_sd = usual_joint_sd  # [R]
         self.joint_sd = usual_joint_sd.repeat(len(self.neighbours), 1)  # [P, R] rad or mm

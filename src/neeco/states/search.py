@@ -17,7 +17,7 @@ from neeco.scene import GaussianScene
 from neeco.states.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer
 from neeco.states.fitter import Fitter, StateFit
 from neeco.states.parameters import DEG, InstrumentParameters, StateParameters
-from neeco.states.refinement import LIMITS, MM_PER_RAD, Refinement
+from neeco.states.refinement import LIMITS, Refinement
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +146,7 @@ class StateSearch:
             found += [*turns.tolist(), *shifts]
             for reading, slides in zip(own.joints, own.slides, strict=True):
                 limits = item.joints[reading] if reading in item.unrecorded else None
-                usual = scale * SEARCH.joint * DEG * (MM_PER_RAD if slides else 1.0)
+                usual = scale * SEARCH.joint * DEG * (LIMITS.mm_per_rad if slides else 1.0)
                 if limits is not None and limits[0] != limits[1]:
                     usual = (limits[1] - limits[0]) / 4
                 elif stated is not None and reading in stated.joints_deg:
@@ -249,7 +249,7 @@ class StateSearch:
                 SEARCH.across,
                 SEARCH.depth,
             ]
-            found += [SEARCH.joint * DEG * (MM_PER_RAD if slides else 1.0) for slides in own.slides]
+            found += [SEARCH.joint * DEG * (LIMITS.mm_per_rad if slides else 1.0) for slides in own.slides]
         return torch.tensor(found, dtype=torch.float64)
 
 

@@ -15,19 +15,28 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-MAX_TURN = 0.5  # rad
-MAX_ZOOM = 1.4  # larger or smaller
-MAX_SHIFT = 0.15  # of a side
-MAX_EXPOSURE = 0.7  # octaves
-MAX_GAMMA = 0.6  # octaves
-MAX_TINT = 0.2  # of each colour channel
-MAX_SATURATION = 0.5
-MAX_SLOPE = 0.4  # of the brightness from one border to the other: lamps elsewhere
-MAX_BLUR = 1.5  # px
-BLUR_RADIUS = 3  # px
-MAX_NOISE = 0.06
-MAX_CUT = 0.35  # of a side
-PLACED, RELIT = 0.5, 0.7  # of the images: turned, zoomed and shifted; with other light and colours
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentationSettings:
+    """Largest changes of an image, and how often it is changed."""
+
+    turn: float = 0.5  # rad
+    zoom: float = 1.4  # larger or smaller
+    shift: float = 0.15  # of a side
+    exposure: float = 0.7  # octaves
+    gamma: float = 0.6  # octaves
+    tint: float = 0.2  # of each colour channel
+    saturation: float = 0.5
+    slope: float = 0.4  # of the brightness from one border to the other: lamps elsewhere
+    blur: float = 1.5  # px
+    blur_radius: int = 3  # px
+    noise: float = 0.06
+    cut: float = 0.35  # of a side
+    placed: float = 0.5  # of the images: turned, zoomed and shifted
+    relit: float = 0.7  # of the images: with other light and colours
+
+
+CHANGES = AugmentationSettings()
 
 Outline = tuple[int, np.ndarray]
 
@@ -46,10 +55,10 @@ def augment(planes: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     grid = functional.affine_grid(given_from_made, [count, 1, height, width], align_corners=False)
     planes = functional.grid_sample(planes, grid, align_corners=False)
     colors, labels = planes[:, :3], planes[:, 3:]
-    colors = torch.where(random.some(RELIT)[:, None, None, None] > 0, _relight(colors, random), colors)
-    colors = _blur(colors, random.some(0.3) * random.uniform(0.2, MAX_BLUR))
+    colors = torch.where(random.some(CHANGES.relit)[:, None, None, None] > 0, _relight(colors, random), colors)
+    colors = _blur(colors, random.some(0.3) * random.uniform(0.2, CHANGES.blur))
     noise = torch.randn(colors.shape, generator=rng, device=planes.device)
-    strength = random.some(0.5) * random.uniform(0, MAX_NOISE)
+    strength = random.some(0.5) * random.uniform(0, CHANGES.noise)
     colors = (colors + noise * strength[:, None, None, None]).clamp(0, 1)
     cut = _rectangles(random, height, width)
     colors = torch.where(cut, random.uniform(0, 1, 3)[..., None, None], colors)
@@ -105,10 +114,10 @@ class _Random:
 
 def _placements(random: _Random, aspect: float) -> Tensor:
     """[B, 2, 3]: flips, turns, zooms and shifts, as `augment` returns them. aspect: width over height."""
-    placed, flip = random.some(PLACED), 1 - 2 * random.some(0.5)
-    turn, zoom = placed * random.uniform(-MAX_TURN, MAX_TURN), MAX_ZOOM ** (placed * random.uniform(-1, 1))
+    placed, flip = random.some(CHANGES.placed), 1 - 2 * random.some(0.5)
+    turn, zoom = placed * random.uniform(-CHANGES.turn, CHANGES.turn), CHANGES.zoom ** (placed * random.uniform(-1, 1))
     cosine, sine = turn.cos() / zoom, turn.sin() / zoom
-    shift = placed[:, None] * random.uniform(-2 * MAX_SHIFT, 2 * MAX_SHIFT, 2)
+    shift = placed[:, None] * random.uniform(-2 * CHANGES.shift, 2 * CHANGES.shift, 2)
     rows = [
         torch.stack([cosine * flip, -sine / aspect, shift[:, 0]], 1),
         torch.stack([sine * aspect * flip, cosine, shift[:, 1]], 1),
@@ -119,24 +128,26 @@ def _placements(random: _Random, aspect: float) -> Tensor:
 def _relight(colors: Tensor, random: _Random) -> Tensor:
     """Other exposure, gamma, tint, saturation and lamps."""
     height, width = colors.shape[2:]
-    angle, slope = random.uniform(-math.pi, math.pi), random.some(0.5) * random.uniform(0, MAX_SLOPE)
+    angle, slope = random.uniform(-math.pi, math.pi), random.some(0.5) * random.uniform(0, CHANGES.slope)
     across, down = (torch.linspace(-0.5, 0.5, side, device=colors.device) for side in (width, height))
     ramp = (slope * angle.cos())[:, None, None] * across + (slope * angle.sin())[:, None, None] * down[:, None]
-    gain = 2 ** random.uniform(-MAX_EXPOSURE, MAX_EXPOSURE)
-    tint = random.uniform(1 - MAX_TINT, 1 + MAX_TINT, 3) * gain[:, None]
+    gain = 2 ** random.uniform(-CHANGES.exposure, CHANGES.exposure)
+    tint = random.uniform(1 - CHANGES.tint, 1 + CHANGES.tint, 3) * gain[:, None]
     grey = colors.mean(1, keepdim=True)
-    colors = grey + (colors - grey) * random.uniform(1 - MAX_SATURATION, 1 + MAX_SATURATION)[:, None, None, None]
+    saturation = random.uniform(1 - CHANGES.saturation, 1 + CHANGES.saturation)
+    colors = grey + (colors - grey) * saturation[:, None, None, None]
     colors = (colors * tint[..., None, None] * (1 + ramp[:, None])).clamp(1e-4, 1)
-    return colors ** (2 ** random.uniform(-MAX_GAMMA, MAX_GAMMA))[:, None, None, None]
+    return colors ** (2 ** random.uniform(-CHANGES.gamma, CHANGES.gamma))[:, None, None, None]
 
 
 def _blur(colors: Tensor, deviations: Tensor) -> Tensor:
     """Blur each image [B, 3, h, w] by a Gaussian of its own standard deviation [B] px; 0: not at all."""
     count = len(colors)
-    offsets = torch.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, device=colors.device)
+    radius = CHANGES.blur_radius
+    offsets = torch.arange(-radius, radius + 1, device=colors.device)
     kernels = torch.exp(-0.5 * (offsets / deviations.clamp(min=1e-3)[:, None]) ** 2)  # [B, 7]
     kernels = (kernels / kernels.sum(1, keepdim=True)).repeat_interleave(3, 0)[:, None]  # [3 B, 1, 7]
-    flat = functional.pad(colors.reshape(1, 3 * count, *colors.shape[2:]), (BLUR_RADIUS,) * 4, mode="replicate")
+    flat = functional.pad(colors.reshape(1, 3 * count, *colors.shape[2:]), (radius,) * 4, mode="replicate")
     flat = functional.conv2d(flat, kernels[:, :, None], groups=3 * count)
     return functional.conv2d(flat, kernels[..., None], groups=3 * count).reshape(colors.shape)
 
@@ -146,5 +157,5 @@ def _rectangles(random: _Random, height: int, width: int) -> Tensor:
     inside, chosen = [], random.some(0.5) > 0
     for side in (height, width):
         places = (torch.arange(side, device=random.device) + 0.5) / side
-        inside.append((places - random.uniform(0, 1, 1)).abs() < random.uniform(0.1, MAX_CUT, 1) / 2)
+        inside.append((places - random.uniform(0, 1, 1)).abs() < random.uniform(0.1, CHANGES.cut, 1) / 2)
     return (inside[0][:, :, None] & inside[1][:, None] & chosen[:, None, None])[:, None]

@@ -27,17 +27,25 @@ from neeco.raster.types import Gaussians
 from neeco.synthesis.camera_effects import linear_to_srgb, srgb_to_linear
 from neeco.synthesis.settings import Settings
 
-MIN_CROP = 0.7  # of the largest crop of the wanted shape: sides of the smallest
-MIN_SIDE_PX = 32  # of an image: smaller ones are icons
-CACHED_IMAGES = 64  # decoded
-MIN_SHARE = 0.02  # of a pixel: of less, an instrument's colour is not known
-SHADOW_BLUR_PX = 1.5  # standard deviation, of the shadow that is found at the instrument's edge
-CLEAR_TISSUE = 0.5  # share of tissue in a pixel from which the shadow on it is measured
-REPLACED = 0.5  # share of the images that show a background, and of those with the colours of other frames
-BORDER = 12 / 255  # brightest channel of an endoscope's black border
-DARK = 1e-3  # of white: no mean light is taken to be less
-ADAPTATION_RANGE = (0.25, 4.0)  # of gains that follow from other images
-SHADOW_RANGE = (0.2, 1.1)  # of the light that a shadow leaves; above 1: errors of the renderings
+
+@dataclass(frozen=True, kw_only=True)
+class BackgroundSettings:
+    """Settings of images placed behind instruments, and of colours taken from others."""
+
+    min_crop: float = 0.7  # of the largest crop of the wanted shape: sides of the smallest
+    min_side_px: int = 32  # of an image: smaller ones are icons
+    cached_images: int = 64  # decoded
+    min_share: float = 0.02  # of a pixel: of less, an instrument's colour is not known
+    shadow_blur_px: float = 1.5  # standard deviation, of the shadow that is found at the instrument's edge
+    clear_tissue: float = 0.5  # share of tissue in a pixel from which the shadow on it is measured
+    replaced: float = 0.5  # share of the images that show a background, and of those with the colours of other frames
+    border: float = 12 / 255  # brightest channel of an endoscope's black border
+    dark: float = 1e-3  # of white: no mean light is taken to be less
+    adaptation_range: tuple[float, float] = (0.25, 4.0)  # of gains that follow from other images
+    shadow_range: tuple[float, float] = (0.2, 1.1)  # of the light that a shadow leaves; above 1: errors of renderings
+
+
+IMAGES = BackgroundSettings()
 
 
 @dataclass(frozen=True)
@@ -57,8 +65,8 @@ class ImageFolder:
         if not files:
             raise NeecoError(f"--{option}: {folder}: has no image; give .png or .jpg files")
         for file in files:
-            if min(image_size(file)) < MIN_SIDE_PX:
-                raise NeecoError(f"--{option}: {file}: is smaller than {MIN_SIDE_PX} px; leave it out")
+            if min(image_size(file)) < IMAGES.min_side_px:
+                raise NeecoError(f"--{option}: {file}: is smaller than {IMAGES.min_side_px} px; leave it out")
         return cls(files)
 
     def digest(self) -> str:
@@ -75,7 +83,7 @@ class ImageFolder:
         resized. Raises NeecoError where the file cannot be read."""
         image = _decoded(self.files[number])
         rows, columns = image.shape[:2]
-        scale = rng.uniform(MIN_CROP, 1) * min(columns / width, rows / height)
+        scale = rng.uniform(IMAGES.min_crop, 1) * min(columns / width, rows / height)
         size = max(1, int(scale * width)), max(1, int(scale * height))
         left, top = (int(rng.integers(whole - part + 1)) for whole, part in zip((columns, rows), size, strict=True))
         crop = image[top : top + size[1], left : left + size[0]]
@@ -84,7 +92,7 @@ class ImageFolder:
         return cv2.resize(np.ascontiguousarray(crop), (width, height), interpolation=way).astype(np.float32) / 255
 
 
-@lru_cache(maxsize=CACHED_IMAGES)
+@lru_cache(maxsize=IMAGES.cached_images)
 def _decoded(file: Path) -> np.ndarray:
     return read_image_bytes(file).numpy()
 
@@ -99,7 +107,7 @@ class Colors:
     @classmethod
     def of(cls, image: np.ndarray) -> Colors:
         """Those of an image [H, W, 3] in [0, 1]."""
-        shown = image[image.max(2) > BORDER]
+        shown = image[image.max(2) > IMAGES.border]
         if not len(shown):
             shown = image.reshape(-1, 3)
         return cls(shown.mean(0), shown.std(0))
@@ -107,7 +115,7 @@ class Colors:
     def given_to(self, image: np.ndarray) -> np.ndarray:
         """An image [H, W, 3] with these colours (Reinhard et al., "Color transfer between images", 2001, in RGB)."""
         own = Colors.of(image)
-        gains = np.clip(self.deviation / np.maximum(own.deviation, DARK), *ADAPTATION_RANGE)
+        gains = np.clip(self.deviation / np.maximum(own.deviation, IMAGES.dark), *IMAGES.adaptation_range)
         return np.clip((image - own.mean) * gains + self.mean, 0, 1).astype(np.float32)
 
 
@@ -136,10 +144,10 @@ class Appearance:
     def over_background(self, layers: Layers) -> Tensor:
         """The image [H, W, 3] of these layers over the background."""
         assert self.background is not None
-        share = layers.share.clamp(min=MIN_SHARE)[..., None].numpy()
+        share = layers.share.clamp(min=IMAGES.min_share)[..., None].numpy()
         alone = np.clip(layers.instruments.numpy() / share, 0, 1)
-        here, own = (srgb_to_linear(x.numpy()).mean((0, 1)) + DARK for x in (self.background, layers.tissue))
-        gains = np.clip((here / own) ** self.adaptation, *ADAPTATION_RANGE)
+        here, own = (srgb_to_linear(x.numpy()).mean((0, 1)) + IMAGES.dark for x in (self.background, layers.tissue))
+        gains = np.clip((here / own) ** self.adaptation, *IMAGES.adaptation_range)
         alone = linear_to_srgb(srgb_to_linear(alone) * gains)
         return replace(layers, instruments=torch.from_numpy((alone * share).astype(np.float32))).over(self.background)
 
@@ -167,9 +175,9 @@ class Appearances:
         """Sample the appearance of an image. Raises NeecoError where a background cannot be read."""
         replaced, adaptation, place, matched, frame = rng.random(5)
         found = Appearance()
-        if self.frames is not None and matched < REPLACED:
+        if self.frames is not None and matched < IMAGES.replaced:
             found = replace(found, colors=self.frames.colors(int(frame * len(self.frames.files))))
-        if self.backgrounds is None or replaced >= REPLACED:
+        if self.backgrounds is None or replaced >= IMAGES.replaced:
             return found
         number = int(place * len(self.backgrounds.files))
         background = torch.from_numpy(self.backgrounds.crop(number, rng, width, height))
@@ -208,13 +216,13 @@ def split(gaussians: Gaussians, owners: Tensor, camera: Camera, image: Tensor, s
     instruments = rasterize(replace(gaussians, sh=black, background=None), camera).color.clamp(0, 1).cpu()
     instruments = instruments * (share > 0)[..., None]  # components that are not labelled stay behind
     tissue = rasterize(gaussians.select(of_tissue), camera).color.clamp(0, 1).cpu()
-    clear = ((1 - share) * (share < CLEAR_TISSUE)).numpy()
+    clear = ((1 - share) * (share < IMAGES.clear_tissue)).numpy()
     behind = (image - instruments).clamp(0, 1)
     lit = tissue.mean(2).numpy() * clear
-    ratio = (_smoothed(behind.mean(2).numpy() * (clear > 0)) + DARK) / (_smoothed(lit) + DARK)
-    shadow = torch.from_numpy(np.clip(ratio, *SHADOW_RANGE).astype(np.float32))
+    ratio = (_smoothed(behind.mean(2).numpy() * (clear > 0)) + IMAGES.dark) / (_smoothed(lit) + IMAGES.dark)
+    shadow = torch.from_numpy(np.clip(ratio, *IMAGES.shadow_range).astype(np.float32))
     return Layers(instruments, share, shadow, tissue)
 
 
 def _smoothed(plane: np.ndarray) -> np.ndarray:
-    return cv2.GaussianBlur(plane, (0, 0), SHADOW_BLUR_PX)
+    return cv2.GaussianBlur(plane, (0, 0), IMAGES.shadow_blur_px)

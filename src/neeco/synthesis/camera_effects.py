@@ -34,10 +34,20 @@ if TYPE_CHECKING:
 SoftMasks = Literal["mid", "mean"]
 SOFT_MASKS = "soft_masks"
 SMOKE_MM = 100.0  # distance over which `smoke` is stated
-MAX_SUBFRAMES = 64
-SUBFRAME_PX = 1.0  # at most, between two subframes of an exposure
-TISSUE_STEP_PX = 40  # spacing of the places on the tissue that are followed
-MAX_GAP_S = 0.5  # between recorded frames; a speed over a longer one means nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectSettings:
+    """Sampling of an exposure, and defaults of effects."""
+
+    max_subframes: int = 64
+    subframe_px: float = 1.0  # at most, between two subframes of an exposure
+    tissue_step_px: int = 40  # spacing of the places on the tissue that are followed
+    max_gap_s: float = 0.5  # between recorded frames; a speed over a longer one means nothing
+    smoke_grey: float = 0.6  # where the file asks for smoke and does not name its brightness
+
+
+SETTINGS = EffectSettings()
 
 
 @dataclass(frozen=True)
@@ -65,7 +75,6 @@ EFFECTS = {
     "gamma": Effect(0.3, 3, "exponent on the stored image; above 1 is darker"),
     "jpeg_quality": Effect(1, 100, "of the JPEG that the image went through; left out: none"),
 }
-SMOKE_GREY = 0.6  # where the file asks for smoke and does not name its brightness
 
 
 @dataclass(frozen=True)
@@ -203,7 +212,7 @@ def _smoked(light: np.ndarray, depth: np.ndarray, values: Mapping[str, float]) -
         return light
     far = np.where(depth > 0, depth, depth.max(initial=SMOKE_MM))
     transmission = ((1 - density) ** (far / SMOKE_MM)).astype(np.float32)[..., None]
-    grey = srgb_to_linear(np.full(3, values.get("smoke_grey", SMOKE_GREY)))
+    grey = srgb_to_linear(np.full(3, values.get("smoke_grey", SETTINGS.smoke_grey)))
     return light * transmission + grey * (1 - transmission)
 
 
@@ -253,7 +262,7 @@ class RecordedMotion:
         self._motions, states = [], []
         for first, second in pairwise(order):
             a, b = recorded.states[first], recorded.states[second]
-            if 0 < b.time - a.time <= MAX_GAP_S and set(a.instruments) == set(b.instruments):
+            if 0 < b.time - a.time <= SETTINGS.max_gap_s and set(a.instruments) == set(b.instruments):
                 self._motions.append(motion_between(a, recorded.cameras[first], b, recorded.cameras[second]))
                 states.append(a)
         self._frames = SimilarFrames(states, len(states), joints=True)
@@ -299,17 +308,17 @@ def subframes(
     scene: GaussianScene, drawing: LayeredDrawing, motion: Motion, shutter_s: float
 ) -> list[tuple[State, Camera]]:
     """States and cameras spread evenly over an exposure of which `drawing` is the middle: so many that nothing moves
-    by more than SUBFRAME_PX from one to the next (MAX_SUBFRAMES at most), and an odd number, so that the middle is
+    by more than `subframe_px` from one to the next (`max_subframes` at most), and an odd number, so that the middle is
     one of them."""
     places = []  # where working ends and places on the tissue are in the image, at the start and at the end
     for side in (-1, 1):
         state, camera = motion.advanced(drawing.state, drawing.camera, side * shutter_s / 2)
         points = [point for ends in working_ends(scene, state).values() for point in ends]
-        points += list(surface_points(drawing.tissue_depth, drawing.camera, TISSUE_STEP_PX))
+        points += list(surface_points(drawing.tissue_depth, drawing.camera, SETTINGS.tissue_step_px))
         places.append([place_in_image(point, camera) for point in points])
     moved = [np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in zip(*places, strict=True) if a and b]
     apart = float(max(moved, default=0.0))
-    count = 2 * int(np.clip(np.ceil(apart / SUBFRAME_PX / 2), 0, MAX_SUBFRAMES // 2 - 1)) + 1
+    count = 2 * int(np.clip(np.ceil(apart / SETTINGS.subframe_px / 2), 0, SETTINGS.max_subframes // 2 - 1)) + 1
     times = ((np.arange(count) + 0.5) / count - 0.5) * shutter_s
     return [motion.advanced(drawing.state, drawing.camera, float(time)) for time in times]
 

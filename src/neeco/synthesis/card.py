@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -155,31 +155,48 @@ def _command(info: Mapping[str, Any]) -> str:
     return shlex.join(map(str, ["neeco", *words, *formats, "--output", "DATASET"]))
 
 
-TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION_LINE = 8, 2, 360, 14, 17
-PAIR_WIDTH = 2 * TILE_WIDTH + 4  # the plain image, and the same with its labels
-PAPER, INK, FAINT = (250, 250, 248), (30, 32, 36), (120, 124, 130)
-BOX, RECTANGLE, BONE, HIDDEN = (255, 255, 255), (255, 209, 70), (20, 22, 26), (150, 150, 150)
+@dataclass(frozen=True, kw_only=True)
+class PreviewSettings:
+    """Layout of preview.png: sizes in px, colours of 255."""
+
+    tiles: int = 8
+    columns: int = 2
+    tile_width: int = 360
+    pair_width: int = 2 * tile_width + 4  # the plain image, and the same with its labels
+    gap: int = 14
+    caption_line: int = 17
+    caption_fonts: tuple[int, int] = (13, 12)  # px
+    label_column: int = 210
+    tint: float = 0.42  # opacity of a part's colour over the image
+    paper: tuple[int, int, int] = (250, 250, 248)
+    ink: tuple[int, int, int] = (30, 32, 36)
+    faint: tuple[int, int, int] = (120, 124, 130)
+    box: tuple[int, int, int] = (255, 255, 255)
+    rectangle: tuple[int, int, int] = (255, 209, 70)
+    bone: tuple[int, int, int] = (20, 22, 26)
+    hidden: tuple[int, int, int] = (150, 150, 150)
+
+
+PREVIEW = PreviewSettings()
 Color = str | tuple[int, int, int]
-TINT = 0.42  # opacity of a part's colour over the image
-CAPTION_FONTS = 13, 12  # px
-LABEL_COLUMN = 210
 
 
 def write_preview(
     root: Path, records: Sequence[Record], names: Sequence[tuple[str, str]], bones: Sequence[tuple[str, str]]
 ) -> None:
     """Write preview.png: up to 8 images spread over the data set, each plain and with parts, boxes and keypoints."""
-    tiles = [draw_tile(root, records[k], bones) for k in evenly_spaced(len(records), TILES, floor=True)]
-    columns = min(COLUMNS, len(tiles))
+    tiles = [draw_tile(root, records[k], bones) for k in evenly_spaced(len(records), PREVIEW.tiles, floor=True)]
+    columns = min(PREVIEW.columns, len(tiles))
     rows = -(-len(tiles) // columns)
     height = max(tile.height for tile in tiles)
-    legend_rows = -(-(len(names) + 3) // max(columns * (PAIR_WIDTH + GAP) // LABEL_COLUMN, 1))
-    header = 26 * legend_rows + GAP
-    sheet = Image.new("RGB", (GAP + columns * (PAIR_WIDTH + GAP), header + GAP + rows * (height + GAP)), PAPER)
+    gap, wide = PREVIEW.gap, PREVIEW.pair_width + PREVIEW.gap
+    legend_rows = -(-(len(names) + 3) // max(columns * wide // PREVIEW.label_column, 1))
+    header = 26 * legend_rows + gap
+    sheet = Image.new("RGB", (gap + columns * wide, header + gap + rows * (height + gap)), PREVIEW.paper)
     _legend(ImageDraw.Draw(sheet), names, sheet.width)
     for k, tile in enumerate(tiles):
         row, column = divmod(k, columns)
-        sheet.paste(tile, (GAP + column * (PAIR_WIDTH + GAP), header + GAP + row * (height + GAP)))
+        sheet.paste(tile, (gap + column * wide, header + gap + row * (height + gap)))
     write_atomically(root / "preview.png", lambda temporary: sheet.save(temporary, format="PNG", compress_level=1))
 
 
@@ -187,23 +204,24 @@ def draw_tile(root: Path, record: Record, bones: Sequence[tuple[str, str]] = ())
     """Return one image, beside it the same with its labels, and a caption below; `bones` join keypoints."""
     pixels = np.asarray(open_image(root / record["image"]).convert("RGB"), dtype=float)
     parts = np.asarray(open_image(root / "parts" / f"{stem(record['index'])}.png"))
-    scale = TILE_WIDTH / pixels.shape[1]
-    size = (TILE_WIDTH, round(pixels.shape[0] * scale))
+    scale = PREVIEW.tile_width / pixels.shape[1]
+    size = (PREVIEW.tile_width, round(pixels.shape[0] * scale))
     image = np.asarray(Image.fromarray(pixels.astype(np.uint8)).resize(size, Image.Resampling.LANCZOS), dtype=float)
     ids = np.asarray(Image.fromarray(parts).resize(size, Image.Resampling.NEAREST))
     tinted = Image.fromarray(_tinted(image, ids).round().astype(np.uint8))
     canvas = ImageDraw.Draw(tinted)
     for label in record["labels"]:
         _draw_label(canvas, label, bones, scale)
-    first, second = (wrap(items, PAIR_WIDTH, font) for items, font in zip(_caption(record), CAPTION_FONTS, strict=True))
-    height = size[1] + 6 + CAPTION_LINE * (len(first) + len(second))
-    tile = Image.new("RGB", (PAIR_WIDTH, height), PAPER)
+    fonts, width = PREVIEW.caption_fonts, PREVIEW.pair_width
+    first, second = (wrap(items, width, font) for items, font in zip(_caption(record), fonts, strict=True))
+    height = size[1] + 6 + PREVIEW.caption_line * (len(first) + len(second))
+    tile = Image.new("RGB", (width, height), PREVIEW.paper)
     tile.paste(Image.fromarray(image.astype(np.uint8)))
-    tile.paste(tinted, (PAIR_WIDTH - size[0], 0))
+    tile.paste(tinted, (width - size[0], 0))
     text = ImageDraw.Draw(tile)
-    lines = [(line, INK, CAPTION_FONTS[0]) for line in first] + [(line, FAINT, CAPTION_FONTS[1]) for line in second]
+    lines = [(line, PREVIEW.ink, fonts[0]) for line in first] + [(line, PREVIEW.faint, fonts[1]) for line in second]
     for k, (line, color, font) in enumerate(lines):
-        text.text((0, size[1] + 5 + CAPTION_LINE * k), line, color, ImageFont.load_default(font))
+        text.text((0, size[1] + 5 + PREVIEW.caption_line * k), line, color, ImageFont.load_default(font))
     return tile
 
 
@@ -222,7 +240,7 @@ def wrap(items: Sequence[str], width: float, font: int) -> list[str]:
 def _tinted(image: np.ndarray, ids: np.ndarray) -> np.ndarray:
     colors = np.concatenate([np.zeros((1, 3)), PART_COLORS[np.arange(max(int(ids.max()), 1)) % len(PART_COLORS)]])[ids]
     inside = ids > 0
-    tinted = np.where(inside[..., None], (1 - TINT) * image + TINT * colors, image)
+    tinted = np.where(inside[..., None], (1 - PREVIEW.tint) * image + PREVIEW.tint * colors, image)
     edge = outline(inside)
     tinted[edge] = colors[edge]
     return tinted
@@ -233,26 +251,26 @@ def _draw_label(
 ) -> None:
     if label["area"] > 0:
         x, y, width, height = (value * scale for value in label["box"])
-        canvas.rectangle((x, y, x + width - 1, y + height - 1), outline=BOX)
+        canvas.rectangle((x, y, x + width - 1, y + height - 1), outline=PREVIEW.box)
         corners = [(px * scale, py * scale) for px, py in label["rectangle"]]
-        canvas.line([*corners, corners[0]], fill=RECTANGLE, width=2)
+        canvas.line([*corners, corners[0]], fill=PREVIEW.rectangle, width=2)
         draw_name(canvas, x, y, label["name"])
     points = {name: (x * scale, y * scale, v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
     for start, end in bones:
         if start in points and end in points:
-            canvas.line([points[start][:2], points[end][:2]], fill=BONE, width=2)
+            canvas.line([points[start][:2], points[end][:2]], fill=PREVIEW.bone, width=2)
     for x, y, visibility in points.values():
-        fill = HIDDEN if visibility == OCCLUDED else BOX
-        canvas.ellipse((x - 4, y - 4, x + 4, y + 4), fill=fill, outline=BONE, width=2)
+        fill = PREVIEW.hidden if visibility == OCCLUDED else PREVIEW.box
+        canvas.ellipse((x - 4, y - 4, x + 4, y + 4), fill=fill, outline=PREVIEW.bone, width=2)
 
 
 def draw_name(canvas: ImageDraw.ImageDraw, x: float, y: float, text: str) -> None:
     """Draw a name above its box, or inside it where there is no room above; never beyond the tile's right edge."""
     font = ImageFont.load_default(11)
     width = canvas.textlength(text, font=font) + 8
-    left, top = min(x, TILE_WIDTH - width), y - 16 if y >= 16 else y
-    canvas.rectangle((left, top, left + width, top + 15), fill=BOX)
-    canvas.text((left + 4, top + 1), text, INK, font)
+    left, top = min(x, PREVIEW.tile_width - width), y - 16 if y >= 16 else y
+    canvas.rectangle((left, top, left + width, top + 15), fill=PREVIEW.box)
+    canvas.text((left + 4, top + 1), text, PREVIEW.ink, font)
 
 
 def _caption(record: Record) -> tuple[list[str], list[str]]:
@@ -272,13 +290,14 @@ def _legend(canvas: ImageDraw.ImageDraw, names: Sequence[tuple[str, str]], width
     entries: list[tuple[str, Color]] = [
         (f"{name} {part}", part_color(part_id)) for part_id, (name, part) in enumerate(names, 1)
     ]
-    entries += [("minimum-area box", RECTANGLE), ("keypoint seen", BOX), ("keypoint occluded", HIDDEN)]
-    columns = max((width - GAP) // LABEL_COLUMN, 1)
+    entries += [("minimum-area box", PREVIEW.rectangle), ("keypoint seen", PREVIEW.box)]
+    entries += [("keypoint occluded", PREVIEW.hidden)]
+    columns = max((width - PREVIEW.gap) // PREVIEW.label_column, 1)
     for k, (text, color) in enumerate(entries):
         row, column = divmod(k, columns)
-        x, y = GAP + column * LABEL_COLUMN, GAP + 26 * row
+        x, y = PREVIEW.gap + column * PREVIEW.label_column, PREVIEW.gap + 26 * row
         if "keypoint" in text:
-            canvas.ellipse((x + 2, y + 2, x + 14, y + 14), fill=color, outline=BONE, width=2)
+            canvas.ellipse((x + 2, y + 2, x + 14, y + 14), fill=color, outline=PREVIEW.bone, width=2)
         else:
             canvas.rectangle((x, y, x + 16, y + 16), fill=color)
-        canvas.text((x + 24, y + 1), text, INK, ImageFont.load_default(13))
+        canvas.text((x + 24, y + 1), text, PREVIEW.ink, ImageFont.load_default(13))

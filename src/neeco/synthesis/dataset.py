@@ -21,8 +21,8 @@ from neeco.base.files import own_folder, read_begun, require_same, sync_disk, wr
 from neeco.base.registry import plugins
 from neeco.base.workers import address, check_workers
 from neeco.labels.annotation import keypoint_names
-from neeco.labels.drawing import EDGE_WIDTH
-from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
+from neeco.labels.labellers import Labeller, ThresholdLabels, instruments_of
+from neeco.labels.settings import LABELS
 from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.card import write_card, write_preview
@@ -37,7 +37,7 @@ from neeco.synthesis.generator import (
     format_counts,
 )
 from neeco.synthesis.parallel import draw_in_workers
-from neeco.synthesis.samplers import N_SIMILAR, states_fingerprint
+from neeco.synthesis.samplers import SAMPLING, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import (
@@ -114,7 +114,7 @@ def synthesize(
     identity = settings.identity() | {
         **settings.image_identity(recorded.width, recorded.height),
         "states_sha256": states_fingerprint(settings.states),
-        "similar_views": N_SIMILAR,
+        "similar_views": SAMPLING.n_similar,
         "camera_effects": effects,
         **folders,
     }
@@ -181,7 +181,7 @@ def description(
         "scene_sha256": scene_digest(run.path),
         "settings": settings,
         "soft": {"share_per_count": SHARE_PER_COUNT},
-        "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": EDGE_WIDTH},
+        "ignore": {"ignored": IGNORED, "clear_shares": list(LABELS.clear_shares), "reach": LABELS.edge_width},
         "scene": str(run.path),
     }
     if instrument_runs:

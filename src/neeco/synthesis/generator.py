@@ -22,8 +22,9 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import State, evenly_spaced
 from neeco.geometry.camera import Camera
 from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends_of
-from neeco.labels.drawing import MAX_UNOBSERVED, LayeredDrawing, draw_layers
+from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
+from neeco.labels.settings import LABELS
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.scene.io import load_gaussians
 from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, split
@@ -48,12 +49,22 @@ if TYPE_CHECKING:
 VERB = "synthesize"
 # of an image's random numbers: camera effects and appearances do not change which state and view are sampled
 EFFECTS_STREAM, APPEARANCE_STREAM = 1, 2
-BURIED_SHARE = 0.05  # of an instrument's pixels that may lie deeper than the tolerance: edges are uncertain
-TOLERANCE_RANGE_MM = (2.0, 5.0)  # range of tolerances found from the recording
-N_TOLERANCE_STATES = 12  # recorded states from which the tolerance is found
-MIN_GAP_MM = 6.0  # surfaces of two instruments nearer than about a shaft's thickness: the instruments intersect
-MIN_CROSSING_PX = 5  # px nearer than that: instruments are taken to intersect
-MAX_UNOBSERVED_SHARE = 0.25  # of an image's pixels
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceptanceSettings:
+    """Thresholds of the states that images show."""
+
+    buried_share: float = 0.05  # of an instrument's pixels that may lie deeper than the tolerance: edges are uncertain
+    tolerance_range_mm: tuple[float, float] = (2.0, 5.0)  # range of tolerances found from the recording
+    n_tolerance_states: int = 12  # recorded states from which the tolerance is found
+    # surfaces of two instruments nearer than about a shaft's thickness: the instruments intersect
+    min_gap_mm: float = 6.0
+    min_crossing_px: int = 5  # px nearer than that: instruments are taken to intersect
+    max_unobserved_share: float = 0.25  # of an image's pixels
+
+
+ACCEPTED = AcceptanceSettings()
 LEAVES_IMAGE, ENTERS_TISSUE, ENTERS_ANOTHER = "leaves the image", "enters the tissue", "enters another"
 UNOBSERVED_TISSUE = "stands before tissue that no frame saw"
 UNOBSERVED_SIDE = "shows sides that no frame saw"
@@ -106,8 +117,8 @@ class Acceptance:
             return LEAVES_IMAGE
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
-        unobserved = drawing.unobserved.numpy() > MAX_UNOBSERVED
-        if unobserved.mean(dtype=np.float32) > MAX_UNOBSERVED_SHARE:
+        unobserved = drawing.unobserved.numpy() > LABELS.max_unobserved
+        if unobserved.mean(dtype=np.float32) > ACCEPTED.max_unobserved_share:
             return UNOBSERVED_TISSUE
         labelled = drawing.parts.numpy() > 0
         if labelled.any() and unobserved[labelled].mean(dtype=np.float32) > self.max_unobserved:
@@ -331,15 +342,15 @@ def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
     recorded = scene.recorded
     depths = [
         buried_depth(draw_layers(scene, labeller, recorded.states[k], recorded.cameras[k], min_component=0.0))
-        for k in evenly_spaced(len(recorded.states), N_TOLERANCE_STATES, floor=True)
+        for k in evenly_spaced(len(recorded.states), ACCEPTED.n_tolerance_states, floor=True)
     ]
-    return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_RANGE_MM)) / 100)
+    return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *ACCEPTED.tolerance_range_mm)) / 100)
 
 
 def buried_depth(drawing: LayeredDrawing) -> float:
     """Return the depth, in mm, of the deepest instrument behind the tissue surface in this camera; 0 for none.
 
-    All but the deepest BURIED_SHARE of an instrument's pixels are above this depth, and all keypoints of its working
+    All but the deepest `buried_share` of an instrument's pixels are above this depth, and all keypoints of its working
     end.
     """
     deepest = 0.0
@@ -350,7 +361,7 @@ def buried_depth(drawing: LayeredDrawing) -> float:
         behind = surface[shown]
         below = np.where(behind > 0, layer.depth[shown] - behind, 0.0)
         if len(below):
-            deepest = max(deepest, float(np.quantile(below, 1 - BURIED_SHARE)))
+            deepest = max(deepest, float(np.quantile(below, 1 - ACCEPTED.buried_share)))
         for point in keypoints.get(name, []):
             if place := place_in_image(point, drawing.camera):
                 x, y, z = place
@@ -370,7 +381,7 @@ def _intersect(drawing: LayeredDrawing, some: frozenset[str], others: frozenset[
     for a, b in product(sorted(some & drawing.layers.keys()), sorted(others & drawing.layers.keys())):
         first, second = drawing.layers[a], drawing.layers[b]
         both = first.mask & second.mask & (first.depth > 0) & (second.depth > 0)
-        if int((np.abs(first.depth - second.depth)[both] < MIN_GAP_MM).sum()) >= MIN_CROSSING_PX:
+        if int((np.abs(first.depth - second.depth)[both] < ACCEPTED.min_gap_mm).sum()) >= ACCEPTED.min_crossing_px:
             return True
     return False
 

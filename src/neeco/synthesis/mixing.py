@@ -35,10 +35,21 @@ from neeco.synthesis.samplers import Sampler, make_sampler
 if TYPE_CHECKING:
     from neeco.synthesis.settings import Settings
 
-DEPTH_SCALE = 0.25  # of the image's size, at which the depth of tissue is looked up
-N_RECORDED_FRAMES = 24  # frames that the mixed scene has as if they had been recorded
-GAIN_RANGE = (0.6, 1.6)  # range of the change of colours: beyond that, the shafts differ in make
-MIN_SHAFT_OPACITY = 0.5  # least opacity of Gaussians from which a shaft's colour is estimated
+
+@dataclass(frozen=True, kw_only=True)
+class MixingSettings:
+    """Settings of tissue and instruments of different runs."""
+
+    depth_scale: float = 0.25  # of the image's size, at which the depth of tissue is looked up
+    n_recorded_frames: int = 24  # frames that the mixed scene has as if they had been recorded
+    gain_range: tuple[float, float] = (
+        0.6,
+        1.6,
+    )  # range of the change of colours: beyond that, the shafts differ in make
+    min_shaft_opacity: float = 0.5  # least opacity of Gaussians from which a shaft's colour is estimated
+
+
+MIXING = MixingSettings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +135,7 @@ class Mixture:
     def _recorded(self) -> Recorded:
         """Frames spread over the tissue's cameras, with the instrument scenes' recorded states placed before them."""
         cameras = self.tissue.recorded.cameras
-        count = min(N_RECORDED_FRAMES, len(cameras))
+        count = min(MIXING.n_recorded_frames, len(cameras))
         chosen, states = [], []
         for k in range(count):
             camera = cameras[round(k * (len(cameras) - 1) / max(1, count - 1))]
@@ -191,7 +202,7 @@ def tissue_depth(tissue: Gaussians, camera: Camera, point: np.ndarray) -> float:
 
     Beyond the image's border, that of the nearest pixel.
     """
-    coarse = camera.scaled(DEPTH_SCALE)
+    coarse = camera.scaled(MIXING.depth_scale)
     rendering = rasterize(tissue, coarse)
     x, y = project(point, coarse.fx, coarse.fy, coarse.cx, coarse.cy, nearest=camera.near)
     row, column = (int(np.clip(value, 0, size - 1)) for value, size in ((y, coarse.height), (x, coarse.width)))
@@ -249,7 +260,7 @@ def _gain(tissue: GaussianScene, instruments: GaussianScene) -> tuple[float, flo
     if tissue is instruments or not tissue.instruments:
         return 1.0, 1.0, 1.0
     ratio = _shaft_color(tissue) / _shaft_color(instruments).clamp_min(1e-3)
-    red, green, blue = (float(value) for value in ratio.clamp(*GAIN_RANGE))
+    red, green, blue = (float(value) for value in ratio.clamp(*MIXING.gain_range))
     return red, green, blue
 
 
@@ -257,6 +268,6 @@ def _shaft_color(scene: GaussianScene) -> Tensor:
     """[3] the mean colour, at 100 mm, of what is solid of the instruments' shafts."""
     labels = scene.label_channels()
     shaft = [k for k, (_, part) in enumerate(scene.label_names) if part in ("shaft", "instrument")]
-    weight = labels[:, shaft].sum(1) * (torch.sigmoid(scene.canonical.opacity_logits) > MIN_SHAFT_OPACITY)
+    weight = labels[:, shaft].sum(1) * (torch.sigmoid(scene.canonical.opacity_logits) > MIXING.min_shaft_opacity)
     color = (scene.canonical.sh_dc[:, 0] * SH_C0 + 0.5).clamp(0, 1)
     return (weight[:, None] * color).sum(0) / weight.sum().clamp_min(1e-6)

@@ -42,17 +42,26 @@ from neeco.synthesis.states import (
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
 
-N_SIMILAR = 10  # recorded frames whose cameras may observe a sampled state
-MAX_VIEW_ATTEMPTS = 50  # views sampled until one has the instrument in the image
-STILL_DEGREES, STILL_MM = 1.0, 1.0  # by which perturbed views differ from those of a still scope: it observed one side
-N_SURFACE_VIEWS = 5  # recorded views that decide where the surface's middle is
+
+@dataclass(frozen=True, kw_only=True)
+class SamplerSettings:
+    """Settings of the samplers of views."""
+
+    n_similar: int = 10  # recorded frames whose cameras may observe a sampled state
+    max_view_attempts: int = 50  # views sampled until one has the instrument in the image
+    still_degrees: float = 1.0  # by which perturbed views differ from those of a still scope: it observed one side
+    still_mm: float = 1.0  # the same, of their positions
+    n_surface_views: int = 5  # recorded views that decide where the surface's middle is
+
+
+SAMPLING = SamplerSettings()
 
 # Draws a camera for a state; intrinsics and image size are always those of a recorded camera.
 ViewSampler = Callable[[State, Generator], Camera]
 
 
 class SimilarFrames:
-    """Picks one of `count` recorded frames (its index): among the N_SIMILAR ones with the most similar states, or any
+    """Picks one of `count` recorded frames (its index): among the `n_similar` ones with the most similar states, or any
     where all states are equal. states: those of the frames; empty: none are known."""
 
     def __init__(self, states: Sequence[State], count: int, joints: bool) -> None:
@@ -69,12 +78,12 @@ class SimilarFrames:
         """Return a frame whose state is similar to `state`."""
         if self._recorded is None or not set(self._recorded.instruments) <= set(state.instruments):
             return self.any(rng)
-        nearest = np.argsort(self._recorded.distances(state), kind="stable")[:N_SIMILAR]
+        nearest = np.argsort(self._recorded.distances(state), kind="stable")[: SAMPLING.n_similar]
         return int(nearest[rng.integers(len(nearest))])
 
 
 class RecordedViews:
-    """The camera of a recorded frame, one of the N_SIMILAR with the most similar states.
+    """The camera of a recorded frame, one of the SAMPLING.n_similar with the most similar states.
 
     A camera that follows its instrument observed it there: instruments stand in the image as recorded ones do, which
     is what a detector learns from. states: the recorded frames'; empty: any camera.
@@ -151,7 +160,7 @@ class Sampler:
         """Return the next (state, camera) for image `index`.
 
         Most views of a moving camera do not show the instrument, and rendering is costly: views are sampled until one
-        has the instrument in the image, MAX_VIEW_ATTEMPTS times at most.
+        has the instrument in the image, SAMPLING.max_view_attempts times at most.
         """
         state = self.states(index, rng)
         given = self.cameras[index % len(self.cameras)]
@@ -159,7 +168,7 @@ class Sampler:
             return state, given
         points = working_ends_or_origins(self.scene, state)
         camera = self.views(state, rng)
-        for _ in range(MAX_VIEW_ATTEMPTS):
+        for _ in range(SAMPLING.max_view_attempts):
             if any_in_image(camera, points):
                 break
             camera = self.views(state, rng)
@@ -191,7 +200,7 @@ def _view_sampler(scene: GaussianScene, views: Views) -> ViewSampler:
     view_sampler: ViewSampler = recorded
     still = scene.recorded.still
     if views == "perturbed":
-        view_sampler = PerturbedViews(recorded, *((STILL_DEGREES, STILL_MM) if still else ()))
+        view_sampler = PerturbedViews(recorded, *((SAMPLING.still_degrees, SAMPLING.still_mm) if still else ()))
     elif views == "orbit" and still:
         raise NeecoError(
             "--views orbit: the scope stood still, and nothing shows the scene from the side; use recorded or perturbed"
@@ -260,7 +269,7 @@ def surface_centre(scene: GaussianScene) -> np.ndarray:
     """The median [3] mm of the surface points that recorded cameras see."""
     recorded = scene.recorded
     points = []
-    for k in evenly_spaced(len(recorded.cameras), N_SURFACE_VIEWS, floor=True):
+    for k in evenly_spaced(len(recorded.cameras), SAMPLING.n_surface_views, floor=True):
         camera = recorded.cameras[k]
         points.append(surface_points(surface_depth(rasterize(scene.at(recorded.states[k]), camera)), camera))
     seen = np.concatenate(points)

@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 
 from neeco.base.errors import NeecoError
 from neeco.base.settings import structure
+from neeco.labels.settings import LABELS
 
 LabelWay = Literal["composited", "threshold"]
 Views = Literal["recorded", "perturbed", "orbit"]
@@ -167,7 +168,7 @@ class Settings(ImageSettings):
     """Share of a pixel that must be instrument (composited). Default: the project's measured best."""
     delta_thresholds: tuple[float, float, float] | None = None
     """Position (mm), rotation and scale (mm) above which a Gaussian has moved (threshold). Default: found."""
-    min_component: float = 0.01
+    min_component: float = LABELS.min_component
     """Drop components of an instrument's mask smaller than this share of its largest."""
     tissue_check: bool = True
     """States whose instrument enters the tissue, as far as the view shows it, are refused, unless --no-tissue-check."""

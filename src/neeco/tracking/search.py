@@ -42,7 +42,7 @@ class TrackSearchSettings:
     mm_per_deg: float = 0.25  # of prismatic joints, wherever a number of degrees is asked for
 
 
-SEARCH = TrackSearchSettings()
+STARTS = TrackSearchSettings()
 
 
 @dataclass(frozen=True)
@@ -71,17 +71,17 @@ class Search:
             for k in range(len(parameters.instruments)):
                 tried += [
                     parameters.moved(base, parameters.along(k, shift, roll * DEG))
-                    for shift in SEARCH.shifts_mm
-                    for roll in SEARCH.rolls_deg
+                    for shift in STARTS.shifts_mm
+                    for roll in STARTS.rolls_deg
                 ]
         size, generator = parameters.size, torch.Generator().manual_seed(0)
         root = torch.linalg.cholesky(predicted.covariance[:size, :size])
-        normal = torch.randn(SEARCH.n_samples, size, generator=generator, dtype=torch.float64)
+        normal = torch.randn(STARTS.n_samples, size, generator=generator, dtype=torch.float64)
         tried += [parameters.moved(predicted.state, increments) for increments in normal @ root.T]
-        precision = self.motion.precision(predicted) / SEARCH.prior_scale**2
+        precision = self.motion.precision(predicted) / STARTS.prior_scale**2
         best: StateFit | None = None
         crop = self.fitter.crop_around(view, predicted.state, 2 * FIT.margin_px)
-        for start in self.fitter.ranked(view if crop is None else crop, tried, 0.25)[: SEARCH.n_fitted_near]:
+        for start in self.fitter.ranked(view if crop is None else crop, tried, 0.25)[: STARTS.n_fitted_near]:
             fit = self.fitter.fit(view, predicted.state, precision, start, levels=(0.25, 0.5), steps=(4, 4))
             if fit is not None and (best is None or fit.gain > best.gain):
                 best = fit
@@ -96,16 +96,16 @@ class Search:
 
         None where no state explains the image better than the tissue alone.
         """
-        fitter, prior = self.fitter, loose_prior(self.fitter.parameters, *SEARCH.anywhere_prior)
-        starts = self._different(fitter.ranked(view, self.recorded_states(view.camera), 0.125), SEARCH.n_starts)
+        fitter, prior = self.fitter, loose_prior(self.fitter.parameters, *STARTS.anywhere_prior)
+        starts = self._different(fitter.ranked(view, self.recorded_states(view.camera), 0.125), STARTS.n_starts)
         fits = [fitter.fit(view, state, prior, levels=(0.125, 0.25), steps=(6, 4)) for state in starts]
         found = _by_gain(fits)
         if found:
-            others = self._different(fitter.ranked(view, self.turned(found[0].state), 0.25), SEARCH.n_turned)
+            others = self._different(fitter.ranked(view, self.turned(found[0].state), 0.25), STARTS.n_turned)
             fits = [fitter.fit(view, state, prior, levels=(0.25,), steps=(6,)) for state in others]
             found = _by_gain([*found, *fits])
         last = [
-            fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4)) for fit in found[: SEARCH.n_finalists]
+            fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4)) for fit in found[: STARTS.n_finalists]
         ]
         best = _by_gain(last)
         return best[0] if best and best[0].gain > 0 else None
@@ -114,7 +114,7 @@ class Search:
         """Return recorded states, moved so that `camera` observes them as their own cameras did."""
         recorded, world = self.recorded, camera.world_from_camera.double().cpu()
         states = []
-        for k in evenly_spaced(len(recorded.states), SEARCH.n_recorded):
+        for k in evenly_spaced(len(recorded.states), STARTS.n_recorded):
             carry = world @ torch.linalg.inv(recorded.cameras[k].world_from_camera.double().cpu())
             instruments = {
                 name: InstrumentState(carry @ given.pose.double().cpu(), given.joints)
@@ -129,13 +129,13 @@ class Search:
         for k, item in enumerate(parameters.instruments):
             given = state.instruments[item.name].joints
             values = [given[name] for name in item.joints]
-            for roll in (0.0, *SEARCH.other_rolls_deg):
+            for roll in (0.0, *STARTS.other_rolls_deg):
                 rolled = parameters.moved(state, parameters.along(k, roll=roll * DEG))
                 found += [rolled] if roll else []
                 for j, slides in enumerate(item.slides):
-                    for change in SEARCH.other_joints_deg:
+                    for change in STARTS.other_joints_deg:
                         moved = [*values]
-                        moved[j] += change * (SEARCH.mm_per_deg if slides else DEG)
+                        moved[j] += change * (STARTS.mm_per_deg if slides else DEG)
                         found.append(parameters.with_joints(rolled, k, moved))
         return found
 
@@ -143,7 +143,7 @@ class Search:
         """Return the first `count` states that lead to different fits."""
         chosen: list[State] = []
         for state in states:
-            limits = SEARCH.apart_deg, SEARCH.apart_joint_deg, SEARCH.apart_mm
+            limits = STARTS.apart_deg, STARTS.apart_joint_deg, STARTS.apart_mm
             if all(differ(self.fitter.parameters, state, other, *limits) for other in chosen):
                 chosen.append(state)
             if len(chosen) == count:
@@ -166,7 +166,7 @@ def differ(
     """Return whether two states differ by more than `degrees` of rotation, `millimetres`, or `joint_degrees`."""
     apart = parameters.increments_between(one, other)
     for item, (pose, rows) in zip(parameters.instruments, parameters.rows, strict=True):
-        units = torch.tensor([SEARCH.mm_per_deg if slides else DEG for slides in item.slides], dtype=torch.float64)
+        units = torch.tensor([STARTS.mm_per_deg if slides else DEG for slides in item.slides], dtype=torch.float64)
         turned, shifted = float(apart[pose][:3].norm()) / DEG, float(apart[pose][3:].norm())
         if turned > degrees or shifted > millimetres or bool((apart[rows].abs() > joint_degrees * units).any()):
             return True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,8 +19,17 @@ from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
 from neeco.training.session import new_session
 
-MAX_POSE_EXPLAINED = 0.98  # share of a joint's variance that its instrument's pose may explain
-N_STRETCHES, MIN_HELD_OUT_EXPLAINED = 4, 0.5  # of the recording, held out in turn, and the share explained there
+
+@dataclass(frozen=True, kw_only=True)
+class JointSettings:
+    """Thresholds of joints that are learned."""
+
+    max_pose_explained: float = 0.98  # share of a joint's variance that its instrument's pose may explain
+    n_stretches: int = 4  # of the recording, held out in turn
+    min_held_out_explained: float = 0.5  # the share explained there
+
+
+JOINTS = JointSettings()
 
 
 def begin_session(
@@ -141,8 +150,8 @@ def moving_joints(
         reading = np.array([states[i].joints[joint] for i in first])
         if (
             reading.var() > 1e-8
-            and _explained(design, reading, 1) > MAX_POSE_EXPLAINED
-            and _explained(design, reading, N_STRETCHES) > MIN_HELD_OUT_EXPLAINED
+            and _explained(design, reading, 1) > JOINTS.max_pose_explained
+            and _explained(design, reading, JOINTS.n_stretches) > JOINTS.min_held_out_explained
         ):
             report(f"{instrument.name}: joint {joint} follows from the pose; it moves no part of its own")
         else:

@@ -21,7 +21,7 @@ from neeco.raster import Rendering, rasterize
 from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
 from neeco.raster.optimizer import Adam
-from neeco.scene.deformation import FINAL_RATE, Perturbation, floored_decay, log_linear
+from neeco.scene.deformation import DEFORMATION, Perturbation, floored_decay, log_linear
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_session import Report, Session, StepResult, check_finite, members, numbers
@@ -230,7 +230,7 @@ class GaussianSession(Session):
         scene, optimizer = self.scene, self.config.optimizer
         # by progress alone positions would be stiff before there is detail to fit
         done = self.resolution.rendered_share(progress)
-        position_rate = optimizer.position_rate * self.extent * log_linear(1.0, FINAL_RATE, done)
+        position_rate = optimizer.position_rate * self.extent * log_linear(1.0, DEFORMATION.final_rate, done)
         rates = self.gaussian_rates | {"means": position_rate}
         learned = [(name, tensor, rates[name]) for name, tensor in scene.canonical.tensors().items() if name in rates]
         still = scene.deformation.warming_up or self.iteration < scene.deformation.start_iteration

@@ -12,9 +12,20 @@ import torch
 from torch import Tensor
 
 UNKNOWN, INSTRUMENT = 128, 255  # of stored values; tissue is 0
-WEIGHT = 0.1  # of the loss, beside the photometric one
-FEW = 30  # frames, from which on it falls with their number: many frames show for themselves what is instrument
-MIN_SHARE = 1e-4  # of rendered labels, in logarithms
+
+
+@dataclass(frozen=True, kw_only=True)
+class SilhouetteSettings:
+    """Weight of the loss."""
+
+    weight: float = 0.1  # of the loss, beside the photometric one
+    few: int = (
+        30  # frames, from which on it falls with their number: many frames show for themselves what is instrument
+    )
+    min_share: float = 1e-4  # of rendered labels, in logarithms
+
+
+SILHOUETTES = SilhouetteSettings()
 
 
 @dataclass(eq=False)
@@ -37,8 +48,8 @@ class Silhouettes:
         resized = cv2.resize(values, (width, height), interpolation=how)
         certain = torch.from_numpy((resized - UNKNOWN) / (INSTRUMENT - UNKNOWN)).to(label)
         instrument, tissue = certain.clamp(0, 1), (-certain).clamp(0, 1)
-        label = label.clamp(MIN_SHARE, 1 - MIN_SHARE)
-        weight = WEIGHT * min(1.0, FEW / len(self.values))
+        label = label.clamp(SILHOUETTES.min_share, 1 - SILHOUETTES.min_share)
+        weight = SILHOUETTES.weight * min(1.0, SILHOUETTES.few / len(self.values))
         return -weight * (instrument * label.log() + tissue * (1 - label).log()).mean()
 
     def tensors(self) -> dict[str, Tensor]:

@@ -45,8 +45,18 @@ from neeco.training.run import (
 from neeco.training.schedule import due
 
 CPU = torch.device("cpu")
-MIN_SIDE_PX = 12  # of images at a share of their size: smaller ones show no instrument
-BASE_BYTES, PIXEL_BYTES = 0.6e9, 300  # of memory for a process, and for one pixel while it is rendered and compared
+
+
+@dataclass(frozen=True, kw_only=True)
+class MemorySettings:
+    """Sizes that training asks for."""
+
+    min_side_px: int = 12  # of images at a share of their size: smaller ones show no instrument
+    base_bytes: float = 0.6e9  # of memory for a process
+    pixel_bytes: int = 300  # for one pixel while it is rendered and compared
+
+
+SIZES = MemorySettings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,11 +195,12 @@ def _size_note(frames: tuple[Frame, ...], config: TrainConfig) -> str:
     """Return the size of the training data, and about how much memory training takes."""
     camera, pixels = frames[0].camera, config.scale**2 * mean_pixels(frames)
     tissue, instrument = config.gaussian_limits(pixels)
-    stored, working = 1.5 * 3 * pixels * len(frames), PIXEL_BYTES * pixels  # full images and those half their size
+    stored = 1.5 * 3 * pixels * len(frames)  # full images and those half their size
+    working = SIZES.pixel_bytes * pixels
     width, height = round(config.scale * camera.width), round(config.scale * camera.height)
     return (
         f"{len(frames)} images of {width}x{height}; at most {tissue} Gaussians of tissue and {instrument} of "
-        f"each instrument; about {(BASE_BYTES + stored + working) / 1e9:.1f} GB of memory"
+        f"each instrument; about {(SIZES.base_bytes + stored + working) / 1e9:.1f} GB of memory"
     )
 
 
@@ -206,10 +217,10 @@ def _training_frames(capture: Capture, path: Path, config: TrainConfig) -> tuple
         )
     frames = capture.split("train")
     shortest = min(min(frame.camera.width, frame.camera.height) for frame in frames)
-    if config.scale < 1 and config.scale * shortest < MIN_SIDE_PX:
+    if config.scale < 1 and config.scale * shortest < SIZES.min_side_px:
         raise NeecoError(
             f"--scale: {config.scale:g} leaves images {max(1, round(config.scale * shortest))} pixels high or wide; "
-            f"give at least {math.ceil(100 * min(1, MIN_SIDE_PX / shortest)) / 100:g}"
+            f"give at least {math.ceil(100 * min(1, SIZES.min_side_px / shortest)) / 100:g}"
         )
     return frames
 

@@ -62,6 +62,9 @@ class PictureSettings:
     joint_range_deg: tuple[float, float] = (0.0, 120.0)  # of a slider, where the capture states no limits
 
 
+PICTURES = PictureSettings()
+
+
 class PosingServer:
     """A running server on one capture; `address` is what to open. Use as a context manager, or call `stop`.
 
@@ -79,7 +82,6 @@ class PosingServer:
         run = load_run(root, force=True) if (root / RUN_FILE).exists() else None
         self.scene = None if run is None else run.scene
         self.posed = PosedCapture(root if run is None else run.capture().root)
-        self.settings = PictureSettings()
         self._lock, self._drawing = threading.Lock(), threading.Lock()
         self._answers = read_answers(self.posed.root)
         self._posings = self.posed.solve(self._answers)
@@ -232,20 +234,20 @@ class PosingServer:
 
     def _image(self, ask: str, instrument: str, question: Mapping[str, Any]) -> tuple[bytes, str]:
         """A frame along the shaft, which points to the right, or the run's instruments there; and its media type."""
-        posing, index, settings = self._posings[instrument], question["index"], self.settings
+        posing, index = self._posings[instrument], question["index"]
         if ask == "ghost":
             pixels = self._ghost(posing, index, question["roll"], question["joints"])
-            width, order, kind = settings.ghost_width, cv2.COLOR_RGBA2BGRA, "png"
+            width, order, kind = PICTURES.ghost_width, cv2.COLOR_RGBA2BGRA, "png"
         else:
             pixels = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
-            width = settings.thumbnail_width if question["small"] else settings.width
+            width = PICTURES.thumbnail_width if question["small"] else PICTURES.width
             order, kind = cv2.COLOR_RGB2BGR, "jpeg"
         left, right, top, bottom = self._window(posing)
         scale = (right - left) / width
         along = left + (np.arange(width) + 0.5) * scale
         across = top + (np.arange(round((bottom - top) / scale)) + 0.5) * scale
         pixels = crop(posing.shafts, index, pixels, along, across).transpose(1, 0, 2)
-        quality = [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality] if kind == "jpeg" else []
+        quality = [cv2.IMWRITE_JPEG_QUALITY, PICTURES.jpeg_quality] if kind == "jpeg" else []
         return cv2.imencode(f".{kind}", cv2.cvtColor(pixels, order), quality)[1].tobytes(), f"image/{kind}"
 
     def _ghost(self, posing: SolvedPosing, index: int, roll_deg: float, joints_deg: Mapping[str, float]) -> np.ndarray:
@@ -268,9 +270,9 @@ class PosingServer:
 
     def _window(self, posing: SolvedPosing) -> tuple[float, float, float, float]:
         """Left, right (mm along the shaft), top and bottom (across) of a picture."""
-        length, settings = posing.shafts.working_length_mm, self.settings
-        aside = settings.aside * length
-        return -settings.before * length, settings.beyond * length, -aside, aside
+        length = posing.shafts.working_length_mm
+        aside = PICTURES.aside * length
+        return -PICTURES.before * length, PICTURES.beyond * length, -aside, aside
 
     def _overview(self, instrument: str) -> dict[str, Any]:
         posing = self._posing(instrument, 0)
@@ -305,7 +307,7 @@ class PosingServer:
             "length": posing.shafts.working_length_mm,
             "radius": posing.shafts.diameter_mm / 2,
             "joints": {
-                name: self.settings.joint_range_deg if span is None else [math.degrees(end) for end in span]
+                name: PICTURES.joint_range_deg if span is None else [math.degrees(end) for end in span]
                 for name, span in limits.items()
             },
         }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,10 +24,20 @@ from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fittin
 if TYPE_CHECKING:
     import viser
 
-IMAGE_PX = 720  # high at most, of the image behind the scene
-AXIS_UNITS = 0.1 * VIEW.distance_units
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingViewSettings:
+    """Settings of how a recording is shown."""
+
+    image_px: int = 720  # high at most, of the image behind the scene
+    axis_share: float = 0.1  # length of an axis, of the distance from which the scene is viewed
+    # RGB, of the instruments in turn
+    track_colors: tuple[tuple[int, int, int], ...] = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167))
+
+
+RECORDING = RecordingViewSettings()
+AXIS_UNITS = RECORDING.axis_share * VIEW.distance_units
 UNREGISTERED = "instruments are not shown: their poses are not in the cameras' frame"
-TRACK_COLORS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167))
 
 
 class RecordingServer(ViserPage):
@@ -72,7 +83,8 @@ class RecordingSession:
                 if name in frame.state.instruments
             ]
             path = np.array([pose[:3, 3] * unit for pose in poses], np.float32).reshape(-1, 3)
-            ends, color = np.stack([path[:-1], path[1:]], 1), TRACK_COLORS[number % len(TRACK_COLORS)]
+            color = RECORDING.track_colors[number % len(RECORDING.track_colors)]
+            ends = np.stack([path[:-1], path[1:]], 1)
             if len(ends):
                 scene.add_line_segments(f"/tracks/{number}", ends, color, thickness=2, thickness_units="screen")
             self.axes[name] = scene.add_frame(f"/axes/{number}", axes_length=AXIS_UNITS, axes_radius=AXIS_UNITS / 25)
@@ -113,7 +125,7 @@ class RecordingSession:
             index, window = self._index, self._client.camera
             frame, aspect = self._capture.frames[index], aspect_of(window)
             with contextlib.suppress(ValueError):  # a camera that is none
-                if not stands_at(browser_camera(window, self._unit, IMAGE_PX), frame.camera, self._distance):
+                if not stands_at(browser_camera(window, self._unit, RECORDING.image_px), frame.camera, self._distance):
                     aspect = 0.0
             if (index, aspect) == self._shown:
                 return
@@ -133,8 +145,8 @@ def image_behind(frame: Frame, aspect: float) -> np.ndarray:
     viser has it. Raises NeecoError."""
     camera = frame.camera
     image = (frame.load_image().numpy() * 255).round().astype(np.uint8)
-    focal = IMAGE_PX / 2 / np.tan(fitting_view(camera, aspect) / 2)
-    size = max(1, round(IMAGE_PX * aspect)), IMAGE_PX
+    focal = RECORDING.image_px / 2 / np.tan(fitting_view(camera, aspect) / 2)
+    size = max(1, round(RECORDING.image_px * aspect)), RECORDING.image_px
     across, down = focal / camera.fx, focal / camera.fy
     place = np.array([[across, 0, size[0] / 2 - across * camera.cx], [0, down, size[1] / 2 - down * camera.cy]])
     place[:, 2] += (place[:, :2].sum(1) - 1) / 2  # OpenCV counts from the first pixel's centre

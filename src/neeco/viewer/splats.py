@@ -38,7 +38,8 @@ MIN_SCALE = 1e-30  # mm: the logarithm of 0 is no number of a file
 SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 2
 SPZ_FRACTION = 12  # bits of a mm: positions reach 2 m
 SPZ_COLOR = 0.15  # of the first harmonic, per unit of what is stored
-SPZ_TURNED = (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)  # signs of harmonics whose y and z are negated
+# signs of harmonics whose y and z are negated, by degree and order
+SPZ_TURNED = [(-1) ** (degree + order + (order < 0)) for degree in range(4) for order in range(-degree, degree + 1)]
 SPZ_STEPS = (8, 16, 16)  # of 256, by which harmonics of degree 1, 2 and 3 are rounded
 
 

@@ -39,11 +39,10 @@ class SceneSettings:
     frustum_units: float = 0.06 * VIEW.distance_units  # size of a camera's frustum
     gizmo_units: float = 0.2 * VIEW.distance_units  # length of axes
     point_units: float = 0.005 * VIEW.distance_units  # size of a point
+    frustum_color: tuple[int, int, int] = (255, 200, 0)
 
 
 SCENE = SceneSettings()
-
-FRUSTUM_COLOR = (255, 200, 0)
 
 
 def aspect_of(window: viser.CameraHandle) -> float:
@@ -132,7 +131,7 @@ class Overlays:
                 scale=SCENE.frustum_units,
                 thickness=1.5,
                 thickness_units="screen",
-                color=FRUSTUM_COLOR,
+                color=SCENE.frustum_color,
                 wxyz=wxyz_of(pose),
                 position=pose[:3, 3] * unit,
             )

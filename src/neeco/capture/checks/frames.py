@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.base.plausible import FEW_TRAIN_FRAMES, Fault, exceeds_limits, joint_fault, limits_fault
+from neeco.base.plausible import PLAUSIBLE, Fault, exceeds_limits, joint_fault, limits_fault
 from neeco.capture.checks.pictures import Picture
 from neeco.capture.checks.settings import SETTINGS
 from neeco.capture.documents import Node, printable
@@ -29,8 +29,8 @@ def check_frames(parsed: Parsed) -> None:
     elif counts["train"] < SETTINGS.min_train_frames:
         message = f"too few frames: {counts['train']} to train on, at least {SETTINGS.min_train_frames} are needed"
         frames.error(message, "record more")
-    elif counts["train"] < FEW_TRAIN_FRAMES:
-        message = f"few frames: {counts['train']} to train on, fewer than {FEW_TRAIN_FRAMES} give a poor scene"
+    elif counts["train"] < (few := PLAUSIBLE.few_train_frames):
+        message = f"few frames: {counts['train']} to train on, fewer than {few} give a poor scene"
         frames.warning(message, "record more if you can")
     if not counts["test"]:
         frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")

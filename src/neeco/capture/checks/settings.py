@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 
@@ -13,11 +13,6 @@ class Margin(NamedTuple):
     certainty: float  # of the gain, standard errors over blocks of frames
     agreement: float  # that the correction must reach
     min_frames: int = 0  # that have it
-
-
-CAMERA, OFFSET = Margin(1.25, 5.0, 0.2), Margin(1.02, 5.0, 0.2)  # a slow camera sees nearly the same in the next frame
-ROTATION, SHIFT = Margin(1.25, 3.0, 0.15), Margin(1.15, 5.0, 0.2)  # rotations: on the rays that they change most
-POSE = Margin(1.5, 5.0, 0.2, 45)  # of many candidates one may fit by chance, in fewer frames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +53,8 @@ class CheckSettings:
     good_colors: float = 0.4  # correlation from which only images of neighbouring frames are tried
     max_offset: int = 10  # frames by which images are tried against the cameras
     max_swapped: float = 0.5  # share of the colours' difference that is left when red and blue are swapped back
-    camera: Margin = CAMERA
-    offset: Margin = OFFSET
+    camera: Margin = field(default=Margin(1.25, 5.0, 0.2))
+    offset: Margin = field(default=Margin(1.02, 5.0, 0.2))  # a slow camera sees nearly the same in the next frame
     # motion in the images
     min_frames: int = 12  # with fewer, chance decides
     motion_width: int = 72  # px to which images are reduced: an instrument is some px wide, errors of depth are hidden
@@ -83,9 +78,9 @@ class CheckSettings:
     small_shift: int = 16  # steps of time, at most a fifth of a recording's: so small a shift explains much
     shift_radius: int = 5  # steps to either side of the likeliest shift, which are compared on the same frames
     scales: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 2.0)  # of positions
-    rotation: Margin = ROTATION
-    shift: Margin = SHIFT
-    pose: Margin = POSE
+    rotation: Margin = field(default=Margin(1.25, 3.0, 0.15))  # on the rays that they change most
+    shift: Margin = field(default=Margin(1.15, 5.0, 0.2))
+    pose: Margin = field(default=Margin(1.5, 5.0, 0.2, 45))  # of many candidates one may fit by chance, in fewer frames
 
 
 SETTINGS = CheckSettings()

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from neeco.base.errors import NeecoError
-from neeco.base.plausible import MAX_SIZE_PX, focal_fault, size_fault
+from neeco.base.plausible import PLAUSIBLE, focal_fault, size_fault
 from neeco.capture.documents import Node, as_float, printable
 from neeco.capture.images import image_size
 from neeco.capture.readers.parsed import Parsed
@@ -222,7 +222,7 @@ def _size_or_largest(image_path: Path) -> tuple[int, int]:
     try:
         return image_size(image_path)
     except NeecoError:  # reported when the images are checked
-        return MAX_SIZE_PX, MAX_SIZE_PX
+        return PLAUSIBLE.max_size_px, PLAUSIBLE.max_size_px
 
 
 class CameraFields:

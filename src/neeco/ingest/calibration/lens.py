@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,20 @@ FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
 FISHEYE_MODEL = "OPENCV_FISHEYE"
 MAX_NUMBER = 1e9  # of any of a lens's numbers
 
-# The dark border around a round field of view.
-MAX_BORDER_FRAMES = 48  # used
-MAX_BLACK = 40.0  # of 255; a border brighter than this in most frames is no border
-EDGE_MARGIN = 0.015  # of the radius, left out: the border's edge is blurred
-MAX_MISFIT = 0.015  # of the radius: distance of the edge from a circle
-MIN_CLEAN = 0.9  # share of the pixels outside the circle that must be dark, of those inside that must not be
-MIN_EDGE_DROP = 0.6  # share of the brightness inside the edge that must be gone right outside
+
+@dataclass(frozen=True, kw_only=True)
+class BorderSettings:
+    """Thresholds of the dark border around a round field of view."""
+
+    max_frames: int = 48  # used
+    max_black: float = 40.0  # of 255; a border brighter than this in most frames is no border
+    edge_margin: float = 0.015  # of the radius, left out: the border's edge is blurred
+    max_misfit: float = 0.015  # of the radius: distance of the edge from a circle
+    min_clean: float = 0.9  # share of the pixels outside the circle that must be dark, of those inside that must not be
+    min_edge_drop: float = 0.6  # share of the brightness inside the edge that must be gone right outside
+
+
+BORDERS = BorderSettings()
 
 
 def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
@@ -148,7 +155,7 @@ def _rational(
 def find_border(images: Iterable[np.ndarray]) -> Border | None:
     """The dark border around a round field of view; None when the images have no such border.
 
-    images: uint8 [H, W, 3], frames spread over the recording (10 or more; at most MAX_BORDER_FRAMES are used). The
+    images: uint8 [H, W, 3], frames spread over the recording (10 or more; at most BORDERS.max_frames are used). The
     border stays at the black level although the scene lights up pixels next to it. Only one with a circular edge, sharp
     all along, counts: dark corners of a dim scene are none."""
     brightness = _brightest(images)
@@ -172,12 +179,12 @@ def visible_mask(border: Border, size: tuple[int, int]) -> np.ndarray:
     """bool [H, W] of images of `size` (width, height): False on the border and on its blurred edge."""
     x, y, radius = border
     rows, columns = np.indices(size[::-1])
-    return np.hypot(columns + 0.5 - x, rows + 0.5 - y) < radius * (1 - EDGE_MARGIN) - 0.5
+    return np.hypot(columns + 0.5 - x, rows + 0.5 - y) < radius * (1 - BORDERS.edge_margin) - 0.5
 
 
 def _brightest(images: Iterable[np.ndarray]) -> np.ndarray | None:
     """Return float [H, W], the brightness of each pixel in its brightest frames, smoothed."""
-    stack = [image.max(axis=2).astype(np.float32) for image in islice(images, MAX_BORDER_FRAMES)]
+    stack = [image.max(axis=2).astype(np.float32) for image in islice(images, BORDERS.max_frames)]
     if not stack:
         return None
     # the second brightest of ten, so that one flash or one damaged frame does not light up the border
@@ -194,7 +201,7 @@ def _dark_threshold(brightness: np.ndarray) -> float | None:
     black, spread = levels[1], float(np.median([np.std(corner) for corner in corners]))
     middle = brightness[height // 4 : -height // 4, width // 4 : -width // 4]
     scene = float(np.percentile(middle, 25))
-    if black > MAX_BLACK or scene < black + 6 * max(spread, 0.5) + 4:
+    if black > BORDERS.max_black or scene < black + 6 * max(spread, 0.5) + 4:
         return None
     return black + max(0.15 * (scene - black), 4 * max(spread, 0.5))
 
@@ -230,7 +237,7 @@ def _fit_circle(points: np.ndarray) -> tuple[float, float, float] | None:
         residuals = np.hypot(local[:, 0] - a, local[:, 1] - b) - radius
         scale = max(1.48 * float(np.median(np.abs(residuals))), 0.3)
         weights = 1 / (1 + (residuals / (2 * scale)) ** 2) ** 2
-    if np.median(np.abs(residuals)) > max(MAX_MISFIT * radius, 1.0):
+    if np.median(np.abs(residuals)) > max(BORDERS.max_misfit * radius, 1.0):
         return None
     return float(center[0] + a), float(center[1] + b), radius
 
@@ -247,15 +254,16 @@ def _divides_dark_from_bright(
         return False
     rows, columns = np.indices(outside.shape)
     distance = np.hypot(columns - x, rows - y)
-    beyond, within = distance > radius * (1 + 2 * MAX_MISFIT) + 1, distance < radius * (1 - 2 * MAX_MISFIT) - 1
+    misfit, clean = 2 * BORDERS.max_misfit, BORDERS.min_clean
+    beyond, within = distance > radius * (1 + misfit) + 1, distance < radius * (1 - misfit) - 1
     if beyond.sum() < 0.01 * beyond.size:
         return False
     ring = within & (distance > 0.9 * radius)
     bright = np.mean(brightness[ring] >= threshold) if ring.any() else 0.0
-    if np.mean(outside[beyond]) <= MIN_CLEAN or np.mean(outside[within]) >= 1 - MIN_CLEAN or bright <= MIN_CLEAN:
+    if np.mean(outside[beyond]) <= clean or np.mean(outside[within]) >= 1 - clean or bright <= clean:
         return False
     # a vignette darkens slowly; an edge does it within a few pixels
     black = float(np.percentile(brightness[beyond], 10))
     inner = float(np.median(brightness[(distance > 0.94 * radius) & (distance < 0.98 * radius)]))
     outer = float(np.median(brightness[(distance > 1.02 * radius) & (distance < 1.06 * radius)]))
-    return inner - outer > MIN_EDGE_DROP * (inner - black)
+    return inner - outer > BORDERS.min_edge_drop * (inner - black)

@@ -37,9 +37,19 @@ EXPECTED = (
 _TURNS, _SHIFTS = ("r", "rotation", "rotationmatrix"), ("t", "translation", "translationvector", "tvec")
 _RECTIFICATION, _PROJECTION = ("rectificationmatrix", "r"), ("projectionmatrix", "p")
 _RIGHT_FROM_LEFT, _LEFT_FROM_RIGHT = ("tcncnm1",), ("stereotc1c2", "tc1c2")  # 4x4: of Kalibr, of ORB-SLAM
-BASELINE_M, BASELINE_MM = (5e-4, 0.2), (1.0, 200.0)  # of a stereo scope or rig, in either unit
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoSettings:
+    """Limits of a stereo scope or rig."""
+
+    baseline_m: tuple[float, float] = (5e-4, 0.2)  # of a stereo scope or rig
+    baseline_mm: tuple[float, float] = (1.0, 200.0)  # the same in mm
+    rotation_tolerance: float = 1e-3  # of R^T R - I: files round to four decimals
+
+
+STEREO = StereoSettings()
 MAX_TURN = math.radians(30)  # of one camera relative to the other
-ROTATION_TOLERANCE = 1e-3  # of R^T R - I: files round to four decimals
 
 
 def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
@@ -93,7 +103,7 @@ class RosCamera:
     def rectification(self) -> np.ndarray:
         """Return rectified_from_camera [3, 3]. Raises NeecoError."""
         turn = _numbers(self.where, self.camera.keys, _RECTIFICATION, 9).reshape(3, 3)
-        if rotation_error(turn) > ROTATION_TOLERANCE:
+        if rotation_error(turn) > STEREO.rotation_tolerance:
             raise NeecoError(
                 f"{self.where}: rectification_matrix: is no rotation; calibrate the two cameras as one stereo rig"
             )
@@ -273,14 +283,15 @@ def _pose(path: Path | str, turn: Sequence[float] | np.ndarray, shift: Sequence[
     if not (np.isfinite(angles).all() and np.isfinite(vector).all()):
         raise NeecoError(f"{path}: R, T: are not all numbers; calibrate again")
     matrix = angles.reshape(3, 3) if len(angles) == 9 else Rotation.from_rotvec(angles).as_matrix()
-    if np.abs(matrix).max() > 2 or rotation_error(matrix) > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
+    if np.abs(matrix).max() > 2 or rotation_error(matrix) > STEREO.rotation_tolerance or np.linalg.det(matrix) < 0:
         raise NeecoError(f"{path}: R: is no rotation; write it row by row")
     rotation = Rotation.from_matrix(matrix)
     if rotation.magnitude() > MAX_TURN:
         degrees = math.degrees(rotation.magnitude())
         raise NeecoError(f"{path}: R: turns by {degrees:.0f} degrees; the cameras of a stereo scope look the same way")
     distance = float(np.linalg.norm(vector))
-    scales = [scale for scale, (least, most) in ((1.0, BASELINE_MM), (1000.0, BASELINE_M)) if least <= distance <= most]
+    ranges = ((1.0, STEREO.baseline_mm), (1000.0, STEREO.baseline_m))
+    scales = [scale for scale, (least, most) in ranges if least <= distance <= most]
     if len(scales) != 1:
         raise NeecoError(f"{path}: T: {distance:.4g} long, which is no stereo scope's in mm or m; give T in mm")
     if vector[0] > np.abs(vector[1:]).max():

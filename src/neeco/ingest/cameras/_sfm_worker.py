@@ -13,19 +13,29 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-MIN_TRIALS = 20  # of RANSAC: nearly all matches are right, COLMAP's 100 take twice as long
-SWEEPS = 4  # over frames that have no camera yet
-MISFIT_PX = 3.0
-STEPS = (15, 30)  # of the adjustment, before and after misfits are dropped
-LENS_STEPS = (30, 100)
-DIRECT_IMAGES = 100  # up to which the cameras' equations are factorised; beyond, conjugate gradients take half the time
-PARALLAX_POINTS = 500  # points looked at
+
+@dataclass(frozen=True, kw_only=True)
+class AdjustmentSettings:
+    """Settings of matching and adjustment."""
+
+    min_trials: int = 20  # of RANSAC: nearly all matches are right, COLMAP's 100 take twice as long
+    sweeps: int = 4  # over frames that have no camera yet
+    misfit_px: float = 3.0
+    steps: tuple[int, int] = (15, 30)  # of the adjustment, before and after misfits are dropped
+    lens_steps: tuple[int, int] = (30, 100)
+    # up to which the cameras' equations are factorised; beyond, conjugate gradients take half the time
+    direct_images: int = 100
+    parallax_points: int = 500  # points looked at
+
+
+SETTINGS = AdjustmentSettings()
 
 
 def say(stage: str, **facts: Any) -> None:
@@ -65,7 +75,7 @@ def extract_and_match(job: dict[str, Any], database: Path) -> None:
     matching.use_gpu = False
     matching.num_threads = job["threads"]
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.min_num_trials = MIN_TRIALS
+    verification.ransac.min_num_trials = SETTINGS.min_trials
     pycolmap.match_image_pairs(
         str(database),
         matching_options=matching,
@@ -176,7 +186,7 @@ def estimate_lens(
     """Focal length and distortion by adjusting a whole model. Where it was mapped with others held, its points are
     found again through the new lens, and it is adjusted again."""
     say("estimating the lens")
-    adjust(model, job, LENS_STEPS, free=True)
+    adjust(model, job, SETTINGS.lens_steps, free=True)
     if job["free_lens"]:
         return model
     start = folder / "start"
@@ -184,7 +194,7 @@ def estimate_lens(
     model.write(str(start))
     continued = incremental_mapping(job | {"several_models": False}, database, start, start)
     model = max(continued.values(), key=lambda model: model.num_reg_images())
-    adjust(model, job, LENS_STEPS, free=True)
+    adjust(model, job, SETTINGS.lens_steps, free=True)
     return model
 
 
@@ -193,7 +203,7 @@ def parallax(model: pycolmap.Reconstruction) -> float:
     places = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
     angles = []
     points = list(model.points3D.values())
-    for point in points[:: max(1, len(points) // PARALLAX_POINTS)]:
+    for point in points[:: max(1, len(points) // SETTINGS.parallax_points)]:
         rays = np.array([places[view.image_id] - point.xyz for view in point.track.elements])
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
         angles.append(np.degrees(np.arccos(np.clip(rays @ rays[0], -1, 1).min())))
@@ -226,7 +236,7 @@ def register_others(job: dict[str, Any], database: Path, model: pycolmap.Reconst
     model.load(cache)
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
-    for sweep in range(SWEEPS):
+    for sweep in range(SETTINGS.sweeps):
         missing = [image for image in model.images.values() if not image.has_pose]
         found = 0
         for image in sorted(missing, key=lambda image: image.name):
@@ -249,12 +259,12 @@ def adjust(model: pycolmap.Reconstruction, job: dict[str, Any], steps: Sequence[
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.num_threads = job["threads"]
     options.ceres.solver_options.function_tolerance = 1e-5
-    options.ceres.max_num_images_direct_sparse_cpu_solver = DIRECT_IMAGES
+    options.ceres.max_num_images_direct_sparse_cpu_solver = SETTINGS.direct_images
     for iterations in steps:
         options.ceres.solver_options.max_num_iterations = iterations
         pycolmap.bundle_adjustment(model, options)
         observations = pycolmap.ObservationManager(model)
-        observations.filter_all_points3D(MISFIT_PX, 1.0)
+        observations.filter_all_points3D(SETTINGS.misfit_px, 1.0)
 
 
 def save(model: pycolmap.Reconstruction, path: Path) -> None:
@@ -311,7 +321,7 @@ def main(job_file: str) -> int:
             for name, number in job["drop"]:  # observations: an image's name and its feature's number
                 if model.images[by_name[name]].points2D[number].has_point3D():
                     model.delete_observation(by_name[name], number)
-            adjust(model, job, STEPS)
+            adjust(model, job, SETTINGS.steps)
             save(model, work / "result.npz")
     say("done", cpu=time.process_time())
     return 0

@@ -20,7 +20,7 @@ from neeco.base.files import write_unsynced
 from neeco.capture.images import encoded_rgb, open_image, write_labels
 from neeco.capture.model import evenly_spaced
 from neeco.geometry.lens import Lens
-from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
+from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
 from neeco.ingest.cameras.tissue_surface import TissueSurface, epipolar_error, surface_behind, surface_from_stereo
 from neeco.ingest.foreground.background import Background, find_background
 from neeco.ingest.foreground.masks import moving_masks
@@ -167,7 +167,7 @@ def read_right_camera(
     folder.mkdir(exist_ok=True)
     sample = sorted(rows)
     border = find_border(
-        image for _, image in video.read([sample[i] for i in evenly_spaced(len(rows), MAX_BORDER_FRAMES)])
+        image for _, image in video.read([sample[i] for i in evenly_spaced(len(rows), BORDERS.max_frames)])
     )
     visible = None if border is None else lens.undistort_mask(visible_mask(border, video.size))
     mask = None if visible is None else folder / "visible.png"

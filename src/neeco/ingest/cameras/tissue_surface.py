@@ -20,18 +20,28 @@ from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project
 from neeco.ingest.foreground.rough_shape import RoughShape
 
-SPACING_PX = 3  # px, of a reduced image, between points of the tissue
-CELL_PX = 4  # px, of a reduced image, of the grid on which surfaces are smoothed
-STIFFNESS = 30.0  # weight of bending against that of what was measured in a cell
-BEHIND_RATIO = 1.5  # depth of the tissue over that of an instrument, whose rough shape lacks what opens and closes
-MIN_INVERSE_RATIO = 0.75  # of the least inverse depth at which an instrument was
-PULL_WEIGHT = 1e-3  # towards the instruments, in cells where the tissue may be farther
-MAX_ROUNDS = 30  # in which instruments behind the surface are found
-MIN_DEPTH_MM = 20.0  # mm from a stereo scope, where the tissue is not
-MIN_MATCHED = 0.2  # share of the image, for depth from stereo
-MAX_FEATURES, MIN_MATCHES = 2000, 30  # of two backgrounds, for their epipolar geometry
-MAX_DISTANCE_RATIO = 0.75  # of the best match's descriptor to the second best's (Lowe 2004)
-MAX_DEVIATION = 0.15  # of a matched depth from its surroundings', relative
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceSettings:
+    """Settings of the surface of tissue behind instruments."""
+
+    spacing_px: int = 3  # px, of a reduced image, between points of the tissue
+    cell_px: int = 4  # px, of a reduced image, of the grid on which surfaces are smoothed
+    stiffness: float = 30.0  # weight of bending against that of what was measured in a cell
+    # depth of the tissue over that of an instrument, whose rough shape lacks what opens and closes
+    behind_ratio: float = 1.5
+    min_inverse_ratio: float = 0.75  # of the least inverse depth at which an instrument was
+    pull_weight: float = 1e-3  # towards the instruments, in cells where the tissue may be farther
+    max_rounds: int = 30  # in which instruments behind the surface are found
+    min_depth_mm: float = 20.0  # mm from a stereo scope, where the tissue is not
+    min_matched: float = 0.2  # share of the image, for depth from stereo
+    max_features: int = 2000  # of two backgrounds, for their epipolar geometry
+    min_matches: int = 30  # of these features
+    max_distance_ratio: float = 0.75  # of the best match's descriptor to the second best's (Lowe 2004)
+    max_deviation: float = 0.15  # of a matched depth from its surroundings', relative
+
+
+SETTINGS = SurfaceSettings()
 
 
 @dataclass(frozen=True)
@@ -50,9 +60,8 @@ class TissueSurface:
         """
         height, width = colors.shape[:2]
         scale = width / self.depth.shape[1]
-        v, u = np.mgrid[
-            SPACING_PX / 2 : self.depth.shape[0] : SPACING_PX, SPACING_PX / 2 : self.depth.shape[1] : SPACING_PX
-        ]
+        step = SETTINGS.spacing_px
+        v, u = np.mgrid[step / 2 : self.depth.shape[0] : step, step / 2 : self.depth.shape[1] : step]
         u, v = u.ravel(), v.ravel()
         depth = self.depth[v.astype(int), u.astype(int)]
         x, y = np.minimum(u * scale, width - 0.5), np.minimum(v * scale, height - 0.5)
@@ -75,14 +84,14 @@ def surface_behind(
     width, height = pinhole.size
     bound = _deepest_instrument(shapes, pinhole)
     if not bound.any():
-        flat = (otherwise if deepest is None else BEHIND_RATIO * deepest) * np.ones((height, width))
+        flat = (otherwise if deepest is None else SETTINGS.behind_ratio * deepest) * np.ones((height, width))
         how = (
             f"not known and taken to be {otherwise:.0f} mm, as nothing says where an instrument was"
             if deepest is None
             else f"not known; a plane well behind the deepest recorded pose ({deepest:.0f} mm) stands for it"
         )
         return TissueSurface(flat, how)
-    inverse = _smoothest_behind(1 / (BEHIND_RATIO * np.where(bound > 0, bound, np.inf)))
+    inverse = _smoothest_behind(1 / (SETTINGS.behind_ratio * np.where(bound > 0, bound, np.inf)))
     depth = 1 / cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
     low, high = np.quantile(depth, (0.05, 0.95))
     how = f"not measured: a smooth surface well behind all places of the instruments ({low:.0f} to {high:.0f} mm)"
@@ -92,14 +101,14 @@ def surface_behind(
 def _deepest_instrument(shapes: Iterable[tuple[RoughShape, np.ndarray]], pinhole: Lens) -> np.ndarray:
     """Greatest depth [rows, columns] mm of the middle of an instrument in each cell; 0 where none was."""
     assert pinhole.size is not None
-    columns, rows = -(-pinhole.size[0] // CELL_PX), -(-pinhole.size[1] // CELL_PX)
+    columns, rows = -(-pinhole.size[0] // SETTINGS.cell_px), -(-pinhole.size[1] // SETTINGS.cell_px)
     bound = np.zeros((rows, columns))
     for shape, poses in shapes:
         for pose in poses:
             points = shape.points @ pose[:3, :3].T + pose[:3, 3]
             x, y = project(points, *pinhole.intrinsics, nearest=1.0)
             with np.errstate(invalid="ignore"):
-                column, row = np.floor(x / CELL_PX), np.floor(y / CELL_PX)
+                column, row = np.floor(x / SETTINGS.cell_px), np.floor(y / SETTINGS.cell_px)
                 inside = (points[:, 2] > 1) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
             cell = row[inside].astype(int) * columns + column[inside].astype(int)
             count = np.bincount(cell, minlength=rows * columns)
@@ -114,14 +123,15 @@ def _smoothest_behind(most: np.ndarray) -> np.ndarray:
     it, or near the least of all: cells at which the surface would come before an instrument hold it back, until none
     does."""
     known = most > 0
-    wanted, weight = np.where(known, most, most[known].min()), np.full(most.shape, PULL_WEIGHT)
-    for _ in range(MAX_ROUNDS):
+    wanted, weight = np.where(known, most, most[known].min()), np.full(most.shape, SETTINGS.pull_weight)
+    for _ in range(SETTINGS.max_rounds):
         found = _smoothed(wanted, weight)
         before = known & (found > most * 1.001) & (weight < 1)
         if not before.any():
             break
         weight[before] = 1.0
-    return np.maximum(found, MIN_INVERSE_RATIO * most[known].min())  # beyond all that is known it may bend to infinity
+    # beyond all that is known it may bend to infinity
+    return np.maximum(found, SETTINGS.min_inverse_ratio * most[known].min())
 
 
 def _smoothed(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -130,7 +140,7 @@ def _smoothed(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     across, down = (sparse.kron(sparse.eye(rows), _bend(columns)), sparse.kron(_bend(rows), sparse.eye(columns)))
     twist = sparse.kron(_step(rows), _step(columns))
     plate = across.T @ across + down.T @ down + 2 * twist.T @ twist
-    system = sparse.diags(weight.ravel()) + STIFFNESS * weight.mean() * plate
+    system = sparse.diags(weight.ravel()) + SETTINGS.stiffness * weight.mean() * plate
     return np.asarray(spsolve(system.tocsc(), (weight * values).ravel())).reshape(rows, columns)
 
 
@@ -157,17 +167,17 @@ def surface_from_stereo(
     """
     depth = _matched_depth(left, right, pinholes, right_from_left)
     depth[~seen] = np.nan
-    if np.isfinite(depth).mean() < MIN_MATCHED:
+    if np.isfinite(depth).mean() < SETTINGS.min_matched:
         return None
-    columns, rows = -(-size[0] // CELL_PX), -(-size[1] // CELL_PX)
+    columns, rows = -(-size[0] // SETTINGS.cell_px), -(-size[1] // SETTINGS.cell_px)
     inverse = _in_cells(1 / depth, rows, columns)
     for _ in range(2):  # what is far from its surroundings was matched wrongly
         weight = np.isfinite(inverse).astype(float)
         smooth = _smoothed(np.where(weight > 0, inverse, 0.0), weight)
-        inverse[np.abs(inverse / smooth - 1) > MAX_DEVIATION] = np.nan
+        inverse[np.abs(inverse / smooth - 1) > SETTINGS.max_deviation] = np.nan
     filled = cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR)
     fine = 1 / cv2.resize(_median_filled(depth), size, interpolation=cv2.INTER_NEAREST)
-    fine = np.where(np.abs(fine / filled - 1) < MAX_DEVIATION, fine, filled)
+    fine = np.where(np.abs(fine / filled - 1) < SETTINGS.max_deviation, fine, filled)
     share, far = float(weight.mean()), 1 / np.quantile(fine, (0.95, 0.05))
     return TissueSurface(
         1 / fine, f"from the stereo partner, {share:.0%} of the image ({far[0]:.0f} to {far[1]:.0f} mm)", True
@@ -183,16 +193,16 @@ def epipolar_error(
     It shows cameras that are turned against each other otherwise than stated, but no wrong baseline and no turn about
     the vertical, which only make the depth another one. pinholes, right_from_left as in `surface_from_stereo`.
     """
-    sift: Any = cv2.SIFT.create(MAX_FEATURES)
+    sift: Any = cv2.SIFT.create(SETTINGS.max_features)
     (points, descriptors), (others, of_right) = (
         sift.detectAndCompute(cv2.cvtColor(np.clip(image, 0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY), None)
         for image in (left, right)
     )
-    if descriptors is None or of_right is None or min(len(descriptors), len(of_right)) < MIN_MATCHES:
+    if descriptors is None or of_right is None or min(len(descriptors), len(of_right)) < SETTINGS.min_matches:
         return None
     pairs = cv2.BFMatcher().knnMatch(descriptors, of_right, k=2)
-    good = [first for first, second in pairs if first.distance < MAX_DISTANCE_RATIO * second.distance]
-    if len(good) < MIN_MATCHES:
+    good = [first for first, second in pairs if first.distance < SETTINGS.max_distance_ratio * second.distance]
+    if len(good) < SETTINGS.min_matches:
         return None
     # OpenCV counts from the first pixel's centre
     seen = np.array([[*points[match.queryIdx].pt, *others[match.trainIdx].pt] for match in good]) + 0.5
@@ -244,7 +254,7 @@ def _matched_depth(
         maps = cv2.initUndistortRectifyMap(matrix, none, turn, new[:3, :3], (width, height), cv2.CV_32FC1)
         views.append(cv2.remap(np.clip(np.rint(image), 0, 255).astype(np.uint8), *maps, cv2.INTER_LINEAR))
     length = abs(float(new_right[0, 3]))  # focal length times baseline, px mm
-    most = int(np.ceil(length / MIN_DEPTH_MM / 16)) * 16
+    most = int(np.ceil(length / SETTINGS.min_depth_mm / 16)) * 16
     block = 5 if width < 800 else 7
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,

@@ -15,15 +15,14 @@ import torch
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_unsynced
-from neeco.capture.images import VISIBLE_MM, VISIBLE_RAD, encoded_rgb, is_repeated, open_image, write_labels
+from neeco.capture.images import PIXELS, encoded_rgb, is_repeated, open_image, write_labels
 from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
 from neeco.geometry.lens import Border, Lens
-from neeco.ingest.calibration.lens import MAX_BORDER_FRAMES, find_border, visible_mask
+from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.timing.episodes import Episodes
 
-MIN_POINT_IMAGES, MAX_POINT_ERROR_PX = 4, 1.2  # of points that are tissue: images that observe them, and misfit
 StageProgress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
 
 
@@ -43,7 +42,7 @@ class SfmResult:
 
     def reliable_points(self) -> np.ndarray:
         """Return [P] bool: observed by enough images and well fitted."""
-        return (self.lengths >= MIN_POINT_IMAGES) & (self.errors < MAX_POINT_ERROR_PX)
+        return (self.lengths >= SETTINGS.min_point_images) & (self.errors < SETTINGS.max_point_error_px)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -92,6 +91,8 @@ class ChoiceSettings:
     thumbnail_px: int = 64  # width
     min_repeated: int = 5  # repeated pictures that are worth a note where no state contradicts them
     aspect_tolerance: float = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
+    min_point_images: int = 4  # that observe points that are tissue
+    max_point_error_px: float = 1.2  # misfit of such points
 
 
 SETTINGS = ChoiceSettings()
@@ -134,7 +135,8 @@ def frozen_frames(features: FrameFeatures, usable: np.ndarray, states: np.ndarra
     """Return the frames whose picture repeats an earlier one, though the state changed since; see `choose_frames`."""
     source = np.maximum.accumulate(np.where(features.repeats, 0, np.arange(len(states))))
     change = states - states[source]
-    moved = (np.linalg.norm(change[:, :3], axis=1) > VISIBLE_MM) | (np.linalg.norm(change[:, 3:], axis=1) > VISIBLE_RAD)
+    shifts, turns = np.linalg.norm(change[:, :3], axis=1), np.linalg.norm(change[:, 3:], axis=1)
+    moved = (shifts > PIXELS.visible_mm) | (turns > PIXELS.visible_rad)
     return np.flatnonzero(moved & usable & usable[source])
 
 
@@ -277,7 +279,7 @@ def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> Chos
     size = data.video.size
     images = ChosenImages(folder=folder, size=size, lens=lens, selected=selected, dropped=dropped, border=None)
     _write(images, data.video, progress)
-    sample = selected[evenly_spaced(len(selected), MAX_BORDER_FRAMES, floor=True)]
+    sample = selected[evenly_spaced(len(selected), BORDERS.max_frames, floor=True)]
     border = find_border(image for _, image in data.video.read(sample.tolist()))
     if border is not None:
         dark = 1 - visible_mask(border, size).mean()

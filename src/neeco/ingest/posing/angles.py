@@ -45,11 +45,10 @@ class AngleSettings:
     joint_sd_scale: float = 0.5  # of the posterior: the priors above leave room for any instrument
     shape_scale: float = 0.8  # of the median distance between two silhouettes
     jitter: float = 1e-6  # rad^2, so that covariances can be inverted
+    hand_sd_deg: float = 3.5  # of a hand-posed angle
 
 
 SETTINGS = AngleSettings()
-
-HAND_SD_DEG = 3.5  # of a hand-posed angle
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +71,7 @@ class AnglePosterior:
     def with_answer(self, frame: int) -> AnglePosterior:
         """Return the posterior with one more hand-posed frame; the values stay."""
         column = self.covariance[:, frame]
-        gained = np.outer(column, column) / (column[frame] + np.radians(HAND_SD_DEG) ** 2)
+        gained = np.outer(column, column) / (column[frame] + np.radians(SETTINGS.hand_sd_deg) ** 2)
         return AnglePosterior(self.values, self.covariance - gained)
 
 
@@ -103,8 +102,8 @@ def _chained(
     covariance = SETTINGS.roll_sd**2 * _correlation(times, SETTINGS.correlation_s) + SETTINGS.mean_sd**2
     precision = np.linalg.inv(covariance + SETTINGS.jitter * np.eye(len(times)))
     pull = np.zeros(len(times))
-    np.add.at(precision, (frames, frames), np.radians(HAND_SD_DEG) ** -2)
-    np.add.at(pull, frames, (angles - center) * np.radians(HAND_SD_DEG) ** -2)
+    np.add.at(precision, (frames, frames), np.radians(SETTINGS.hand_sd_deg) ** -2)
+    np.add.at(pull, frames, (angles - center) * np.radians(SETTINGS.hand_sd_deg) ** -2)
     rolls = np.linalg.solve(precision, pull)
     own = np.eye(len(times)) * np.radians(SETTINGS.texture_sd_deg) ** -2
     shown, known, share = rolls, precision, 1.0
@@ -146,7 +145,7 @@ def solve_joint(
         return AnglePosterior(_within(opening * SETTINGS.width_sd, limits), SETTINGS.joint_sd_scale**2 * covariance)
     center = angles.mean()
     covariance += 0.5
-    answered = covariance[np.ix_(frames, frames)] + np.eye(len(frames)) * np.radians(HAND_SD_DEG) ** 2
+    answered = covariance[np.ix_(frames, frames)] + np.eye(len(frames)) * np.radians(SETTINGS.hand_sd_deg) ** 2
     gain = np.linalg.solve(answered, covariance[frames]).T
     left = covariance - gain @ covariance[frames]
     return AnglePosterior(_within(center + gain @ (angles - center), limits), SETTINGS.joint_sd_scale**2 * left)

@@ -27,7 +27,7 @@ from neeco.capture.documents import Node
 from neeco.capture.model import UNKNOWN_DEG, Capture, Instrument
 from neeco.capture.readers import read_capture
 from neeco.ingest.posing.along_shaft import Load, Shafts
-from neeco.ingest.posing.angles import HAND_SD_DEG, AnglePosterior, chain_breaks, solve_joint, solve_rolls
+from neeco.ingest.posing.angles import SETTINGS, AnglePosterior, chain_breaks, solve_joint, solve_rolls
 from neeco.ingest.posing.measurements import Measurements, measure, read_measurements, write_measurements
 from neeco.ingest.recording.sections import Name
 
@@ -218,9 +218,9 @@ class SolvedPosing:
                 if earlier is not None and abs(apart := half_turn(angle - _angle(earlier, what))) > POSING.outlier_deg:
                     found.append(OutlierAnswer(frame, what, apart, "an earlier answer"))
                 # leaving one answer out of a Gaussian posterior
-                left = max(1 - (float(solved.deviations[frame]) / math.radians(HAND_SD_DEG)) ** 2, 0.02)
+                left = max(1 - (float(solved.deviations[frame]) / math.radians(SETTINGS.hand_sd_deg)) ** 2, 0.02)
                 apart = half_turn(angle - math.degrees(solved.values[frame])) / left
-                far = abs(apart) * math.sqrt(left) / HAND_SD_DEG
+                far = abs(apart) * math.sqrt(left) / SETTINGS.hand_sd_deg
                 if len(self.answers) >= POSING.min_answers and abs(apart) > POSING.outlier_deg and far > least:
                     worst, least = OutlierAnswer(frame, what, half_turn(apart), "what its neighbours say"), far
             found += [] if worst is None else [worst]

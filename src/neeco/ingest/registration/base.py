@@ -36,7 +36,7 @@ from neeco.ingest.registration.silhouette_model import (
     sides,
     step_between,
 )
-from neeco.ingest.registration.silhouette_search import SEARCH, distance_to, search_bases
+from neeco.ingest.registration.silhouette_search import COARSE, distance_to, search_bases
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +194,7 @@ def find_base(
     best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
     radius = float(np.median(best.shape[len(best.shape) // 2 :, 0, 0]))
     if not BASES.radius_range_mm[0] < radius < BASES.radius_range_mm[1]:
-        best = refine(few, known, resized(few, best, SEARCH.typical_radius_mm / radius))
+        best = refine(few, known, resized(few, best, COARSE.typical_radius_mm / radius))
     best = _best_size(few, known, best)
     fit = fit_silhouettes(problem, known, best, RIGID_FIT.widths_px[-2:])
     problem, fit = with_marks(problem, fit)

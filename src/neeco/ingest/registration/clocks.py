@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,9 +21,17 @@ from neeco.ingest.timing.clock_search import (
 )
 from neeco.ingest.timing.episodes import Episode, Episodes
 
-CONTRADICTION_SD = 4.0  # standard deviations by which two clocks differ
-INSTRUMENT_SLACK = 0.1  # s by which an instrument's outline may move earlier or later than its tracked frame
-LARGE_RATE = 0.003  # from 1: no clock is that fast; frame rates are mistaken by more
+
+@dataclass(frozen=True, kw_only=True)
+class ClockSettings:
+    """Limits of the clocks of one recording."""
+
+    contradiction_sd: float = 4.0  # standard deviations by which two clocks differ
+    instrument_slack: float = 0.1  # s by which an instrument's outline may move earlier or later than its tracked frame
+    large_rate: float = 0.003  # from 1: no clock is that fast; frame rates are mistaken by more
+
+
+CLOCKS = ClockSettings()
 
 
 def register(data: Episodes, views: Views) -> tuple[Episodes, Registration | None]:
@@ -104,8 +112,8 @@ def _compare(data: Episodes, episode: int, name: str, found: ClockOffset | None,
     sentence, takes_motion = "", False
     if found is not None:
         off = found.at(times) - stated.at(times)
-        slack = max(CONTRADICTION_SD * found.sd, float(np.median(np.diff(data.parts[episode].times))) / 2)
-        slack = max(slack, INSTRUMENT_SLACK) if found.source == INSTRUMENT_MOTION else slack
+        slack = max(CLOCKS.contradiction_sd * found.sd, float(np.median(np.diff(data.parts[episode].times))) / 2)
+        slack = max(slack, CLOCKS.instrument_slack) if found.source == INSTRUMENT_MOTION else slack
         if off.min() > slack or off.max() < -slack:
             sentence = (
                 f"sync: {name}: {1000 * stated.seconds:.1f} ms contradicts what moves in the images, which gives "
@@ -125,14 +133,14 @@ def _take(data: Episodes, episode: int, name: str, found: ClockOffset) -> Episod
     """
     part, sentence = data.parts[episode], ""
     clocks = {name: found}
-    if abs(found.rate - 1) > max(LARGE_RATE, CONTRADICTION_SD * found.rate_sd):
+    if abs(found.rate - 1) > max(CLOCKS.large_rate, CLOCKS.contradiction_sd * found.rate_sd):
         for other, clock in part.clocks.items():
             if other != name and clock.source in (GIVEN, ASSUMED):
                 clocks[other] = replace(clock, rate=found.rate)
         fps = 1 / float(np.median(np.diff(part.times)))
         fits, own, says = fps / found.rate, part.video.own_fps, ""
         if own is not None:
-            fits = own if abs(fits / own - 1) < CONTRADICTION_SD * found.rate_sd else fits
+            fits = own if abs(fits / own - 1) < CLOCKS.contradiction_sd * found.rate_sd else fits
             says = f"; {part.video.path.name} itself says {own:.4g}"
         fast = fits / fps - 1
         sentence = (

@@ -22,7 +22,7 @@ from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.recording.model import IngestSettings
-from neeco.ingest.timing.clock_search import SCOPE_MOTION, SEARCH, ClockOffset, clock_from_turning
+from neeco.ingest.timing.clock_search import CLOCK, SCOPE_MOTION, ClockOffset, clock_from_turning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +114,7 @@ def register_with_laparoscope(
 
     From a closed form all unknowns are refined under a soft-L1 loss, the tracker's slow drift among them: left out, it
     (a few tenths of a mm over seconds) is taken for scope motion and bends the scale by percents. A known clock is
-    kept; else it is estimated, with a rate where that differs from 1 by SEARCH.rate_significance. Raises
+    kept; else it is estimated, with a rate where that differs from 1 by CLOCK.rate_significance. Raises
     NeecoError when the scope moved too little.
     """
     clock = clock_from_turning(world_from_camera, times, log) if known is None else known
@@ -125,7 +125,7 @@ def register_with_laparoscope(
         solution, covariances = problem.solve(problem.start, ())
         sd = _clock_deviations(covariances)
         rate = clock.rate * (1 + solution[STRETCH])
-        if abs(rate - 1) < SEARCH.rate_significance * clock.rate * sd[1]:
+        if abs(rate - 1) < CLOCK.rate_significance * clock.rate * sd[1]:
             solution[STRETCH], rate = 1 / clock.rate - 1, 1.0
             solution, covariances = problem.solve(solution, (STRETCH,))
             sd = _clock_deviations(covariances)

@@ -45,7 +45,7 @@ class SilhouetteSearchSettings:
     far_cost: float = 1e9  # of a base behind the cameras
 
 
-SEARCH = SilhouetteSearchSettings()
+COARSE = SilhouetteSearchSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -109,7 +109,7 @@ def rotations_about(center: np.ndarray, sd_rad: float, count: int, generator: np
 def distance_to(problem: LoggedSilhouettes, known: BasePrior) -> float:
     """Approximate mm from the cameras to the instrument: by the prior, else by a shaft of typical size."""
     half = float(np.median([mask.max() for mask in problem.silhouettes.distances]))
-    guess = SEARCH.typical_radius_mm * problem.silhouettes.intrinsics[0] / max(half, 0.5)
+    guess = COARSE.typical_radius_mm * problem.silhouettes.intrinsics[0] / max(half, 0.5)
     if known.sd_mm is None:
         return guess
     place = problem.pivot(known.world_from_base)
@@ -128,12 +128,12 @@ def search_bases(
     """The best bases by lines (the masks' shafts where None) and tips of the masks. distance: as `distance_to` has it;
     stated: what links say of the shaft (see `ShaftViews`)."""
     if known.sd_rad is None or known.sd_mm is None:
-        rotations = uniform_rotations(SEARCH.n_uniform, generator)
+        rotations = uniform_rotations(COARSE.n_uniform, generator)
         cameras = np.linalg.inv(problem.camera_from_world)  # the instrument is where most of them look
         center, sd_mm, step = (cameras[:, :3, 3] + distance * cameras[:, :3, 2]).mean(0), distance, 0.2
     else:
         given = known.world_from_base
-        rotations = rotations_about(given[:3, :3], known.sd_rad, SEARCH.n_rotations, generator)
+        rotations = rotations_about(given[:3, :3], known.sd_rad, COARSE.n_rotations, generator)
         center, sd_mm, step = problem.pivot(given), known.sd_mm, 0.5 * known.sd_rad
     views = ShaftViews(
         lines=problem.silhouettes.shafts if lines is None else lines,
@@ -146,24 +146,24 @@ def search_bases(
         **stated,
     )
     found = search(views, rotations, generator, step)
-    return found.take(np.flatnonzero(found.costs < SEARCH.max_start_cost))
+    return found.take(np.flatnonzero(found.costs < COARSE.max_start_cost))
 
 
 def search(views: ShaftViews, rotations: np.ndarray, generator: np.random.Generator, first_step: float) -> Candidates:
     """The best bases, different from each other, after narrowing down around the best rotations [B, 3, 3]; first_step
     rad: between these."""
-    best = _solve_all(views, rotations).distinct(SEARCH.n_first, first_step)
+    best = _solve_all(views, rotations).distinct(COARSE.n_first, first_step)
     step = first_step
-    while step > SEARCH.min_step_rad:
-        around = [rotations_about(base[:3, :3], step, SEARCH.n_around, generator) for base in best.world_from_base]
+    while step > COARSE.min_step_rad:
+        around = [rotations_about(base[:3, :3], step, COARSE.n_around, generator) for base in best.world_from_base]
         step /= 2
-        best = _solve_all(views, np.concatenate(around)).distinct(SEARCH.n_next, step)
-    return best.distinct(SEARCH.n_best, SEARCH.distinct_rad)
+        best = _solve_all(views, np.concatenate(around)).distinct(COARSE.n_next, step)
+    return best.distinct(COARSE.n_best, COARSE.distinct_rad)
 
 
 def _solve_all(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     """The best base and instrument for each rotation, the cheapest first."""
-    parts = [_solve(views, rotations[first : first + SEARCH.chunk]) for first in range(0, len(rotations), SEARCH.chunk)]
+    parts = [_solve(views, rotations[first : first + COARSE.chunk]) for first in range(0, len(rotations), COARSE.chunk)]
     found = [np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)]
     order = np.argsort(found[0], kind="stable")
     return Candidates(*(values[order] for values in found))
@@ -193,13 +193,13 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     across = unit(np.cross(tip_rays, cameras[:, :3, 0]))
     # equations [F, 3, 3] that are 0 where the tip projects onto its place, and onto its line
     rows = np.stack([across, unit(np.cross(tip_rays, across)), normals], 1)
-    scale = (fx + fy) / 2 / distance / np.array([SEARCH.tip_sd_px, SEARCH.tip_sd_px, SEARCH.line_sd_px])
+    scale = (fx + fy) / 2 / distance / np.array([COARSE.tip_sd_px, COARSE.tip_sd_px, COARSE.line_sd_px])
     given = np.stack([has_tip, has_tip, has_line], -1)
 
     count = len(rotations)
     along = np.einsum("fi,bfij->bfj", normals, turned)  # [B, F, 3]
     towards = np.einsum("fi,bfij->bfj", unit(rays(on_line)), turned)
-    sideways = SEARCH.sideways_weight * np.einsum("bfi,bfj->bij", towards, towards)
+    sideways = COARSE.sideways_weight * np.einsum("bfi,bfj->bij", towards, towards)
     weight = np.broadcast_to(has_line, (count, len(has_line))).astype(float)
     weights = np.broadcast_to(given, (count, *given.shape)).astype(float)
     on_tip = np.einsum("fri,bfij->bfrj", rows, turned)
@@ -211,13 +211,13 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     if views.end is not None:
         wanted[:, :, 2] = np.einsum("fi,bfi->bf", normals, places - ends)
     wanted = wanted * scale
-    tip_sd = SEARCH.tip_sd_mm if views.tips is None else SEARCH.stated_tip_sd_mm
+    tip_sd = COARSE.tip_sd_mm if views.tips is None else COARSE.stated_tip_sd_mm
     prior = np.diag([views.sd_mm**-2.0] * 3 + [tip_sd**-2.0] * 3)
     target = np.append(prior[:3, :3] @ views.center, np.zeros(3))
-    for _ in range(SEARCH.n_rounds):
+    for _ in range(COARSE.n_rounds):
         moments = np.einsum("bf,bfi,bfj->bij", weight, along, along) + sideways
         axes = np.linalg.eigh(moments)[1][:, :, 0] if views.axis is None else np.tile(views.axis, (count, 1))
-        line_off = np.einsum("bfj,bj->bf", along, axes) / SEARCH.line_sd_rad
+        line_off = np.einsum("bfj,bj->bf", along, axes) / COARSE.line_sd_rad
         weight = has_line / (1 + line_off**2)
         matrix = np.einsum("bfr,bfri,bfrj->bij", weights, linear, linear) + prior
         right = np.einsum("bfr,bfri,bfr->bi", weights, linear, wanted) + target
@@ -229,8 +229,8 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
         off = off * (distance / np.maximum(depth, 0.1 * distance))[..., None]  # as pixels
         weights = given / (1 + off**2)
     costs = _mean(line_off**2 / (1 + line_off**2), has_line) + _mean(off**2 / (1 + off**2), given)
-    costs = costs + SEARCH.prior_weight * np.square((shift - views.center) / views.sd_mm).sum(-1)
-    costs = np.where((depth > 0).mean(1) > 0.9, costs, SEARCH.far_cost)
+    costs = costs + COARSE.prior_weight * np.square((shift - views.center) / views.sd_mm).sum(-1)
+    costs = np.where((depth > 0).mean(1) > 0.9, costs, COARSE.far_cost)
     # of the axis' two directions, the one that leads to the tip in most images
     behind = at - 0.1 * distance * np.einsum("bfij,bj->bfi", turned, axes)
     ends = [np.einsum("fij,bfj->bfi", cameras[:, :3, :3].transpose(0, 2, 1), end - places) for end in (at, behind)]
@@ -239,7 +239,7 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     if views.axis is None:
         axes = axes * np.where(agreement >= 0, 1.0, -1.0)[:, None]
     else:
-        costs = np.where(agreement >= 0, costs, SEARCH.far_cost)
+        costs = np.where(agreement >= 0, costs, COARSE.far_cost)
     bases = np.tile(np.eye(4), (count, 1, 1))
     bases[:, :3, :3] = rotations
     bases[:, :3, 3] = shift - rotations @ middle

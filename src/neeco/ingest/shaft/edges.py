@@ -7,6 +7,7 @@ blurs, against tissue that may darken towards it. The edge lies where that fits 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -17,26 +18,54 @@ from neeco.geometry.lines import places_nearest_to_rays, unit
 from neeco.ingest.foreground.masks import MASKS, color_odds
 from neeco.ingest.shaft.axis import Intrinsics, ShaftAxes, ShaftEdges, axis_between, contour_normals, image_lines
 
-# from masks
-STRIP_WIDTH, STRIP_LENGTH = 160, 720  # px of the strip along the shaft that a mask is resampled to
-RANSAC_SAMPLES, INLIER_PX = 200, 1.2  # of two places each; distance from their line
-MAX_SLOPE = 0.35  # of an edge against the middle of the mask
-MIN_LENGTH_PX = 12  # of shaft, for an edge to be detected
-HEAD_MARGIN_PX = 2.0  # before its end, from which the edges count
-PLACES, OUTLINE_SD_PX = 12, 0.7  # on an edge; standard deviation of a mask's edge as a whole
 
-# from shading
-BLOCK_PX = 5  # along the shaft, of one place
-REACH_PX, STEP_PX = 3.0, 0.1  # about the prediction in which an edge is searched for
-INSIDE_PX, OUTSIDE_PX = 9.0, 6.0  # to both sides that are fitted
-MAX_RADIUS_SHARE = 0.6  # that is fitted: the middle has reflections
-SAMPLE_PX, FINE_PX = 0.25, 0.05  # spacing of samples of images and of models
+@dataclass(frozen=True, kw_only=True)
+class EdgeSettings:
+    """Settings of how a shaft's edges, and the end between them, are detected."""
+
+    # from masks
+    strip_width: int = 160  # px of the strip along the shaft that a mask is resampled to
+    strip_length: int = 720  # px, the same along the shaft
+    ransac_samples: int = 200  # of two places each
+    inlier_px: float = 1.2  # distance from their line
+    max_slope: float = 0.35  # of an edge against the middle of the mask
+    min_length_px: int = 12  # of shaft, for an edge to be detected
+    head_margin_px: float = 2.0  # before its end, from which the edges count
+    places: int = 12  # on an edge
+    outline_sd_px: float = 0.7  # standard deviation of a mask's edge as a whole
+    # from shading
+    block_px: int = 5  # along the shaft, of one place
+    reach_px: float = 3.0  # about the prediction in which an edge is searched for
+    step_px: float = 0.1  # of that search
+    inside_px: float = 9.0  # to the inner side that is fitted
+    outside_px: float = 6.0  # to the outer side
+    max_radius_share: float = 0.6  # that is fitted: the middle has reflections
+    sample_px: float = 0.25  # spacing of samples of images
+    fine_px: float = 0.05  # spacing of samples of models
+    blurs: tuple[float, ...] = (0.5, 0.7, 0.9, 1.2)  # standard deviations px of lenses
+    common_sd_px: float = 0.15  # of an edge as a whole, in addition to its noise
+    min_misfit: float = 1.0  # sum of squares of a profile, from noise alone
+    max_places: int = 60  # along an edge
+    max_diameters: int = 30  # behind the shaft's end, up to which it is searched for
+    margin_radii: float = 0.4  # behind the shaft's end, from which on it is searched for
+    # Where a shaft ends and the wrist begins their colours differ, and neither is known. But what enters at the image's
+    # border is shaft in most images that show much of the instrument, and what lies near the tip is not.
+    shaft_share: float = 0.3  # of a long mask's length from the border, at first
+    head_share: float = 0.3  # of its length from the tip, at first
+    long_share: float = 0.5  # of the images, those with the longest masks, from which the colours are learned first
+    border_px: float = 2.0  # from the mask's or the image's ends, within which a tip or an end does not count
+    n_rounds: int = 4
+    end_margin_px: float = 3.0  # about the end found, that belongs to neither colour
+    max_odds: float = 3.0  # absolute logarithm, of one place
+    dark: float = 12.0  # of 255, added before logarithms
+    # logarithms: red of green, green of blue, lightness
+    tint_ranges: tuple[tuple[float, float], ...] = ((-0.5, 0.9), (-0.3, 0.5), (2.4, 5.6))
+    min_contrast: float = 0.5  # difference of the mean odds of shaft and head
+
+
+EDGE = EdgeSettings()
+
 LINEAR_LIGHT = (255 * (np.arange(256) / 255) ** 2.2).astype(np.float32)  # of the values of an image
-BLURS = (0.5, 0.7, 0.9, 1.2)  # standard deviations px of lenses
-SYSTEMATIC_SD_PX = 0.15  # of an edge as a whole, in addition to its noise
-MIN_MISFIT = 1.0  # sum of squares of a profile, from noise alone
-MAX_PLACES = 60  # along an edge
-MAX_DIAMETERS, MARGIN_RADII = 30, 0.4  # behind the shaft's end, between which it is searched for
 
 
 def outline_edges(
@@ -51,7 +80,7 @@ def outline_edges(
     random = np.random.default_rng(0)
     count = len(masks)
     points, axes = np.tile([0.0, 0.0, 1.0], (2, count, 1))
-    pixels, deviations = np.zeros((count, 2, PLACES, 2)), np.full((count, 2, PLACES), np.inf)
+    pixels, deviations = np.zeros((count, 2, EDGE.places, 2)), np.full((count, 2, EDGE.places), np.inf)
     found = np.zeros(count, dtype=bool)
     for frame in np.flatnonzero(np.isfinite(ends[:, 0])):
         both = _both_edges(masks[frame], ends[frame], directions[frame], random)
@@ -63,7 +92,7 @@ def outline_edges(
         if not np.isfinite(point).all() or point[2] <= radius:
             continue
         points[frame], axes[frame], pixels[frame] = point, axis, places
-        deviations[frame] = OUTLINE_SD_PX * np.sqrt(PLACES)
+        deviations[frame] = EDGE.outline_sd_px * np.sqrt(EDGE.places)
         found[frame] = True
     return ShaftAxes(points=points, directions=axes), ShaftEdges(pixels, deviations), found
 
@@ -71,14 +100,14 @@ def outline_edges(
 def _both_edges(
     mask: np.ndarray, end: np.ndarray, direction: np.ndarray, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Places [2, PLACES, 2] px on both edges of a shaft that ends about `end` px and goes along `direction`, the end on
+    """Places [2, P, 2] px on both edges of a shaft that ends about `end` px and goes along `direction`, the end on
     the line midway, and that line's direction. None: there are none."""
-    places = np.zeros((2, PLACES, 2))
+    places = np.zeros((2, EDGE.places, 2))
     for _ in range(2):  # the second time about the shaft's own middle
         aside = np.array([-direction[1], direction[0]])
         along, left, right = _outline(mask, end, direction)
-        behind = along < -HEAD_MARGIN_PX
-        if behind.sum() < MIN_LENGTH_PX:
+        behind = along < -EDGE.head_margin_px
+        if behind.sum() < EDGE.min_length_px:
             return None
         x = along[behind]
         weights = np.clip(1.2 - (x - x[0]) / max(float(np.ptp(x)), 1.0), 0.2, None)  # masks are best far from the head
@@ -87,7 +116,7 @@ def _both_edges(
         if fits[0] is None or fits[1] is None:
             return None
         lines = np.array([fits[0], fits[1]])  # slope, offset
-        reach = np.linspace(x[0], x[-1], PLACES)[:, None]
+        reach = np.linspace(x[0], x[-1], EDGE.places)[:, None]
         places = np.stack([end + reach * direction + (slope * reach + offset) * aside for slope, offset in lines])
         slope, offset = lines.mean(0)
         end = end + offset * aside
@@ -99,17 +128,17 @@ def _outline(mask: np.ndarray, point: np.ndarray, direction: np.ndarray) -> tupl
     """Outline of the mask left and right of a line through `point` px along `direction`: places along it, from behind
     to the tip, and both offsets across it, px; only where both lie in the image."""
     aside = np.array([-direction[1], direction[0]])
-    x = np.arange(STRIP_LENGTH) - STRIP_LENGTH / 2
-    y = np.arange(STRIP_WIDTH) - STRIP_WIDTH / 2
+    x = np.arange(EDGE.strip_length) - EDGE.strip_length / 2
+    y = np.arange(EDGE.strip_width) - EDGE.strip_width / 2
     places = (point + x[None, :, None] * direction + y[:, None, None] * aside - 0.5).astype(np.float32)
     level = cv2.remap(mask.astype(np.float32), places[..., 0], places[..., 1], cv2.INTER_LINEAR)
     height, width = mask.shape
     shown = (places[..., 0] > 0) & (places[..., 0] < width - 1) & (places[..., 1] > 0) & (places[..., 1] < height - 1)
     on = level > 0.5
-    first, last = on.argmax(0), STRIP_WIDTH - 1 - on[::-1].argmax(0)
-    column = np.arange(STRIP_LENGTH)
-    good = on.any(0) & (first > 0) & (last < STRIP_WIDTH - 1)
-    before, after = np.maximum(first - 1, 0), np.minimum(last + 1, STRIP_WIDTH - 1)
+    first, last = on.argmax(0), EDGE.strip_width - 1 - on[::-1].argmax(0)
+    column = np.arange(EDGE.strip_length)
+    good = on.any(0) & (first > 0) & (last < EDGE.strip_width - 1)
+    before, after = np.maximum(first - 1, 0), np.minimum(last + 1, EDGE.strip_width - 1)
     good &= shown[before, column] & shown[after, column]
     low, high = level[before, column], level[first, column]
     left = y[first] - (high - 0.5) / np.maximum(high - low, 1e-6)
@@ -122,17 +151,17 @@ def _line(x: np.ndarray, y: np.ndarray, weights: np.ndarray, random: np.random.G
     """Slope and offset of the line through most of the places x, y [N] px, by weight (RANSAC); None: there is none."""
     if len(x) < 6:
         return None
-    pairs = random.integers(0, len(x), (RANSAC_SAMPLES, 2))
+    pairs = random.integers(0, len(x), (EDGE.ransac_samples, 2))
     pairs = pairs[np.abs(x[pairs[:, 0]] - x[pairs[:, 1]]) > min(8.0, 0.5 * np.ptp(x))]
     slopes = (y[pairs[:, 0]] - y[pairs[:, 1]]) / (x[pairs[:, 0]] - x[pairs[:, 1]])
     offsets = y[pairs[:, 0]] - slopes * x[pairs[:, 0]]
     missed = np.abs(y - slopes[:, None] * x - offsets[:, None])  # [T, N]
-    votes = (weights * np.clip(1 - (missed / INLIER_PX) ** 2, 0, None)).sum(1) * (np.abs(slopes) < MAX_SLOPE)
+    votes = (weights * np.clip(1 - (missed / EDGE.inlier_px) ** 2, 0, None)).sum(1) * (np.abs(slopes) < EDGE.max_slope)
     if not len(votes) or votes.max() <= 0:
         return None
     slope, offset = float(slopes[votes.argmax()]), float(offsets[votes.argmax()])
     for _ in range(3):
-        near = np.abs(y - slope * x - offset) < INLIER_PX
+        near = np.abs(y - slope * x - offset) < EDGE.inlier_px
         if near.sum() < 4:
             return None
         slope, offset = (float(value) for value in np.polyfit(x[near], y[near], 1, w=weights[near]))
@@ -171,7 +200,7 @@ def shaded_edges(
     Returns the edges, how many diameters of shaft each image shows [F], and the profiles' mean squared misfit.
     """
     count = len(images)
-    pixels, deviations = np.zeros((count, 2, MAX_PLACES, 2)), np.full((count, 2, MAX_PLACES), np.inf)
+    pixels, deviations = np.zeros((count, 2, EDGE.max_places, 2)), np.full((count, 2, EDGE.max_places), np.inf)
     diameters, misfits = np.zeros(count), []
     for frame in range(count):
         seen = _visible(axes.points[frame], axes.directions[frame], radius, intrinsics, images.shape[1:3])
@@ -180,17 +209,17 @@ def shaded_edges(
         ends, width = seen
         length = float(np.linalg.norm(ends[1] - ends[0]))
         diameters[frame] = length / width
-        if length < MIN_LENGTH_PX:
+        if length < EDGE.min_length_px:
             continue
         light = LINEAR_LIGHT[images[frame]]  # shading and blur are of light, not of its gamma-coded values
         normals = contour_normals(axes.points[frame], axes.directions[frame], radius)
         for side, line in enumerate(image_lines(normals, intrinsics)):
             places, sds, misfit = _edge(light, ends, line, width / 2, blur)
             misfits += misfit.tolist()
-            keep = evenly_spaced(len(places), MAX_PLACES)
+            keep = evenly_spaced(len(places), EDGE.max_places)
             pixels[frame, side, : len(keep)] = places[keep]
             # an edge has an error as a whole, too: its places are not independent
-            deviations[frame, side, : len(keep)] = np.hypot(sds[keep], SYSTEMATIC_SD_PX * np.sqrt(max(len(keep), 1)))
+            deviations[frame, side, : len(keep)] = np.hypot(sds[keep], EDGE.common_sd_px * np.sqrt(max(len(keep), 1)))
     return ShaftEdges(pixels, deviations), diameters, float(np.mean(misfits)) if misfits else np.inf
 
 
@@ -205,7 +234,7 @@ def _visible(
     None: none of it is in the image."""
     fx, fy, cx, cy = intrinsics
     height, width = size[:2]
-    back = np.linspace(MAX_DIAMETERS * 2, MARGIN_RADII, 400) * radius
+    back = np.linspace(EDGE.max_diameters * 2, EDGE.margin_radii, 400) * radius
     axis = point - back[:, None] * direction
     deep = np.maximum(axis[:, 2], 1e-6)
     places = np.stack([fx * axis[:, 0] / deep + cx, fy * axis[:, 1] / deep + cy], 1)
@@ -233,13 +262,13 @@ def _edge(
     height, width = light.shape[:2]
     shown = (places > 0).all(-1) & (places[..., 0] < width - 1) & (places[..., 1] < height - 1)  # [S, U]
     whole = shown.all(1)
-    blocks = len(foot) // BLOCK_PX
+    blocks = len(foot) // EDGE.block_px
     if not blocks:
         return np.zeros((0, 2)), np.zeros(0), np.zeros(0)
-    cut = blocks * BLOCK_PX
-    whole = whole[:cut].reshape(blocks, BLOCK_PX).all(1)
+    cut = blocks * EDGE.block_px
+    whole = whole[:cut].reshape(blocks, EDGE.block_px).all(1)
     profiles = (
-        np.median(colors[:cut].reshape(blocks, BLOCK_PX, len(offsets), 3), axis=1)[whole] * used[:, None]
+        np.median(colors[:cut].reshape(blocks, EDGE.block_px, len(offsets), 3), axis=1)[whole] * used[:, None]
     )  # [B, U, 3]
     missed = (profiles**2).sum((1, 2))[:, None]
     missed = missed - (np.einsum("euk,buc->bekc", bases, profiles, optimize=True) ** 2).sum((2, 3))  # [B, E]
@@ -249,23 +278,23 @@ def _edge(
     best = np.clip(best, 1, missed.shape[1] - 2)
     low, least, high = missed[row, best - 1], missed[row, best], missed[row, best + 1]
     curvature = np.maximum(low - 2 * least + high, 1e-9)
-    shift = _candidates()[best] + STEP_PX * 0.5 * (low - high) / curvature
-    noise = np.maximum(least, MIN_MISFIT) / (3 * used.sum())
-    independent = SAMPLE_PX  # neighbouring samples are of one pixel
-    sds = np.sqrt(2 * noise / independent * STEP_PX**2 / curvature)
-    centers = foot[:cut].reshape(blocks, BLOCK_PX, 2).mean(1)[whole]
+    shift = _candidates()[best] + EDGE.step_px * 0.5 * (low - high) / curvature
+    noise = np.maximum(least, EDGE.min_misfit) / (3 * used.sum())
+    independent = EDGE.sample_px  # neighbouring samples are of one pixel
+    sds = np.sqrt(2 * noise / independent * EDGE.step_px**2 / curvature)
+    centers = foot[:cut].reshape(blocks, EDGE.block_px, 2).mean(1)[whole]
     found = centers - shift[:, None] * line[:2]
     return found[inner], sds[inner], noise[inner]
 
 
 def _offsets() -> np.ndarray:
     """Offsets [U] px across an edge, outwards, at which images are sampled."""
-    return np.arange(-INSIDE_PX, OUTSIDE_PX + SAMPLE_PX / 2, SAMPLE_PX)
+    return np.arange(-EDGE.inside_px, EDGE.outside_px + EDGE.sample_px / 2, EDGE.sample_px)
 
 
 def _candidates() -> np.ndarray:
     """Offsets [E] px at which an edge may lie."""
-    return np.arange(-REACH_PX, REACH_PX + STEP_PX / 2, STEP_PX)
+    return np.arange(-EDGE.reach_px, EDGE.reach_px + EDGE.step_px / 2, EDGE.step_px)
 
 
 @lru_cache(maxsize=256)
@@ -276,9 +305,9 @@ def _profile_bases(radius_px: float, blur: float) -> tuple[np.ndarray, np.ndarra
     lit by a lamp at the lens, sqrt(1 - t^2) of the share t of its radius.
     """
     offsets = _offsets()
-    used = (offsets >= -max(MAX_RADIUS_SHARE * radius_px, 2.0)).astype(float)
-    fine = np.arange(-INSIDE_PX - 5, OUTSIDE_PX + 5, FINE_PX)
-    reach = np.arange(-4 * blur, 4 * blur + FINE_PX / 2, FINE_PX)
+    used = (offsets >= -max(EDGE.max_radius_share * radius_px, 2.0)).astype(float)
+    fine = np.arange(-EDGE.inside_px - 5, EDGE.outside_px + 5, EDGE.fine_px)
+    reach = np.arange(-4 * blur, 4 * blur + EDGE.fine_px / 2, EDGE.fine_px)
     kernel = np.exp(-0.5 * (reach / blur) ** 2)
     kernel /= kernel.sum()
     bases = []
@@ -290,19 +319,6 @@ def _profile_bases(radius_px: float, blur: float) -> tuple[np.ndarray, np.ndarra
         columns = [np.interp(offsets, fine, np.convolve(part, kernel, "same")) * used for part in parts]
         bases.append(np.linalg.qr(np.stack(columns, 1))[0])
     return np.stack(bases), used
-
-
-# Where a shaft ends and the wrist begins their colours differ, and neither is known. But what enters at the image's
-# border is shaft in most images that show much of the instrument, and what lies near the tip is not.
-SHAFT_SHARE, HEAD_SHARE = 0.3, 0.3  # of a long mask's length from the border, and from the tip, at first
-LONG_SHARE = 0.5  # of the images, those with the longest masks, from which the colours are learned first
-EDGE_PX = 2.0  # from the mask's or the image's ends, within which a tip or an end does not count
-N_ROUNDS = 4
-MARGIN_PX = 3.0  # about the end found, that belongs to neither colour
-MAX_ODDS = 3.0  # absolute logarithm, of one place
-DARK = 12.0  # of 255, added before logarithms
-TINT_RANGES = ((-0.5, 0.9), (-0.3, 0.5), (2.4, 5.6))  # logarithms: red of green, green of blue, lightness
-MIN_CONTRAST = 0.5  # difference of the mean odds of shaft and head
 
 
 def axis_coordinates(axes: ShaftAxes, frame: int, pixels: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
@@ -325,7 +341,7 @@ def tips_along(masks: np.ndarray, axes: ShaftAxes, intrinsics: Intrinsics) -> np
         hull = cv2.convexHull(np.stack([u, v], 1).astype(np.float32))[:, 0] + 0.5
         along = axis_coordinates(axes, frame, hull, intrinsics)
         tip = hull[along.argmax()]
-        if (tip > EDGE_PX).all() and tip[0] < width - EDGE_PX and tip[1] < height - EDGE_PX:
+        if (tip > EDGE.border_px).all() and tip[0] < width - EDGE.border_px and tip[1] < height - EDGE.border_px:
             tips[frame] = along.max()
     return tips
 
@@ -345,17 +361,17 @@ def shaft_ends(images: np.ndarray, masks: np.ndarray, points: np.ndarray, direct
         along = (np.stack([u, v], 1) + 0.5 - points[frame]) @ directions[frame]
         seen[frame] = _tints(images[frame][v, u]), along, float(along.min()), float(along.max())
     lengths = np.array([seen[frame][3] - seen[frame][2] for frame in frames])
-    ranked = np.argsort(-lengths)[: max(1, round(LONG_SHARE * len(frames)))]
+    ranked = np.argsort(-lengths)[: max(1, round(EDGE.long_share * len(frames)))]
     shaft, head = [], []
     for frame in (frames[i] for i in ranked):
         colors, along, first, last = seen[frame]
-        shaft.append(colors[along < first + SHAFT_SHARE * (last - first)])
-        head.append(colors[along > last - HEAD_SHARE * (last - first)])
+        shaft.append(colors[along < first + EDGE.shaft_share * (last - first)])
+        head.append(colors[along > last - EDGE.head_share * (last - first)])
     difference = 0.0
-    for _ in range(N_ROUNDS):
+    for _ in range(EDGE.n_rounds):
         colors = np.concatenate([*shaft, *head])
         is_shaft = np.arange(len(colors)) < sum(map(len, shaft))
-        odds = np.clip(color_odds(colors, is_shaft, ~is_shaft).of_color, -MAX_ODDS, MAX_ODDS)
+        odds = np.clip(color_odds(colors, is_shaft, ~is_shaft).of_color, -EDGE.max_odds, EDGE.max_odds)
         shaft, head = [], []
         for frame in frames:
             own, along, first, last = seen[frame]
@@ -366,25 +382,25 @@ def shaft_ends(images: np.ndarray, masks: np.ndarray, points: np.ndarray, direct
             gained = np.concatenate([[0.0], np.cumsum(mean)])
             best = int(gained.argmax())
             ends[frame] = first + best
-            shaft.append(own[along < ends[frame] - MARGIN_PX])
-            head.append(own[along > ends[frame] + MARGIN_PX])
+            shaft.append(own[along < ends[frame] - EDGE.end_margin_px])
+            head.append(own[along > ends[frame] + EDGE.end_margin_px])
         if not any(map(len, shaft)) or not any(map(len, head)):
             return np.full(len(images), np.nan)
         difference = float(odds[np.concatenate(shaft)].mean() - odds[np.concatenate(head)].mean())
     for frame in frames:
         _, _, first, last = seen[frame]
-        if not first + EDGE_PX < ends[frame] < last - EDGE_PX:
+        if not first + EDGE.border_px < ends[frame] < last - EDGE.border_px:
             ends[frame] = np.nan
-    return ends if difference > MIN_CONTRAST else np.full(len(images), np.nan)
+    return ends if difference > EDGE.min_contrast else np.full(len(images), np.nan)
 
 
 def _tints(pixels: np.ndarray) -> np.ndarray:
     """Colours [N] of pixels uint8 [N, 3], numbered as by `color_levels`, but by tints, which separate greys, and
     lightness."""
-    red, green, blue = np.log(pixels.astype(np.float64) + DARK).T
+    red, green, blue = np.log(pixels.astype(np.float64) + EDGE.dark).T
     light = (red + green + blue) / 3
     level = [
         np.clip((value - low) / (high - low) * MASKS.levels, 0, MASKS.levels - 1).astype(np.int64)
-        for value, (low, high) in zip((red - green, green - blue, light), TINT_RANGES, strict=True)
+        for value, (low, high) in zip((red - green, green - blue, light), EDGE.tint_ranges, strict=True)
     ]
     return np.asarray((level[0] * MASKS.levels + level[1]) * MASKS.levels + level[2])

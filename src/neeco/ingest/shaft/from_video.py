@@ -17,7 +17,7 @@ from neeco.ingest.frames.images import SfmResult, Views, reduced
 from neeco.ingest.recording.model import InstrumentLogs, Recording
 from neeco.ingest.shaft.axis import ShaftAxes, ShaftEdges, ShaftVideo, across_axes, edge_distances, solve_axes
 from neeco.ingest.shaft.edges import (
-    BLURS,
+    EDGE,
     axis_coordinates,
     outline_edges,
     shaded_edges,
@@ -130,13 +130,14 @@ def find_shaft(
     if video.scaled and not known_scale:
         axes = _plausible(axes, tissue)
         notes.append(UNKNOWN_SCALE)
-    diameters, blur = np.zeros(len(images)), BLURS[0]
+    diameters, blur = np.zeros(len(images)), EDGE.blurs[0]
     offset = 0.0  # mm by which the shaft ends before the change of colour
     for turn in range(SHAFT.max_rounds):
         if turn == 0:
             sample = evenly_spaced(len(images), SHAFT.blur_frames)
             few = replace(axes, points=axes.points[sample], directions=axes.directions[sample])
-            blur = min(BLURS, key=lambda px: shaded_edges(images[sample], few, video.radius, video.intrinsics, px)[2])
+            some = images[sample]
+            blur = min(EDGE.blurs, key=lambda px: shaded_edges(some, few, video.radius, video.intrinsics, px)[2])
         edges, diameters, _ = shaded_edges(images, axes, video.radius, video.intrinsics, blur)
         axes = solve_axes(video, axes, edges, covariance=turn == 0)
         if turn == 0 and axes.scale_sd is not None and axes.scale_sd > SHAFT.max_scale_sd:

@@ -38,7 +38,7 @@ class ClockSearchSettings:
     rate_significance: float = 2.0  # standard deviations from 1, at which a rate is taken to differ
 
 
-SEARCH = ClockSearchSettings()
+CLOCK = ClockSearchSettings()
 GIVEN, SCOPE_MOTION, INSTRUMENT_MOTION = "given", "scope motion", "instrument motion"  # sources of clocks
 ASSUMED = "assumed equal to the video's"
 
@@ -85,14 +85,14 @@ def clock_from_turning(world_from_camera: np.ndarray, times: np.ndarray, log: Po
     two never fit, or fit at several offsets.
     """
     _check_span(log)
-    video_grid = np.arange(times[0] + SEARCH.stride_s, times[-1] - SEARCH.stride_s, SEARCH.step_s)
-    log_grid = np.arange(log.times[0] + SEARCH.stride_s, log.times[-1] - SEARCH.stride_s, SEARCH.step_s)
+    video_grid = np.arange(times[0] + CLOCK.stride_s, times[-1] - CLOCK.stride_s, CLOCK.step_s)
+    log_grid = np.arange(log.times[0] + CLOCK.stride_s, log.times[-1] - CLOCK.stride_s, CLOCK.step_s)
     if len(video_grid) < 50 or len(log_grid) < 50:
         raise NeecoError(f"{log.path}: video or log is shorter than a second; give its clock offset in `sync`")
     video = _turning_speed(video_grid, times, Rotation.from_matrix(world_from_camera[:, :3, :3]))
     sensor = _turning_speed(log_grid, log.times, Rotation.from_quat(log.quats, scalar_first=True))
     rate, lags, scores = best_rate(video, sensor)
-    seconds = log_grid[0] + _peak(lags, scores, rate, log) * SEARCH.step_s - rate * video_grid[0]
+    seconds = log_grid[0] + _peak(lags, scores, rate, log) * CLOCK.step_s - rate * video_grid[0]
     return ClockOffset(float(seconds), float("nan"), SCOPE_MOTION, rate)
 
 
@@ -105,12 +105,12 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
     _check_span(log)
     steps = np.diff(times)
     middle, speed = (times[1:] + times[:-1]) / 2, motion / steps
-    grid = np.arange(middle[0], middle[-1], SEARCH.step_s)
-    log_grid = np.arange(log.times[0] + SEARCH.stride_s, log.times[-1] - SEARCH.stride_s, SEARCH.step_s)
+    grid = np.arange(middle[0], middle[-1], CLOCK.step_s)
+    log_grid = np.arange(log.times[0] + CLOCK.stride_s, log.times[-1] - CLOCK.stride_s, CLOCK.step_s)
     if len(grid) < 100 or len(log_grid) < 100:
         raise NeecoError(f"{log.path}: video or log is shorter than two seconds; give its clock offset in `sync`")
-    before, after = (poses_at(log, log_grid + side * SEARCH.step_s) for side in (-1, 1))
-    tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * SEARCH.step_s)
+    before, after = (poses_at(log, log_grid + side * CLOCK.step_s) for side in (-1, 1))
+    tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * CLOCK.step_s)
     tracked = np.sqrt(np.where(before[1] & after[1], tracked, np.nanmedian(tracked)))
     observed = np.sqrt(np.interp(grid, middle, speed))  # roots: a fast stroke must not outweigh all others
     rate, lags, scores = best_rate(observed, tracked)
@@ -118,15 +118,15 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
         rate = _finer_rate(observed, tracked, rate)
         lags, scores = correlate(_stretched(observed, rate), tracked)
     best, length, stretched = _peak(lags, scores, rate, log), grid[-1] - grid[0], _stretched(observed, rate)
-    if (sds := significance(stretched, tracked, best, float(scores.max()))) < SEARCH.min_significance:
+    if (sds := significance(stretched, tracked, best, float(scores.max()))) < CLOCK.min_significance:
         raise NeecoError(
             f"{log.path}: its clock cannot be determined from the images: in so short a recording the best offset's "
             f"correlation of {scores.max():.2f} is {sds:.1f} standard deviations of chance, of "
-            f"{SEARCH.min_significance:g} that are needed; give it in `sync`, or record more motion"
+            f"{CLOCK.min_significance:g} that are needed; give it in `sync`, or record more motion"
         )
     sd = _spread_of_parts(stretched, tracked, best)
     rate_sd = np.sqrt(12) * sd / length if rate != 1 else 0.0  # of a line through offsets spread over the video
-    seconds = log_grid[0] + _vertex(lags, scores) * SEARCH.step_s - rate * grid[0]
+    seconds = log_grid[0] + _vertex(lags, scores) * CLOCK.step_s - rate * grid[0]
     return ClockOffset(float(seconds), sd, INSTRUMENT_MOTION, rate, float(rate_sd))
 
 
@@ -139,15 +139,15 @@ def _spread_of_parts(observed: np.ndarray, tracked: np.ndarray, best: int) -> fl
     found = []
     for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
         near, fit = correlate(observed[part], tracked)
-        around = np.abs((near - part.start - best) * SEARCH.step_s) < SEARCH.lobe_s
+        around = np.abs((near - part.start - best) * CLOCK.step_s) < CLOCK.lobe_s
         if around.any():
             found.append(_vertex(near[around] - part.start, fit[around]))
-    return max(float(np.std(found)) * SEARCH.step_s if len(found) > 1 else SEARCH.lobe_s, SEARCH.step_s / 4)
+    return max(float(np.std(found)) * CLOCK.step_s if len(found) > 1 else CLOCK.lobe_s, CLOCK.step_s / 4)
 
 
 def _check_span(log: PoseLog) -> None:
     """Raise NeecoError when stray stamps make a log too long to search."""
-    if log.times[-1] - log.times[0] > SEARCH.max_length_s:
+    if log.times[-1] - log.times[0] > CLOCK.max_length_s:
         raise NeecoError(
             f"{log.path}: its times span {(log.times[-1] - log.times[0]) / 3600:.3g} h; remove rows with stray times, "
             "or give its clock offset in `sync`"
@@ -160,15 +160,15 @@ def best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, np
     All rates are tried on the segment of most variance; it grows to the whole video while the rates narrow down.
     """
     lags, scores = correlate(video, log)
-    if scores.max(initial=-1.0) > SEARCH.same_motion:
+    if scores.max(initial=-1.0) > CLOCK.same_motion:
         return 1.0, lags, scores
-    size = min(len(video), round(SEARCH.segment_s / SEARCH.step_s))
+    size = min(len(video), round(CLOCK.segment_s / CLOCK.step_s))
     variances = [float(np.var(video[start : start + size])) for start in range(0, len(video) - size + 1, size)]
     centre = int(np.argmax(variances)) * size + size // 2
-    span = np.log(SEARCH.max_rate)
+    span = np.log(CLOCK.max_rate)
     rate = 1.0
     while True:
-        step = SEARCH.rate_mismatch_s / (size * SEARCH.step_s / 2)
+        step = CLOCK.rate_mismatch_s / (size * CLOCK.step_s / 2)
         rates = rate * np.exp(step * np.arange(-round(span / step), round(span / step) + 1))
         start = int(np.clip(centre - size // 2, 0, len(video) - size))
         fits = [correlate(_stretched(video[start : start + size], one), log)[1].max(initial=-1.0) for one in rates]
@@ -177,14 +177,14 @@ def best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, np
             break
         size = min(2 * size, len(video))
     other = correlate(_stretched(video, rate), log)
-    if other[1].max(initial=-1.0) < max(scores.max(initial=-1.0) + SEARCH.rate_lead, SEARCH.rate_correlation):
+    if other[1].max(initial=-1.0) < max(scores.max(initial=-1.0) + CLOCK.rate_lead, CLOCK.rate_correlation):
         return 1.0, lags, scores
     return rate, *other
 
 
 def _finer_rate(video: np.ndarray, log: np.ndarray, rate: float) -> float:
     """Return the rate near a coarse one at which the correlation has its vertex."""
-    step = SEARCH.rate_mismatch_s / (len(video) * SEARCH.step_s / 2) / 4
+    step = CLOCK.rate_mismatch_s / (len(video) * CLOCK.step_s / 2) / 4
     rates = rate * (1 + step * np.arange(-6, 7))
     fits = np.array([correlate(_stretched(video, one), log)[1].max(initial=-1.0) for one in rates])
     return rate * (1 + step * _vertex(np.arange(-6.0, 7.0), fits))
@@ -200,9 +200,9 @@ def _stretched(video: np.ndarray, rate: float) -> np.ndarray:
 def _peak(lags: np.ndarray, scores: np.ndarray, rate: float, log: PoseLog) -> int:
     """Return the best lag. Raises NeecoError when it is no fit, or one of several."""
     best = int(scores.argmax())
-    rivals = scores[np.abs(lags - lags[best]) * SEARCH.step_s > SEARCH.lobe_s * max(rate, 1.0)]
+    rivals = scores[np.abs(lags - lags[best]) * CLOCK.step_s > CLOCK.lobe_s * max(rate, 1.0)]
     rival = float(rivals.max()) if len(rivals) else -1.0
-    if scores[best] < SEARCH.min_correlation or scores[best] - rival < SEARCH.min_lead:
+    if scores[best] < CLOCK.min_correlation or scores[best] - rival < CLOCK.min_lead:
         raise NeecoError(
             f"{log.path}: its clock cannot be determined from the images: the best offset fits with correlation "
             f"{scores[best]:.2f}, another with {rival:.2f}; give it in `sync`, or shake what is tracked at the start "
@@ -242,8 +242,8 @@ def _vertex(lags: np.ndarray, scores: np.ndarray) -> float:
 def _turning_speed(grid: np.ndarray, times: np.ndarray, turns: Rotation) -> np.ndarray:
     """Return angular speeds [G] rad/s at the grid's times s, from interpolated rotations `stride_s` apart."""
     along = Slerp(times, turns)
-    before, after = (along(np.clip(grid + side * SEARCH.stride_s / 2, times[0], times[-1])) for side in (-1, 1))
-    return (before.inv() * after).magnitude() / SEARCH.stride_s
+    before, after = (along(np.clip(grid + side * CLOCK.stride_s / 2, times[0], times[-1])) for side in (-1, 1))
+    return (before.inv() * after).magnitude() / CLOCK.stride_s
 
 
 def correlate(short: np.ndarray, long: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -251,7 +251,7 @@ def correlate(short: np.ndarray, long: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
     They overlap by at least `min_overlap` of the shorter.
     """
-    least = int(SEARCH.min_overlap * min(len(short), len(long)))
+    least = int(CLOCK.min_overlap * min(len(short), len(long)))
     lags = np.arange(-(len(short) - least), len(long) - least + 1)
     # without their means, which correlation does not see, less is lost to rounding
     short, long = short - short.mean(), long - long.mean()

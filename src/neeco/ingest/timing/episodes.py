@@ -1,6 +1,6 @@
 """Recordings of one instrument (episodes) in memory, on one timeline.
 
-Every episode keeps its own clocks. On the joint timeline an episode begins PAUSE_S after the one before has ended;
+Every episode keeps its own clocks. On the joint timeline an episode begins `pause_s` after the one before has ended;
 frames are counted on from episode to episode. A single recording is an episode with its own times and numbers. Later
 stages find clocks, robot bases and instruments; each returns an `Episodes` that knows them.
 """
@@ -22,9 +22,17 @@ from neeco.ingest.readers.logs import PoseLog, ReadingLog
 from neeco.ingest.recording.model import InstrumentLogs, Recording
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, ClockOffset
 
-PAUSE_S = 2.0  # longer than any smoothing over time reaches
-SAME_INSTANT = 1e-6  # s
-LIMIT_SLACK = 0.03  # rad beyond a joint's limits that noise and calibration explain
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeSettings:
+    """Settings of the joint timeline, and what counts as the same on it."""
+
+    pause_s: float = 2.0  # longer than any smoothing over time reaches
+    same_instant: float = 1e-6  # s
+    limit_slack: float = 0.03  # rad beyond a joint's limits that noise and calibration explain
+
+
+EPISODES = EpisodeSettings()
 
 States = dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]  # instrument -> poses [N, 4, 4], readings [N] by joint
 Log = TypeVar("Log", PoseLog, ReadingLog)
@@ -226,7 +234,7 @@ class Episodes:
             known = part.clocks.get(log.clock, ClockOffset(0.0, 0.0, GIVEN))
             own = part.times + part.start_s
             moved = known.video_times(log.times) + part.start_s
-            rows.append((moved > own[0] - PAUSE_S / 2) & (moved < own[-1] + PAUSE_S / 2))
+            rows.append((moved > own[0] - EPISODES.pause_s / 2) & (moved < own[-1] + EPISODES.pause_s / 2))
             times.append(moved[rows[-1]])
             inner += [tuple(known.video_times(np.array(gap)) + part.start_s) for gap in log.gaps]
         joint = np.concatenate(times)
@@ -265,7 +273,7 @@ class Episodes:
         if not len(held):
             return np.full((len(times), 4, 4), np.nan), np.zeros(len(times), dtype=bool)
         row = np.abs(times[:, None] - held).argmin(1)
-        known = np.abs(times - held[row]) < SAME_INSTANT
+        known = np.abs(times - held[row]) < EPISODES.same_instant
         found = np.where(known[:, None, None], poses[row], np.nan)
         if name in self.parts[0].rolls:
             roll, logged = self._gathered(times, lambda part, own: part.logged_readings(part.rolls[name], own), ())
@@ -311,7 +319,7 @@ class Episodes:
 
     def _each(self, times: np.ndarray) -> Iterator[tuple[Episode, np.ndarray, np.ndarray]]:
         """Yield every episode that times [N] fall into, their rows, and their seconds on its own timeline."""
-        ends = np.array([part.start_s + part.times[-1] + PAUSE_S / 2 for part in self.parts[:-1]])
+        ends = np.array([part.start_s + part.times[-1] + EPISODES.pause_s / 2 for part in self.parts[:-1]])
         of = np.searchsorted(ends, times)
         for episode in np.unique(of):
             rows = np.flatnonzero(of == episode)
@@ -338,7 +346,7 @@ class Episodes:
             return values
         held = np.clip(values, *limits)
         excess = float(np.nanmax(np.abs(values - held), initial=0.0))
-        if excess > LIMIT_SLACK:
+        if excess > EPISODES.limit_slack:
             raise NeecoError(
                 f"{log.path}: readings go {np.degrees(excess):.1f} deg beyond the joint's limits {limits[0]:g} .. "
                 f"{limits[1]:g} rad; correct `limits` in the recording, or the calibration"

@@ -16,12 +16,21 @@ from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_r
 from neeco.ingest.recording.base import STATED
 from neeco.ingest.recording.compatibility import check_recordings, episode_names, refusal
 from neeco.ingest.recording.model import STILL, Recording
-from neeco.ingest.timing.clock_search import GIVEN, SEARCH, ClockOffset
-from neeco.ingest.timing.episodes import PAUSE_S, Episode, Episodes, Notes, assumed_clock
+from neeco.ingest.timing.clock_search import CLOCK, GIVEN, ClockOffset
+from neeco.ingest.timing.episodes import EPISODES, Episode, Episodes, Notes, assumed_clock
 
-MIN_FPS, MAX_FPS = 0.01, 10_000.0
-SAME_FOCAL = 0.02  # of a focal length, between calibrations of one lens
-MIN_SIDE_PX = 32  # smaller frames have too few features to find cameras
+
+@dataclass(frozen=True, kw_only=True)
+class ReadingSettings:
+    """Limits of recordings that can be used."""
+
+    min_fps: float = 0.01
+    max_fps: float = 10_000.0
+    same_focal: float = 0.02  # of a focal length, between calibrations of one lens
+    min_side_px: int = 32  # smaller frames have too few features to find cameras
+
+
+READING = ReadingSettings()
 
 
 def read_episodes(recordings: Sequence[Recording]) -> Episodes:
@@ -36,7 +45,7 @@ def read_episodes(recordings: Sequence[Recording]) -> Episodes:
         part = _read(recording, names[episode], notes, episode)
         if parts:
             before = parts[-1]
-            start = before.start_s + before.times[-1] + PAUSE_S - part.times[0]
+            start = before.start_s + before.times[-1] + EPISODES.pause_s - part.times[0]
             part = replace(part, start_s=start, first_frame=before.first_frame + len(before.times))
         parts.append(part)
     _check_episodes(parts)
@@ -118,7 +127,7 @@ def _check_partner(recording: Recording) -> str:
     own = None
     with suppress(NeecoError):  # what the file states is not used
         own = None if known is None or recording.video is None else known.lens(recording.video, recording.stream)
-    if own is None or abs(left.fl_x / own.fl_x - 1) < SAME_FOCAL:
+    if own is None or abs(left.fl_x / own.fl_x - 1) < READING.same_focal:
         return ""
     return (
         f"stereo.calibration: {calibration.name} states a focal length of {left.fl_x:.0f} px, the images' own file "
@@ -173,14 +182,14 @@ def require_lens(recording: Recording, lens: Lens | None) -> None:
 def _check_video(recording: Recording, video: VideoSource) -> None:
     """Raise NeecoError for times that no recording has, and for frames too small."""
     rate, length = 1 / float(np.median(np.diff(video.times))), video.times[-1] - video.times[0]
-    if not (MIN_FPS < rate < MAX_FPS and length < SEARCH.max_length_s):
+    if not (READING.min_fps < rate < READING.max_fps and length < CLOCK.max_length_s):
         raise NeecoError(
             f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
             "cannot be; correct fps or the times' unit"
         )
-    if min(video.size) < MIN_SIDE_PX:
+    if min(video.size) < (least := READING.min_side_px):
         width, height = video.size
-        raise NeecoError(f"{video.path}: its frames are {width}x{height} pixels; give {MIN_SIDE_PX} or more each way")
+        raise NeecoError(f"{video.path}: its frames are {width}x{height} pixels; give {least} or more each way")
 
 
 def _length_notes(recording: Recording, video: VideoSource, logs: Sequence[PoseLog | ReadingLog]) -> list[str]:
