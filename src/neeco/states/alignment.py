@@ -170,8 +170,8 @@ def pose_changes(frame: Frame, state: State, camera: Camera) -> dict[str, dict[s
     return moved | {"camera": pose_change(frame.camera.world_from_camera, camera.world_from_camera)}
 
 
-def pose_change(given: Tensor, fitted: Tensor) -> dict[str, float]:
+def pose_change(recorded: Tensor, fitted: Tensor) -> dict[str, float]:
     """Return the distance between pose `fitted` [4, 4] and `given`: {"mm": of the origins, "deg": of the rotations}."""
-    relative = torch.linalg.inv(given.double()) @ fitted.double()
+    relative = torch.linalg.inv(recorded.double()) @ fitted.double()
     cosine = ((torch.diagonal(relative[:3, :3]).sum() - 1) / 2).clamp(-1, 1)
     return {"mm": float(relative[:3, 3].norm()), "deg": float(torch.rad2deg(torch.arccos(cosine)))}
