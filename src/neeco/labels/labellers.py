@@ -206,9 +206,9 @@ def find_thresholds(scene: GaussianScene) -> DeltaThresholds:
     Raises NeecoError when no kind of delta separates Gaussians, as in a scene in which nothing moves.
     """
     states = scene.recorded.states
-    found = [delta_magnitudes(scene, states[k]) for k in evenly_spaced(len(states), N_THRESHOLD_STATES, floor=True)]
+    deltas = [delta_magnitudes(scene, states[k]) for k in evenly_spaced(len(states), N_THRESHOLD_STATES, floor=True)]
     limits = {
-        kind: otsu_of_magnitudes(torch.cat([magnitudes[kind].cpu() for magnitudes in found])) if found else None
+        kind: otsu_of_magnitudes(torch.cat([magnitudes[kind].cpu() for magnitudes in deltas])) if deltas else None
         for kind in DELTAS
     }
     if all(limit is None for limit in limits.values()):
