@@ -78,9 +78,9 @@ def _folder_to_convert(sources: Sequence[Path]) -> Path | None:
     for source in sources:
         if source.suffix.lower() in VIDEOS:
             raise NeecoError(f"{source}: is a video; give it as --video {shlex.quote(str(source))}")
-        if (known := format_of(source)) is not None and source.exists():
+        if (kind := format_of(source)) is not None and source.exists():
             raise NeecoError(
-                f"{source}: is in a recording's format ({known.format}) but does not state the meaning of its streams; "
+                f"{source}: is in a recording's format ({kind.format}) but does not state the meaning of its streams; "
                 f"write that down first: neeco ingest --init {source}"
             )
         if source.is_dir():
