@@ -83,5 +83,5 @@ def test_workers_that_keep_dying_end_it(ball_run, tmp_path: Path, monkeypatch) -
 
 
 def test_no_worker_is_none_at_all(ball_run, tmp_path: Path) -> None:
-    with pytest.raises(NeecoError, match="--workers: 0 is none at all"):
+    with pytest.raises(NeecoError, match="--workers must be at least 1"):
         synthesize(ball_run, tmp_path / "set", SETTINGS, workers=0)

@@ -263,10 +263,10 @@ def require_inside(file: Path, folder: Path) -> Path:
         file.stat()  # `resolve` detects circles in Python 3.11 and 3.12 only
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise NeecoError(f"{file}: a link that leads in a circle; remove it") from None
+            raise NeecoError(f"{file}: a symbolic link that leads to itself; remove it") from None
     if file.resolve().is_relative_to(folder.resolve()):
         return file
-    raise NeecoError(f"{file}: a link leads out of {folder}; put there what it leads to, or remove it")
+    raise NeecoError(f"{file}: a symbolic link leads out of {folder}; replace it by its target, or remove it")
 
 
 def open_file(path: Path, expected: str) -> BufferedReader:
@@ -333,7 +333,7 @@ def read_json(path: Path) -> Any:
         _refuse_halves(path, text, value)
         return value
     except json.JSONDecodeError as error:
-        raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}; mend or write it anew") from None
+        raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}; repair or replace it") from None
     except RepeatedKeyError as error:
         raise NeecoError(f"{path}: {error}") from None
     except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
@@ -344,7 +344,7 @@ def _refuse_halves(path: Path, text: str, value: Any) -> None:
     """Raise NeecoError for a document with halves of characters, as of names that are not in UTF-8: no other file could
     hold them."""
     if "\\ud" in text.lower() and (half := HALVES.search(json.dumps(value, ensure_ascii=False, default=str))):
-        raise NeecoError(f"{path}: holds {half[0]!r}, half a character; write its names and the files' in UTF-8")
+        raise NeecoError(f"{path}: holds {half[0]!r}, an incomplete character; write its names and the files' in UTF-8")
 
 
 class RepeatedKeyError(ValueError):
@@ -402,7 +402,7 @@ def parse_yaml(path: Path, text: str, remedy: str, loader: type[yaml.SafeLoader]
         reason = " ".join(str(getattr(error, "problem", None) or error).split())[:100]
         raise NeecoError(f"{path}: {place}not valid YAML ({reason}); {remedy}") from None
     if _unfolded(value, {}) > MAX_VALUES:
-        raise NeecoError(f"{path}: its aliases unfold to too many values; write the values out")
+        raise NeecoError(f"{path}: its aliases expand to too many values; write the values out")
     _refuse_halves(path, text, value)
     return value
 

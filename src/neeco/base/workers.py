@@ -81,7 +81,7 @@ def check_workers(count: int) -> None:
     """Raises NeecoError for fewer than one worker, where RAY_ADDRESS names a cluster and Ray is not installed, or where
     nobody listens at its HOST:PORT."""
     if count < 1:
-        raise NeecoError(f"--workers: {count} is none at all; give at least 1")
+        raise NeecoError(f"--workers must be at least 1 (got {count})")
     if not (given := address()):
         return
     if importlib.util.find_spec("ray") is None:

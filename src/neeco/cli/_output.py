@@ -136,7 +136,7 @@ def require_ending(option: str, path: Path, *endings: str) -> None:
     """Raise NeecoError where the name of an output file ends as another format's than the one that is written, whose
     names end in one of `endings`; one without an ending is nobody's."""
     if path.suffix and path.suffix.lower() not in endings:
-        raise NeecoError(f"{option}: {path}: another format's name; what is written ends in {' or '.join(endings)}")
+        raise NeecoError(f"{option}: {path}: wrong file name extension; use {' or '.join(endings)}")
 
 
 def write_numbers(path: Path | None, numbers: Any) -> bool:

@@ -61,7 +61,7 @@ def sources_of(request: IngestRequest, output: Path | None) -> tuple[Path | None
         raise NeecoError("--output: give the folder of the capture to write")
     ignored = [option for option in request.options if folder is not None or option != "--frames"]
     if request.source and ignored:
-        raise NeecoError(f"{request.source[0]}: {ignored[0]} would be ignored with it; leave one of them out")
+        raise NeecoError(f"{request.source[0]}: {ignored[0]} has no effect with it; leave one of them out")
     if request.frames is not None and request.frames < MIN_FRAMES:
         raise NeecoError(f"--frames: {request.frames} is too few; give {MIN_FRAMES} or more")
     if folder is not None:

@@ -163,8 +163,7 @@ class ViewedRun:
                 raise NeecoError(f"{file}: cannot read: {error.strerror or error}") from error
             return str(file), found.st_ino, found.st_mtime_ns, found.st_size
         raise NeecoError(
-            f"{self.path}: nothing to look at yet: neither a finished scene nor a checkpoint; "
-            "wait until `neeco train` has written one"
+            f"{self.path}: has neither a finished scene nor a checkpoint yet; wait until `neeco train` has written one"
         )
 
     def _load(self) -> LoadedRun:
@@ -181,7 +180,7 @@ class ViewedRun:
         if capture is not None:
             capture = scene.recorded.completed(capture, scene.instruments)
         if not scene.recorded.states and capture is None:
-            raise NeecoError(f"{self.path}: the scene remembers no frames, and its capture is gone; train again")
+            raise NeecoError(f"{self.path}: the scene holds no frames, and its capture is missing; train again")
         frames = () if capture is None else capture.frames
         known = scene.recorded if capture is None else Recorded.of(frames, scene.instruments)
         order = np.argsort([state.time for state in known.states], kind="stable")
