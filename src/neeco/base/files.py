@@ -22,10 +22,10 @@ from neeco.base.errors import NeecoError
 from neeco.base.locks import LOCK, LOCKING, TEMPORARY, begin_file, locked, remove_abandoned
 from neeco.base.placeholders import placeholder
 
-LOCK_WAIT_S = 20.0  # for a person who clicks, while another process writes
+LOCK_WAIT_S = 20.0  # limit on the wait in s, for a person who clicks, while another process writes
 FOLLOW_LINKS = "NEECO_FOLLOW_LINKS"  # environment variable
-MAX_VALUES = 1_000_000  # in a YAML file, aliases written out
-MAX_BYTES = 2**30  # of a file that is read whole
+MAX_VALUES = 1_000_000  # limit on the values of a YAML file, aliases written out
+MAX_BYTES = 2**30  # limit on the bytes of a file that is read whole
 HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
 _REMEDIES = {
     errno.ENOSPC: "free space there, or write to another disk",
@@ -353,12 +353,12 @@ class RepeatedKeyError(ValueError):
 
 def distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return a JSON object of its pairs, as `object_pairs_hook`. Raises RepeatedKeyError."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    values = dict(pairs)
+    if len(values) < len(pairs):
         names = [name for name, _ in pairs]
-        twice = next(name for name in found if names.count(name) > 1)
+        twice = next(name for name in values if names.count(name) > 1)
         raise RepeatedKeyError(f"{twice!r} is given twice in one object; keep one of them")
-    return found
+    return values
 
 
 class YamlLoader(yaml.SafeLoader):
@@ -407,15 +407,15 @@ def parse_yaml(path: Path, text: str, remedy: str, loader: type[yaml.SafeLoader]
     return value
 
 
-def _unfolded(value: Any, known: dict[int, int]) -> int:
-    """Number of values when every alias is written out; `known`: of those met already."""
+def _unfolded(value: Any, counts: dict[int, int]) -> int:
+    """Number of values when every alias is written out; `counts`: of those met already."""
     if not isinstance(value, dict | list):
         return 1
-    if id(value) not in known:
-        known[id(value)] = MAX_VALUES + 1  # until it is known: it would contain itself
+    if id(value) not in counts:
+        counts[id(value)] = MAX_VALUES + 1  # until it is known: it would contain itself
         inner = value.values() if isinstance(value, dict) else value
-        known[id(value)] = 1 + sum(_unfolded(item, known) for item in inner)
-    return known[id(value)]
+        counts[id(value)] = 1 + sum(_unfolded(item, counts) for item in inner)
+    return counts[id(value)]
 
 
 def read_begun(

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from neeco.training.config import TrainConfig
     from neeco.training.train import ProgressRow
 
-LINE_INTERVAL_S = 30.0  # between two lines about the same work, where no terminal shows bars
-WIDE = 100  # characters of a terminal on which bars are long
-MIN_SHOWN_S = 1.0  # what took less has no last line
-EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
+LINE_INTERVAL_S = 30.0  # s between two lines about the same work, where no terminal shows bars
+WIDE = 100  # least width in characters of a terminal on which bars are long
+MIN_SHOWN_S = 1.0  # least s of work that has a last line
+EVALUATION_SHARE = 0.1  # share of a job's bar for evaluation; the rest is training
 
 
 class Bars:
@@ -64,8 +64,8 @@ class Bars:
             self.left.set()
             self.lines.join()
             if kind is None:
-                shown = [task for task in self.bar.tasks if task.visible]  # none where all were jobs that ended
-                for task in [task for task in shown[:-1] if (task.elapsed or 0) >= MIN_SHOWN_S] + shown[-1:]:
+                tasks = [task for task in self.bar.tasks if task.visible]  # none where all were jobs that ended
+                for task in [task for task in tasks[:-1] if (task.elapsed or 0) >= MIN_SHOWN_S] + tasks[-1:]:
                     self._print(_line(task))
         passed = time.monotonic() - self.began
         if kind is None and self.tasks and passed >= MIN_SHOWN_S:

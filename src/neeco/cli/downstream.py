@@ -100,15 +100,15 @@ def _settings(args: Downstream) -> DownstreamSettings:
         if name in tests:
             raise NeecoError(f"--test {name}: is a split's name or no file name; choose another: --test NAME={place}")
         tests[name] = Path(place)
-    given = vars(args) | {
+    values = vars(args) | {
         "sets": tuple(_data_set(word) for word in args.sets),
         "models": tuple(dict.fromkeys(args.models)),
         "num_real": tuple(dict.fromkeys(args.num_real)) or None,
         "tests": tests,
         "conditions": args.conditions or None,
     }
-    del given["test"]
-    return DownstreamSettings(**given)
+    del values["test"]
+    return DownstreamSettings(**values)
 
 
 def _data_set(word: str) -> ImageSet:

@@ -72,7 +72,7 @@ def _list_formats() -> int:
     from neeco.ingest.readers import recording_formats
 
     table = Table("format", "read of it", "extra")
-    for known in recording_formats():
-        table.add_row(known.format, known.holds, known.extra or "")
+    for reader in recording_formats():
+        table.add_row(reader.format, reader.holds, reader.extra or "")
     whole_lines().print(table)
     return 0
