@@ -244,9 +244,9 @@ def _drop_small_components(
         if not width:
             continue
         box = slice(y, y + height), slice(x, x + width)
-        kept = np.where(without_small_components(mask[box], min_component), original[box], 0)
-        kept = without_part_islands(kept, ids, min_component)
-        np.copyto(cleaned[box], kept, where=kept > 0)
+        large_parts = np.where(without_small_components(mask[box], min_component), original[box], 0)
+        large_parts = without_part_islands(large_parts, ids, min_component)
+        np.copyto(cleaned[box], large_parts, where=large_parts > 0)
     remaining = cleaned > 0
     dropped = (original > 0) & ~remaining
     return torch.from_numpy(cleaned), torch.from_numpy(without_components(share.numpy(), remaining, dropped))

@@ -180,11 +180,11 @@ def line_chart(
 
 
 @page_style()
-def legend(names: Sequence[str], drawn: Sequence[str]) -> list[tuple[str, Markup]]:
+def legend(names: Sequence[str], used: Sequence[str]) -> list[tuple[str, Markup]]:
     """(name, its line and mark as inline SVG) of every method shown; `names`: all, whose order gives them these."""
     entries = []
     for order, name in enumerate(names):
-        if name in drawn:
+        if name in used:
             axes = new_axes((46, 14), 0, 0, 0, 0)
             axes.set_axis_off()
             _draw_line(axes, order, ((1, 7), (45, 7)), linewidth=2, dashes=DASHES[order % len(DASHES)])
