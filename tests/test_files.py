@@ -133,7 +133,7 @@ def test_half_a_character_is_no_json_and_a_pair_of_halves_is_one_letter(tmp_path
     assert read_json(file) == {"name": "\N{GRINNING FACE}"}
     for text in (r'{"name": ["\udcff.jpg"]}', r'{"\uD83D": 1}'):
         file.write_text(text)
-        with pytest.raises(NeecoError, match="half a character; write its names"):
+        with pytest.raises(NeecoError, match="an incomplete character; write its names"):
             read_json(file)
 
 
@@ -172,13 +172,13 @@ def test_a_link_out_of_a_folder_is_refused_and_one_within_it_is_not(tmp_path: Pa
     with own_folder(folder):
         assert require_inside(folder / "same", folder) == folder / "same"
     (folder / "deep").symlink_to(outside)
-    with pytest.raises(NeecoError, match=r"deep/any.png: a link leads out of .*folder; put there what it leads to"):
+    with pytest.raises(NeecoError, match=r"any.png: a symbolic link leads out of .*folder; replace it by its target"):
         require_inside(folder / "deep" / "any.png", folder)
-    with pytest.raises(NeecoError, match=r"deep: a link leads out of"):
+    with pytest.raises(NeecoError, match=r"deep: a symbolic link leads out of"):
         own_folder(folder).__enter__()
     (folder / "deep").unlink()
     (folder / "round").symlink_to("round")
-    with pytest.raises(NeecoError, match=r"round: a link that leads in a circle; remove it"):
+    with pytest.raises(NeecoError, match=r"round: a symbolic link that leads to itself; remove it"):
         own_folder(folder).__enter__()
 
 
@@ -224,8 +224,8 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (BOMB, "its aliases unfold to too many values"),
-        ("&a [*a]", "its aliases unfold to too many values"),
+        (BOMB, "its aliases expand to too many values"),
+        ("&a [*a]", "its aliases expand to too many values"),
         ("[" * 5000, "its nesting is too deep"),
         ("a: 2020-13-45", "not valid YAML"),
         ("a: !!float x", "not valid YAML"),

@@ -244,9 +244,9 @@ def train(
 
         run = neeco.train("samples/liver-mini", "runs/sample", minutes=2)
     """
-    given = {"iterations": iterations, "minutes": minutes, "seed": seed}
+    overrides = {"iterations": iterations, "minutes": minutes, "seed": seed}
     others = {name.replace("__", "."): value for name, value in settings.items()}
-    config = training_config(method, given, others, runs.begun_config(Path(output)) if resume else None)
+    config = training_config(method, overrides, others, runs.begun_config(Path(output)) if resume else None)
     path = train_run(Path(capture), Path(output), config, device=device_of(device), resume=resume, progress=progress)
     return load(path, device)
 

@@ -427,7 +427,7 @@ def _tree(**changes):
     [
         ({"value": {"elbow": 1}}, "instruments", "'elbow' is no joint of it (recorded: jaw_angle)", "error"),
         ({"offset": 50.0, "limits": [-1, 1]}, "instruments", "8 frames, outside its limits", "warning"),
-        ({"parent": "wrist"}, "instruments[0].kinematics.links", "joined in a circle", "error"),
+        ({"parent": "wrist"}, "instruments[0].kinematics.links", "the links form a cycle", "error"),
         ({"type": "hinge"}, "instruments[0].kinematics.links[1].type", "is 'hinge'", "error"),
     ],
 )

@@ -87,5 +87,5 @@ def test_truth_lies_in_its_capture(tmp_path):
     (tmp_path / "capture" / "truth" / "masks").mkdir(parents=True)
     (tmp_path / "other.png").touch()
     (tmp_path / "capture" / "truth" / "masks" / "000.png").symlink_to(tmp_path / "other.png")
-    with pytest.raises(NeecoError, match=r"000.png: a link leads out of .*capture"):
+    with pytest.raises(NeecoError, match=r"000.png: a symbolic link leads out of .*capture"):
         truth_file(tmp_path / "capture", "000")

@@ -236,4 +236,4 @@ def test_static_transforms_tell_the_axes_that_a_frames_name_leaves_open(tmp_path
             bag.image("/camera/image_raw", time, np.zeros((8, 8, 3), np.uint8), "rgb8", optical)
     for stream in ("/tool/pose", "/needle/pose"):
         assert_seen(read_pose_log(PoseColumns(bag.path, stream=stream)))
-    assert "# poses are stated in camera_link, and turned by static transforms of the bag" in write_template(bag.path)
+    assert "# poses are stated in camera_link, turned by the bag's static transforms" in write_template(bag.path)

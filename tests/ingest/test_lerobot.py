@@ -464,7 +464,7 @@ def test_links_out_of_the_data_set(tmp_path):
     file = path / "data/chunk-000/episode_000001.parquet"
     file.rename(tmp_path / "elsewhere.parquet")
     file.symlink_to(tmp_path / "elsewhere.parquet")
-    assert "a link leads out of" in refusal(path)
+    assert "a symbolic link leads out of" in refusal(path)
 
 
 def test_the_hubs_cache_holds_links(tmp_path):

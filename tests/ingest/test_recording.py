@@ -235,7 +235,7 @@ def test_links_are_given_inline_or_by_a_tool_file(world, folder):
     ("words", "message"),
     [
         (LINKS.replace("jaw", "elbow"), r"instruments\[0\]\.kinematics: 'elbow' is no joint of it; .*\(jaw, wrist\)"),
-        (LINKS.replace("shaft, type", "tip, type"), r"kinematics\.links: joined in a circle: 'tip'"),
+        (LINKS.replace("shaft, type", "tip, type"), r"kinematics\.links: the links form a cycle: 'tip'"),
         ("{dvrk_tool: none.json}", r"instruments\[0\]\.kinematics\.dvrk_tool: no such file: 'none\.json'"),
         ("{dvrk_tool: tool.json, reading: {}}", r"reading: it has no such field; .*did you mean readings\?"),
         ("{dvrk_tool: tool.json, readings: {yaw: jaw}}", r"kinematics\.readings\.yaw: unknown key"),

@@ -235,7 +235,7 @@ def test_small_residuals_of_a_scope_that_turned_little_do_not_make_a_good_verdic
 @pytest.mark.parametrize(("overlap", "advice"), [(0.68, "do not train"), (0.80, "usable"), (0.93, "good")])
 def test_a_reason_is_stated_once_with_what_is_usual(tmp_path, overlap, advice):
     note = "the outline of psm1 and what moves overlap by"
-    result = made(SAMPLE, bases={"psm1": based(overlap)}, notes=(f"{note} {overlap:.2f} only: is its clock right?",))
+    result = made(SAMPLE, bases={"psm1": based(overlap)}, notes=(f"{note} {overlap:.2f} only; check its clock.",))
     verdict = assess_ingest(result, read_capture(SAMPLE))
     assert verdict.as_json()["advice"] == advice
     assert len(verdict.as_json()["facts"]) == 2
@@ -244,7 +244,7 @@ def test_a_reason_is_stated_once_with_what_is_usual(tmp_path, overlap, advice):
     if advice != "good":
         lines = [line for line in lines if "outline of psm1" in line]
         assert len(lines) == 1
-        assert "is its clock right? (usual: 0.85 or more)" in lines[0]
+        assert "check its clock (usual: 0.85 or more)" in lines[0]
     write_ingest_page(result, tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
     assert ("Measured: " in page) == (advice == "good")

@@ -82,7 +82,7 @@ def test_a_file_may_say_a_number_a_range_or_for_which_share(tmp_path: Path) -> N
         ("- gamma", "names no effect"),
         ("gamma: [1, 2", r"line 1: not valid YAML \(expected"),
         ("gamma: " + "9" * 400, r"gamma: 9+ is out of range"),
-        ("gamma: [1, 2, &a [*a]]", "its aliases unfold to too many values"),
+        ("gamma: [1, 2, &a [*a]]", "its aliases expand to too many values"),
         ("gama: 1", "gama: no such effect; there are shutter_s"),
         ("gamma: often", "gamma: 'often' is no range"),
         ("gamma: [1]", r"gamma: \[1\] is no range"),

@@ -51,7 +51,7 @@ def lens_scene(scene):
         (SizeSettings(size="64000x48000"), "--size: 64000x48000 is more than"),
         (SizeSettings(scale=1e30), "--scale: .* is more than"),
         (ImageSettings(quality=0), "--quality: 0"),
-        (ImageSettings(quality=50), "--quality: is of JPEG images, and PNG would be written"),
+        (ImageSettings(quality=50), "--quality: applies to JPEG only, and images would be PNG"),
     ],
 )
 def test_sizes_that_make_no_sense_are_refused_by_name(size, words):
@@ -147,12 +147,12 @@ def test_a_data_set_drawn_through_the_lens_says_so(lens_scene, run, tmp_path):
     assert all((plane[outside] == 0).all() for plane in planes.values())
     assert (np.asarray(Image.open(output / "depth/000000.png"))[outside] == 0).all()
     assert "--lens" in (output / "README.md").read_text()
-    with pytest.raises(NeecoError, match=r"--formats: bop knows no distortion"):
+    with pytest.raises(NeecoError, match=r"--formats: bop cannot store distorted images"):
         synthesize(run, tmp_path / "bop", replace(SETTINGS, lens=True), ("bop",))
 
 
 def test_a_recording_without_a_lens_is_drawn_through_none(run, tmp_path):
-    with pytest.raises(NeecoError, match="--lens: the scene's capture does not tell of its lens"):
+    with pytest.raises(NeecoError, match="--lens: the scene's capture states no lens"):
         synthesize(run, tmp_path / "dataset", replace(SETTINGS, lens=True))
 
 

@@ -148,8 +148,8 @@ def test_what_cannot_be_mixed_is_told(near: GaussianScene, scene: GaussianScene)
     [
         (["--count", "2"], "synthesize: give a RUN, or --tissue RUN with --instruments RUN"),
         (["a", "--tissue", "b", "--instruments", "c", "--count", "2"], "synthesize: give a RUN, or --tissue RUN"),
-        (["--tissue", "b", "--count", "2"], "--instruments: goes with --tissue RUN"),
-        (["a", "--instruments", "b", "--count", "2"], "--instruments: goes with --tissue RUN"),
+        (["--tissue", "b", "--count", "2"], "--instruments: needs --tissue RUN"),
+        (["a", "--instruments", "b", "--count", "2"], "--instruments: needs --tissue RUN"),
         (["--tissue", "b", "--instruments", "c", "--count", "2"], "b: no such run folder"),
     ],
 )

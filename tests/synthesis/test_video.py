@@ -70,8 +70,8 @@ def test_a_missing_package_is_named(run: FakeRun, tmp_path: Path, monkeypatch: p
     [
         ([], "render: give --output FOLDER, or --video FILE.mp4"),
         (["--output", "a", "--video", "b.mp4"], "one of the two"),
-        (["--video", "film.avi"], "--video: film.avi: another format's name"),
-        (["--output", "a", "--frames", "9"], "--frames: goes with --video"),
+        (["--video", "film.avi"], "--video: film.avi: wrong file name extension"),
+        (["--output", "a", "--frames", "9"], "--frames: applies to --video only"),
         (["--video", "b.mp4", "--frames", "1"], "--frames: 1 is no path"),
     ],
 )

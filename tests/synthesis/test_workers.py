@@ -78,10 +78,10 @@ def test_workers_that_keep_dying_end_it(ball_run, tmp_path: Path, monkeypatch) -
             os.kill(worker.process.pid, signal.SIGKILL)
 
     monkeypatch.setattr(Processes, "submit", submit)
-    with pytest.raises(NeecoError, match=r"--workers: workers keep dying over image 0 \(exit status -9\)"):
+    with pytest.raises(NeecoError, match=r"--workers: workers were killed repeatedly at image 0 \(exit status -9\)"):
         synthesize(ball_run, tmp_path / "set", replace(SETTINGS, count=2), workers=2)
 
 
 def test_no_worker_is_none_at_all(ball_run, tmp_path: Path) -> None:
-    with pytest.raises(NeecoError, match="--workers: 0 is none at all"):
+    with pytest.raises(NeecoError, match="--workers must be at least 1"):
         synthesize(ball_run, tmp_path / "set", SETTINGS, workers=0)

@@ -171,7 +171,7 @@ def test_a_run_is_read_from_its_own_folder_alone(capture: Path, tmp_path: Path) 
     for name in ("config.yaml", "scene.safetensors", "metrics.jsonl"):
         (run / name).rename(tmp_path / name)
         (run / name).symlink_to(tmp_path / name)
-        with pytest.raises(NeecoError, match=rf"{name}: a link leads out of .*run; put there what it leads to"):
+        with pytest.raises(NeecoError, match=rf"{name}: a symbolic link leads out of .*run; replace it by its target"):
             load_run(run)
         (tmp_path / name).rename(run / name)
 

@@ -101,9 +101,7 @@ def test_readers_see_one_state_of_the_run_while_it_changes(run: Path) -> None:
 
 def test_a_run_without_scene_or_checkpoint_is_refused_in_one_line(run: Path) -> None:
     (run / SCENE_FILE).unlink()
-    with pytest.raises(
-        NeecoError, match="nothing to look at yet: neither a finished scene nor a checkpoint"
-    ) as refused:
+    with pytest.raises(NeecoError, match="has neither a finished scene nor a checkpoint yet") as refused:
         ViewedRun(run)
     assert "\n" not in str(refused.value)
 

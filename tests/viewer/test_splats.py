@@ -215,9 +215,7 @@ def test_the_format_is_that_of_the_ending(tmp_path: Path, capsys: pytest.Capture
         assert (tmp_path / name).read_bytes().startswith(begin)
     for words, ends in ((["b.splat"], ".ply or .spz or .usdc"), (["b.ply", "--format", "spz"], ".spz")):
         assert main(["export", str(run), "--output", *words]) == 1
-        assert (
-            f"--output: {words[0]}: another format's name; what is written ends in {ends}\n" in capsys.readouterr().err
-        )
+        assert f"--output: {words[0]}: wrong file name extension; use {ends}\n" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -231,7 +229,7 @@ def test_the_format_is_that_of_the_ending(tmp_path: Path, capsys: pytest.Capture
 def test_no_file_is_written_under_another_formats_name(words, tmp_path, capsys):
     run = run_folder(tmp_path / "run", ball_scene("ball", [(0.0, 0.0, 60.0)]))
     assert main([str(run) if word == "RUN" else word for word in words]) == 1
-    assert f"{words[-2]}: {words[-1]}: another format's name" in capsys.readouterr().err
+    assert f"{words[-2]}: {words[-1]}: wrong file name extension" in capsys.readouterr().err
 
 
 def test_numbers_that_are_not_finite_are_in_no_file() -> None:

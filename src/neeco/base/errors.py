@@ -65,11 +65,11 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def nearest(name: str, known: Iterable[str]) -> str | None:
-    """Return the name in `known` that is most similar to `name`; None where none is similar."""
+def nearest(name: str, names: Iterable[str]) -> str | None:
+    """Return the name in `names` that is most similar to `name`; None where none is similar."""
     from difflib import get_close_matches  # slow to import
 
-    return next(iter(get_close_matches(name, list(known), n=1)), None)
+    return next(iter(get_close_matches(name, list(names), n=1)), None)
 
 
 def _argument(option: re.Match[str]) -> str:

@@ -22,10 +22,10 @@ from neeco.base.errors import NeecoError
 from neeco.base.locks import LOCK, LOCKING, TEMPORARY, begin_file, locked, remove_abandoned
 from neeco.base.placeholders import placeholder
 
-LOCK_WAIT_S = 20.0  # for a person who clicks, while another process writes
+LOCK_WAIT_S = 20.0  # limit on the wait in s, for a person who clicks, while another process writes
 FOLLOW_LINKS = "NEECO_FOLLOW_LINKS"  # environment variable
-MAX_VALUES = 1_000_000  # in a YAML file, aliases written out
-MAX_BYTES = 2**30  # of a file that is read whole
+MAX_VALUES = 1_000_000  # limit on the values of a YAML file, aliases written out
+MAX_BYTES = 2**30  # limit on the bytes of a file that is read whole
 HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
 _REMEDIES = {
     errno.ENOSPC: "free space there, or write to another disk",
@@ -263,10 +263,10 @@ def require_inside(file: Path, folder: Path) -> Path:
         file.stat()  # `resolve` detects circles in Python 3.11 and 3.12 only
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise NeecoError(f"{file}: a link that leads in a circle; remove it") from None
+            raise NeecoError(f"{file}: a symbolic link that leads to itself; remove it") from None
     if file.resolve().is_relative_to(folder.resolve()):
         return file
-    raise NeecoError(f"{file}: a link leads out of {folder}; put there what it leads to, or remove it")
+    raise NeecoError(f"{file}: a symbolic link leads out of {folder}; replace it by its target, or remove it")
 
 
 def open_file(path: Path, expected: str) -> BufferedReader:
@@ -333,7 +333,7 @@ def read_json(path: Path) -> Any:
         _refuse_halves(path, text, value)
         return value
     except json.JSONDecodeError as error:
-        raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}; mend or write it anew") from None
+        raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}; repair or replace it") from None
     except RepeatedKeyError as error:
         raise NeecoError(f"{path}: {error}") from None
     except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
@@ -344,7 +344,7 @@ def _refuse_halves(path: Path, text: str, value: Any) -> None:
     """Raise NeecoError for a document with halves of characters, as of names that are not in UTF-8: no other file could
     hold them."""
     if "\\ud" in text.lower() and (half := HALVES.search(json.dumps(value, ensure_ascii=False, default=str))):
-        raise NeecoError(f"{path}: holds {half[0]!r}, half a character; write its names and the files' in UTF-8")
+        raise NeecoError(f"{path}: holds {half[0]!r}, an incomplete character; write its names and the files' in UTF-8")
 
 
 class RepeatedKeyError(ValueError):
@@ -353,12 +353,12 @@ class RepeatedKeyError(ValueError):
 
 def distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return a JSON object of its pairs, as `object_pairs_hook`. Raises RepeatedKeyError."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    values = dict(pairs)
+    if len(values) < len(pairs):
         names = [name for name, _ in pairs]
-        twice = next(name for name in found if names.count(name) > 1)
+        twice = next(name for name in values if names.count(name) > 1)
         raise RepeatedKeyError(f"{twice!r} is given twice in one object; keep one of them")
-    return found
+    return values
 
 
 class YamlLoader(yaml.SafeLoader):
@@ -402,20 +402,20 @@ def parse_yaml(path: Path, text: str, remedy: str, loader: type[yaml.SafeLoader]
         reason = " ".join(str(getattr(error, "problem", None) or error).split())[:100]
         raise NeecoError(f"{path}: {place}not valid YAML ({reason}); {remedy}") from None
     if _unfolded(value, {}) > MAX_VALUES:
-        raise NeecoError(f"{path}: its aliases unfold to too many values; write the values out")
+        raise NeecoError(f"{path}: its aliases expand to too many values; write the values out")
     _refuse_halves(path, text, value)
     return value
 
 
-def _unfolded(value: Any, known: dict[int, int]) -> int:
-    """Number of values when every alias is written out; `known`: of those met already."""
+def _unfolded(value: Any, counts: dict[int, int]) -> int:
+    """Number of values when every alias is written out; `counts`: of those met already."""
     if not isinstance(value, dict | list):
         return 1
-    if id(value) not in known:
-        known[id(value)] = MAX_VALUES + 1  # until it is known: it would contain itself
+    if id(value) not in counts:
+        counts[id(value)] = MAX_VALUES + 1  # until it is known: it would contain itself
         inner = value.values() if isinstance(value, dict) else value
-        known[id(value)] = 1 + sum(_unfolded(item, known) for item in inner)
-    return known[id(value)]
+        counts[id(value)] = 1 + sum(_unfolded(item, counts) for item in inner)
+    return counts[id(value)]
 
 
 def read_begun(

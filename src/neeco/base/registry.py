@@ -19,7 +19,7 @@ def plugins(base: type[T], attribute: str, package: str, group: str | None = Non
 
     Raises NeecoError when two share a name, or an entry point cannot be loaded.
     """
-    found = named_classes(base, attribute, importlib.import_module(package))
+    kinds = named_classes(base, attribute, importlib.import_module(package))
     group = group or package
     for point in entry_points(group=group):
         try:
@@ -34,8 +34,8 @@ def plugins(base: type[T], attribute: str, package: str, group: str | None = Non
                 f"{point.value}: entry point of {_owner(point.dist)} in {group} is no {base.__name__} with a "
                 f"`{attribute}`; update or uninstall it"
             )
-        _add(found, getattr(kind, attribute), kind, attribute)
-    return dict(sorted(found.items()))
+        _add(kinds, getattr(kind, attribute), kind, attribute)
+    return dict(sorted(kinds.items()))
 
 
 def named_classes(base: type[T], attribute: str, package: ModuleType) -> dict[str, type[T]]:
@@ -44,7 +44,7 @@ def named_classes(base: type[T], attribute: str, package: ModuleType) -> dict[st
 
     Sorted by name. Raises NeecoError when two share one.
     """
-    found: dict[str, type[T]] = {}
+    kinds: dict[str, type[T]] = {}
     for entry in pkgutil.iter_modules(package.__path__):
         if entry.name.startswith("_"):
             continue
@@ -52,14 +52,14 @@ def named_classes(base: type[T], attribute: str, package: ModuleType) -> dict[st
         for kind in vars(module).values():
             named = isinstance(kind, type) and issubclass(kind, base) and attribute in vars(kind)
             if named and f"{kind.__module__}.".startswith(f"{module.__name__}."):
-                _add(found, getattr(kind, attribute), kind, attribute)
-    return dict(sorted(found.items()))
+                _add(kinds, getattr(kind, attribute), kind, attribute)
+    return dict(sorted(kinds.items()))
 
 
-def _add(found: dict[str, type[T]], name: str, kind: type[T], attribute: str) -> None:
-    if (other := found.get(name, kind)) is not kind:
+def _add(kinds: dict[str, type[T]], name: str, kind: type[T], attribute: str) -> None:
+    if (other := kinds.get(name, kind)) is not kind:
         raise NeecoError(f"{kind.__module__}: {attribute} {name!r} is also in {other.__module__}; give it another name")
-    found[name] = kind
+    kinds[name] = kind
 
 
 def _owner(distribution: object) -> str:

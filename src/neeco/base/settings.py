@@ -29,7 +29,7 @@ from neeco.base.errors import NeecoError, nearest
 
 Device = Annotated[str, tyro.conf.arg(help="cpu, cuda, cuda:N, or auto: a CUDA device where there is one.")]
 T = TypeVar("T")
-MAX_INTEGER = 2**63  # torch accepts no larger one
+MAX_INTEGER = 2**63  # limit on an integer: torch accepts no larger one
 VALUES = {str: "STR", int: "INT", float: "FLOAT", bool: "true|false"}
 FIELD = re.compile(  # of a dataclass: the comments above, the name, the comment behind, the text below
     r'((?:^ {4}# [^\n]*\n)*)^ {4}(\w+): [^\n]*?(?: {2}# ([^\n]*))?\n(?: {4}"""(.*?)""")?', re.MULTILINE | re.DOTALL
@@ -133,8 +133,8 @@ def structure(kind: type[T], values: Mapping[str, Any], where: str = "", owner: 
     Raises NeecoError naming the field (`where` and its dotted path) that is unknown or does not fit its type.
     """
     with faults_in(""):
-        found: T = read(kind, Place(values, field=where), owner)
-        return found
+        settings: T = read(kind, Place(values, field=where), owner)
+        return settings
 
 
 def name_and_value(option: str, text: str, example: str) -> tuple[str, str]:
@@ -171,8 +171,8 @@ def described(kind: type[Any]) -> Iterator[tuple[str, str, str]]:
             yield from ((f"{field.name}.{name}", value, text) for name, value, text in described(type(default)))
             continue
         hint = hints[field.name]
-        shown = default is None or typing.get_origin(hint) is typing.Literal
-        choices = f" ({value_words(hint).strip('{}')})" if shown else ""
+        has_choices = default is None or typing.get_origin(hint) is typing.Literal
+        choices = f" ({value_words(hint).strip('{}')})" if has_choices else ""
         text = f"{default:.4g}" if isinstance(default, float) else str(default)
         yield field.name, text, texts.get(field.name, "") + choices
 
@@ -221,17 +221,17 @@ def _read_fields(kind: Any, place: Place, owner: str) -> Any:
         place = dataclasses.replace(place, value=value)
     for key in value:
         if key not in hints:
-            likely, known = nearest(str(key), hints), ", ".join(hints) or "none"
-            message = f"{owner} has no such field; it has {known}" + (f"; did you mean {likely}?" if likely else "")
+            likely, names = nearest(str(key), hints), ", ".join(hints) or "none"
+            message = f"{owner} has no such field; it has {names}" + (f"; did you mean {likely}?" if likely else "")
             raise Fault(join_places(place.field, key_name(str(key))), message)
-    given = {}
+    arguments = {}
     for field in dataclasses.fields(kind):
         if value.get(field.name) is not None or (field.name in value and _is_optional(hints[field.name])):
-            given[field.name] = read(hints[field.name], place.child(field.name), owner)
+            arguments[field.name] = read(hints[field.name], place.child(field.name), owner)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             raise Fault(join_places(place.field, field.name), "missing; give it")
     try:
-        return kind(**given)
+        return kind(**arguments)
     except Fault as fault:
         raise Fault(join_places(place.field, fault.field), str(fault)) from None
 

@@ -33,11 +33,11 @@ from neeco.base.placeholders import read_head
 class WorkerSettings:
     """Times and numbers of tasks that workers share."""
 
-    max_retries: int = 3  # of a task whose worker died
-    connect_s: float = 5.0  # that a cluster's head gets to answer
-    probe_s: float = 60.0  # that a cluster's nodes get to start a worker and look at a folder
-    poll_s: float = 1.0  # between two looks at running tasks
-    tasks_per_worker: int = 2  # submitted to a cluster, so that no worker waits for the next
+    max_retries: int = 3  # limit on the retries of a task whose worker died
+    connect_s: float = 5.0  # limit on the s that a cluster's head takes to answer
+    probe_s: float = 60.0  # limit on the s that a cluster's nodes take to start a worker and look at a folder
+    poll_s: float = 1.0  # s between two looks at running tasks
+    tasks_per_worker: int = 2  # tasks submitted to a cluster per worker, so that no worker waits for the next
 
 
 LIMITS = WorkerSettings()
@@ -89,19 +89,19 @@ def check_workers(count: int) -> None:
     """Raises NeecoError for fewer than one worker, where RAY_ADDRESS names a cluster and Ray is not installed, or where
     nobody listens at its HOST:PORT."""
     if count < 1:
-        raise NeecoError(f"--workers: {count} is none at all; give at least 1")
-    if not (given := address()):
+        raise NeecoError(f"--workers must be at least 1 (got {count})")
+    if not (cluster := address()):
         return
     if importlib.util.find_spec("ray") is None:
         raise NeecoError(f"RAY_ADDRESS: a cluster needs Ray; {install_hint('cluster')}, or unset RAY_ADDRESS")
-    host, _, port = given.rpartition(":")
-    if "/" in given or not (host and port.isdecimal()):  # ray://..., auto, local: for Ray to understand
+    host, _, port = cluster.rpartition(":")
+    if "/" in cluster or not (host and port.isdecimal()):  # ray://..., auto, local: for Ray to understand
         return
     try:
         socket.create_connection((host, int(port)), LIMITS.connect_s).close()
     except (OSError, OverflowError) as error:
         raise NeecoError(
-            f"RAY_ADDRESS: no Ray cluster answers at {given} ({error}); start it, or unset RAY_ADDRESS to work here"
+            f"RAY_ADDRESS: no Ray cluster answers at {cluster} ({error}); start it, or unset RAY_ADDRESS to work here"
         ) from None
 
 
@@ -180,21 +180,21 @@ class Processes:
 
     def finished(self) -> list[tuple[int, Outcome, Any]]:
         """Return what ended within LIMITS.poll_s."""
-        found: list[tuple[int, Outcome, Any]] = []
+        results: list[tuple[int, Outcome, Any]] = []
         for connection in wait(list(self.running), LIMITS.poll_s):
             worker, index = self.running.pop(connection)
             try:
                 stage, value = worker.connection.recv()
             except (EOFError, OSError):
                 self._end(worker)
-                found.append((index, "died", f"exit status {worker.process.exitcode}"))
+                results.append((index, "died", f"exit status {worker.process.exitcode}"))
                 continue
-            found.append((index, stage, value))
+            results.append((index, stage, value))
             if self._workers.fresh:
                 self._end(worker)
             else:
                 self._idle.append(worker)
-        return found
+        return results
 
     def stop(self) -> None:
         """Interrupt all workers; those that do not end in time are killed, at a second Ctrl-C at once."""
@@ -285,16 +285,16 @@ class RayTasks:
 
     def finished(self) -> list[tuple[int, Outcome, Any]]:
         """Return what ended within LIMITS.poll_s."""
-        found: list[tuple[int, Outcome, Any]] = []
+        results: list[tuple[int, Outcome, Any]] = []
         for reference in self._ray.wait(list(self.running), timeout=LIMITS.poll_s)[0]:
             index = self.running.pop(reference)
             try:
-                found.append((index, "done", self._ray.get(reference)))
+                results.append((index, "done", self._ray.get(reference)))
             except self._ray.exceptions.RayTaskError as error:
-                found.append((index, "failed", _in_one_line(error.cause)))
+                results.append((index, "failed", _in_one_line(error.cause)))
             except self._ray.exceptions.RayError as error:
-                found.append((index, "died", str(error).strip().splitlines()[0]))
-        return found
+                results.append((index, "died", str(error).strip().splitlines()[0]))
+        return results
 
     def stop(self) -> None:
         """Interrupt the running tasks, and wait until they end; a second Ctrl-C ends the waiting."""
@@ -309,8 +309,8 @@ def work_on_node(function: TaskFunction, shared: Any, task: Any, threads: int, f
     """Do the task in a cluster's worker, its paths relative to `folder`, with the GPU that Ray assigned."""
     import ray
 
-    if own := ray.get_runtime_context().get_accelerator_ids().get("GPU"):
-        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(own)  # before PyTorch looks for the first time
+    if gpus := ray.get_runtime_context().get_accelerator_ids().get("GPU"):
+        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(gpus)  # before PyTorch looks for the first time
     with contextlib.suppress(OSError):  # where a node has no such folder, all paths are absolute
         os.chdir(folder)
     return function(shared, task, threads)
@@ -323,12 +323,12 @@ def joined() -> Iterator[Any]:
     os.environ.setdefault("RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES", "1")  # else Ray hides them
     import ray
 
-    given = address()
+    cluster = address()
     try:
-        ray.init(address=given, log_to_driver=False, logging_level=logging.ERROR)
+        ray.init(address=cluster, log_to_driver=False, logging_level=logging.ERROR)
     # with another token than the cluster's, Ray raises an error of its own
     except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
-        raise NeecoError(f"RAY_ADDRESS: {given} is no cluster that can be joined: {_in_one_line(error)}") from None
+        raise NeecoError(f"RAY_ADDRESS: {cluster} is no cluster that can be joined: {_in_one_line(error)}") from None
     try:
         yield ray
     finally:

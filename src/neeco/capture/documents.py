@@ -49,12 +49,12 @@ def condensed(problems: Sequence[Problem]) -> list[Problem]:
     for problem in problems:
         key = (VARYING.sub("#", part) for part in (problem.file, problem.field, problem.message, problem.remedy))
         groups.setdefault((problem.severity, *key), []).append(problem)
-    found = []
+    merged = []
     for first, *others in groups.values():
         many = len(others) >= MIN_CONDENSED
-        found.append(replace(first, message=f"{first.message} (and {len(others)} more like it)") if many else first)
-        found += [] if many else others
-    return found
+        merged.append(replace(first, message=f"{first.message} (and {len(others)} more like it)") if many else first)
+        merged += [] if many else others
+    return merged
 
 
 @dataclass
@@ -199,8 +199,8 @@ class Node(Place):
         if not isinstance(self.value, list) or len(self.value) != count:
             self.error(f"expected {count} numbers ({what}), found {printable(self.value)}", "correct it")
             return None
-        found = [number for item in self.items() if (number := item.number(least=least)) is not None]
-        return found if len(found) == count else None
+        values = [number for item in self.items() if (number := item.number(least=least)) is not None]
+        return values if len(values) == count else None
 
     def range(self, unit: str) -> tuple[float, float] | None:
         """A range: two numbers, the least first."""

@@ -104,8 +104,8 @@ def open_image(path: Path, size: tuple[int, int] | None = None, formats: tuple[s
     path = Path(path)
     with _opened(path, formats) as image:
         if size is not None and image.size != tuple(size):  # before its pixels, of which there may be billions
-            found, wanted = "x".join(map(str, image.size)), "x".join(map(str, size))
-            raise NeecoError(f"{path}: image is {found}, its camera says {wanted}; resize it or correct w and h")
+            actual, expected = "x".join(map(str, image.size)), "x".join(map(str, size))
+            raise NeecoError(f"{path}: image is {actual}, its camera says {expected}; resize it or correct w and h")
         image.load()
     return image
 
@@ -261,11 +261,11 @@ def measure_hidden(pixels: np.ndarray, mask: np.ndarray, camera: Camera | None, 
     return Hidden(share, int(ignored[row, column].sum()), int(inside.sum()))
 
 
-def masks_fault(found: Sequence[Hidden]) -> Fault | None:
-    """Return what is wrong with loss masks that hide what was found, and what to do."""
-    shares = [one.pixels for one in found if one.pixels is not None]
+def masks_fault(hidden: Sequence[Hidden]) -> Fault | None:
+    """Return the fault of loss masks that hide so much, and its remedy."""
+    shares = [one.pixels for one in hidden if one.pixels is not None]
     if not shares:
         return None
-    in_view = sum(one.points_in_view for one in found)
-    points = sum(one.points for one in found) / in_view if in_view else None
+    in_view = sum(one.points_in_view for one in hidden)
+    points = sum(one.points for one in hidden) / in_view if in_view else None
     return mask_fault(float(np.median(shares)), points)

@@ -99,11 +99,11 @@ class KinematicTree:
     def poses(self, readings: Mapping[str, float]) -> dict[str, Array]:
         """root_from_link [4, 4] mm of every link (forward kinematics). Raises KeyError for a reading that is
         missing."""
-        found: dict[str, Array] = {}
+        poses: dict[str, Array] = {}
         for link in self.links:
             here = link.parent_from_link(readings)
-            found[link.name] = here if link.parent is None else found[link.parent] @ here
-        return found
+            poses[link.name] = here if link.parent is None else poses[link.parent] @ here
+        return poses
 
     def readings_of(self, name: str) -> set[str]:
         """Readings that move a link against the root."""
@@ -116,8 +116,8 @@ class KinematicTree:
         """[4, 4] mm of the link `pose_of`, whose pose is recorded. Raises KeyError without a reading that moves it."""
         if self.pose_of is None:
             return np.eye(4)
-        own = {name: readings[name] for name in self.readings_of(self.pose_of)}
-        return self.poses(dict.fromkeys(self.readings, 0.0) | own)[self.pose_of]
+        relevant = {name: readings[name] for name in self.readings_of(self.pose_of)}
+        return self.poses(dict.fromkeys(self.readings, 0.0) | relevant)[self.pose_of]
 
     def world_from_root(self, pose: Array, readings: Mapping[str, float]) -> Array:
         """[4, 4] mm from the recorded pose of the link `pose_of`. Raises KeyError without a reading that moves it."""
@@ -127,10 +127,10 @@ class KinematicTree:
     @cached_property
     def rest_poses(self) -> dict[str, Array]:
         """root_from_link [4, 4] mm of every link where the values of all joints are 0."""
-        found: dict[str, Array] = {}
+        poses: dict[str, Array] = {}
         for link in self.links:
-            found[link.name] = link.origin if link.parent is None else found[link.parent] @ link.origin
-        return found
+            poses[link.name] = link.origin if link.parent is None else poses[link.parent] @ link.origin
+        return poses
 
     @cached_property
     def axes_at_rest(self) -> tuple[Array, Array]:
@@ -178,11 +178,11 @@ def _parents_first(links: tuple[Link, ...]) -> tuple[Link, ...]:
     if not links:
         raise NeecoError("there are no links; give at least the root")
     if twice := [name for name in names if names.count(name) > 1]:
-        raise NeecoError(f"{twice[0]!r} comes twice; give every link a name of its own")
+        raise NeecoError(f"{twice[0]!r} is defined twice; give every link a unique name")
     roots = [link for link in links if link.parent is None]
     if len(roots) != 1:
-        found = ", ".join(repr(link.name) for link in roots) or "none"
-        raise NeecoError(f"one link has no parent, the root; found {found}")
+        root_names = ", ".join(repr(link.name) for link in roots) or "none"
+        raise NeecoError(f"one link has no parent, the root; found {root_names}")
     for link in links:
         if link.parent is not None and link.parent not in names:
             raise NeecoError(f"{link.name!r}: its parent {link.parent!r} is no link; name one of {', '.join(names)}")
@@ -197,5 +197,5 @@ def _parents_first(links: tuple[Link, ...]) -> tuple[Link, ...]:
         ordered += [child for child in links if child.parent == link.name]
     if len(ordered) < len(links):
         circle = sorted(set(names) - {link.name for link in ordered})
-        raise NeecoError(f"joined in a circle: {', '.join(map(repr, circle))}; every link needs a way to the root")
+        raise NeecoError(f"the links form a cycle: {', '.join(map(repr, circle))}; connect every link to the root")
     return tuple(ordered)

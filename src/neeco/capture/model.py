@@ -106,11 +106,11 @@ class State:
     time: float = 0.0  # s
 
     def __post_init__(self) -> None:
-        given = {
+        states = {
             name: InstrumentState(*state) if isinstance(state, tuple) else state
             for name, state in self.instruments.items()
         }
-        object.__setattr__(self, "instruments", given)
+        object.__setattr__(self, "instruments", states)
         if not isinstance(self.time, Tensor) and not _is_finite(self.time):
             raise NeecoError(f"State.time: is {self.time!r}, not a finite number of seconds; correct it")
 
@@ -125,18 +125,18 @@ class State:
         fitted: it may come from a fit, so joints may leave their limits by the range between these and be others than
         the scene's, and tensors on a GPU or with gradients are not read.
         """
-        known = {item.name: item for item in instruments}
-        for name, given in self.instruments.items():
-            item, place = known.get(name), f"state: {name}"
-            if item is None and known and not fitted:
-                raise NeecoError(f"{place}: is not in the scene; it has {', '.join(known)}")
-            if _is_readable(given.pose, fitted):
-                fault = rigid_fault(given.pose.detach().cpu().double().numpy())
+        by_name = {item.name: item for item in instruments}
+        for name, state in self.instruments.items():
+            item, place = by_name.get(name), f"state: {name}"
+            if item is None and by_name and not fitted:
+                raise NeecoError(f"{place}: is not in the scene; it has {', '.join(by_name)}")
+            if _is_readable(state.pose, fitted):
+                fault = rigid_fault(state.pose.detach().cpu().double().numpy())
                 if fault is not None:
                     raise NeecoError(f"{place}: pose {fault[0]}; {fault[1]}")
             if item is None:
                 continue
-            for joint, value in given.joints.items():
+            for joint, value in state.joints.items():
                 if (fitted and joint not in item.joints) or not _is_readable(value, fitted):
                     continue
                 fault = item.joint_fault(joint, float(value), slack=1.0 if fitted else 0.0)
@@ -145,7 +145,7 @@ class State:
 
     def to(self, device: torch.device | str) -> State:
         """The same state, its poses on `device`."""
-        moved = {name: replace(given, pose=given.pose.to(device)) for name, given in self.instruments.items()}
+        moved = {name: replace(state, pose=state.pose.to(device)) for name, state in self.instruments.items()}
         return replace(self, instruments=moved)
 
 
@@ -354,9 +354,9 @@ class RecordedStates:
             return [state.time]
         values: list[float] = []
         for name in self.instruments:
-            given = state.instruments[name]
-            values += given.pose[:3].detach().cpu().double().numpy().ravel().tolist()
-            values += [given.joints[joint] for joint in sorted(given.joints)] if self.joints else []
+            item = state.instruments[name]
+            values += item.pose[:3].detach().cpu().double().numpy().ravel().tolist()
+            values += [item.joints[joint] for joint in sorted(item.joints)] if self.joints else []
         return values
 
 

@@ -51,7 +51,7 @@ def write_capture(
     """
     path = Path(path)
     if (path / "transforms.json").exists() and not overwrite:
-        raise NeecoError(f"{path}: already holds a capture; choose another folder or ask to overwrite it")
+        raise NeecoError(f"{path}: already holds a capture; choose another folder, or set `overwrite`")
     if images is not None and len(images) != len(capture.frames):
         raise NeecoError(f"images: there are {len(images)} for {len(capture.frames)} frames; give one for each")
     names = _names(capture)
@@ -174,11 +174,11 @@ def _names(capture: Capture) -> list[str]:
 
 
 def _write_frame(
-    frame: Frame, name: str, path: Path, image: Tensor | np.ndarray | None, known: Sequence[Instrument]
+    frame: Frame, name: str, path: Path, image: Tensor | np.ndarray | None, declared: Sequence[Instrument]
 ) -> dict[str, Any]:
     """Write a frame's files and return its JSON."""
     camera = frame.camera
-    unrecorded = {(item.name, joint) for item in known for joint in item.unrecorded}
+    unrecorded = {(item.name, joint) for item in declared for joint in item.unrecorded}
     world_from_camera = _rigid(camera.world_from_camera, f"{frame.image_path}: world_from_camera")
     instruments = [
         {

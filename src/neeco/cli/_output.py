@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from neeco.studies.tables import ResultTable
 
 STANDARD_OUTPUT = Path("-")  # as the value of --json
-FILE_WIDTH = 1000  # characters of a line in files and pipes, at most
+FILE_WIDTH = 1000  # limit on the characters of a line in files and pipes
 BORDER = 3  # characters of a column in addition to its text
 
 
@@ -61,8 +61,8 @@ def fitted(table: ResultTable, width: int) -> list[Table]:
     rows = []
     for row in table.rows:
         cells = [Text(str(cell), "bold" if cell.best or row.reference else "") for cell in row.cells]
-        shown = cells if row.failed is None else [Text("failed", "red")]
-        rows.append([*(Text(key, "bold" if row.reference else "") for key in row.keys), *shown])
+        cells_or_reason = cells if row.failed is None else [Text("failed", "red")]
+        rows.append([*(Text(key, "bold" if row.reference else "") for key in row.keys), *cells_or_reason])
     return _pieces(table.title, headings, rows, keys, width)
 
 
@@ -136,7 +136,7 @@ def require_ending(option: str, path: Path, *endings: str) -> None:
     """Raise NeecoError where the name of an output file ends as another format's than the one that is written, whose
     names end in one of `endings`; one without an ending is nobody's."""
     if path.suffix and path.suffix.lower() not in endings:
-        raise NeecoError(f"{option}: {path}: another format's name; what is written ends in {' or '.join(endings)}")
+        raise NeecoError(f"{option}: {path}: wrong file name extension; use {' or '.join(endings)}")
 
 
 def write_numbers(path: Path | None, numbers: Any) -> bool:
@@ -187,9 +187,9 @@ def state_defaults(kind: Any) -> None:
         if empty and field.name in texts and tyro.conf.UseAppendAction not in markers:
             text, _, default = texts[field.name].removesuffix(".").partition(DEFAULT)
             end = f"(default: {default})" if default else "(required)" if required else "(optional)"
-            shown = [] if tyro.conf.Positional in markers else [tyro.conf.arg(metavar=value_words(hint))]
+            metavar = [] if tyro.conf.Positional in markers else [tyro.conf.arg(metavar=value_words(hint))]
             changed = hint
-            for argument in (*shown, tyro.conf.arg(help=text, help_behavior_hint=end)):
+            for argument in (*metavar, tyro.conf.arg(help=text, help_behavior_hint=end)):
                 changed = Annotated[changed, argument]
             kind.__annotations__[field.name] = changed
 
@@ -213,9 +213,9 @@ def option_names(kind: Any) -> list[str]:
 def usage_error(box: str, words: Sequence[str], kind: Any) -> str:
     """Return in one line what is wrong with a command line that tyro refused in a framed `box`: the options that its
     verb does not have and that are nearly one, else tyro's words without its frame and its list of similar options."""
-    known, slips = [*option_names(kind), "--help"], []
+    options, slips = [*option_names(kind), "--help"], []
     for option in (word.partition("=")[0] for word in words):
-        if option.startswith("--") and option not in known and (meant := nearest(option, known)) is not None:
+        if option.startswith("--") and option not in options and (meant := nearest(option, options)) is not None:
             slips.append(f"{option}: no such option of {words[0]}; did you mean {meant}?")
     if slips:
         return " ".join(slips)

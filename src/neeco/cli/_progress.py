@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 class ProgressSettings:
     """Times and sizes of bars and lines."""
 
-    line_interval_s: float = 30.0  # between two lines about the same work, where no terminal shows bars
-    wide: int = 100  # characters of a terminal on which bars are long
-    min_shown_s: float = 1.0  # what took less has no last line
-    evaluation_share: float = 0.1  # of a job's bar; the rest is training
+    line_interval_s: float = 30.0  # s between two lines about the same work, where no terminal shows bars
+    wide: int = 100  # least width in characters of a terminal on which bars are long
+    min_shown_s: float = 1.0  # least s of work that has a last line
+    evaluation_share: float = 0.1  # share of a job's bar for evaluation; the rest is training
 
 
 PROGRESS = ProgressSettings()
@@ -72,8 +72,8 @@ class Bars:
             self.left.set()
             self.lines.join()
             if kind is None:
-                shown = [task for task in self.bar.tasks if task.visible]  # none where all were jobs that ended
-                for task in [task for task in shown[:-1] if (task.elapsed or 0) >= PROGRESS.min_shown_s] + shown[-1:]:
+                tasks = [task for task in self.bar.tasks if task.visible]  # none where all were jobs that ended
+                for task in [task for task in tasks[:-1] if (task.elapsed or 0) >= PROGRESS.min_shown_s] + tasks[-1:]:
                     self._print(_line(task))
         passed = time.monotonic() - self.began
         if kind is None and self.tasks and passed >= PROGRESS.min_shown_s:

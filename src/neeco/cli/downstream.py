@@ -98,17 +98,17 @@ def _settings(args: Downstream) -> DownstreamSettings:
         if not equals or Path(word).exists():
             name, place = Path(word).resolve().name, word
         if name in tests:
-            raise NeecoError(f"--test {name}: results go by this name; name it otherwise: --test NAME={place}")
+            raise NeecoError(f"--test {name}: is a split's name or no file name; choose another: --test NAME={place}")
         tests[name] = Path(place)
-    given = vars(args) | {
+    values = vars(args) | {
         "sets": tuple(_data_set(word) for word in args.sets),
         "models": tuple(dict.fromkeys(args.models)),
         "num_real": tuple(dict.fromkeys(args.num_real)) or None,
         "tests": tests,
         "conditions": args.conditions or None,
     }
-    del given["test"]
-    return DownstreamSettings(**given)
+    del values["test"]
+    return DownstreamSettings(**values)
 
 
 def _data_set(word: str) -> ImageSet:
@@ -120,5 +120,5 @@ def _data_set(word: str) -> ImageSet:
     if not colon or not count.isdecimal() or Path(place).exists():
         return ImageSet(name, Path(place))
     if int(count) < 1:
-        raise NeecoError(f"--sets {word}: {count} images is nothing to learn from; give at least 1")
+        raise NeecoError(f"--sets {word}: the number of images must be at least 1 (got {count})")
     return ImageSet(name, Path(folder), int(count))

@@ -48,7 +48,7 @@ def run(args: Ingest) -> int:
     if folder is not None:
         if args.strict or args.json is not None:  # they are of a verdict, and what is converted has none
             option = "--strict" if args.strict else "--json"
-            raise NeecoError(f"{folder}: {option} would be ignored with it; leave it out")
+            raise NeecoError(f"{folder}: {option} has no effect with it; leave it out")
         for sentence in convert_folder(folder, output):
             print(f"note: {visible(sentence)}")
         print(f"capture: {output}  (next: neeco check {shlex.quote(str(output))})")
@@ -72,7 +72,7 @@ def _list_formats() -> int:
     from neeco.ingest.readers import recording_formats
 
     table = Table("format", "read of it", "extra")
-    for known in recording_formats():
-        table.add_row(known.format, known.holds, known.extra or "")
+    for reader in recording_formats():
+        table.add_row(reader.format, reader.holds, reader.extra or "")
     whole_lines().print(table)
     return 0

@@ -69,14 +69,14 @@ def _table(scores: dict[str, Any]) -> Table:
 def _lines(scores: dict[str, Any]) -> list[str]:
     """The numbers that belong to no part."""
 
-    def shown(value: float | None) -> str:
+    def formatted(value: float | None) -> str:
         return "-" if value is None else f"{value:.3f}"
 
     splits = f" of {', '.join(scores['splits'])}" if scores["splits"] else ""
-    challenge = shown(scores["instrument"]["challenge_iou"])
+    challenge = formatted(scores["instrument"]["challenge_iou"])
     lines = [f"{scores['images']} images{splits}; Challenge IoU of the instrument {challenge}"]
     if scores["classes"] is not None:
-        lines[0] += f", of its parts {shown(scores['classes']['challenge_iou'])}"
+        lines[0] += f", of its parts {formatted(scores['classes']['challenge_iou'])}"
     for pair, way in scores["pair_assignment"].items():
         if way == "swapped":
             lines.append(f"{pair}: left and right are taken the other way round, which fits this folder better")

@@ -86,7 +86,7 @@ def _runs(arguments: Arguments) -> tuple[Path, tuple[Path, ...]]:
     if (arguments.run is None) == (arguments.tissue is None):
         raise NeecoError("synthesize: give a RUN, or --tissue RUN with --instruments RUN ...; one of the two")
     if (arguments.tissue is None) != (not arguments.instruments):
-        raise NeecoError("--instruments: goes with --tissue RUN, and that with it; give both or neither")
+        raise NeecoError("--instruments: needs --tissue RUN, and --tissue needs it; give both or neither")
     if arguments.run is not None:
         return arguments.run, ()
     assert arguments.tissue is not None

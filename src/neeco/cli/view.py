@@ -71,7 +71,7 @@ def run(arguments: Arguments) -> int:
 def is_capture(path: Path) -> bool:
     """Whether a folder is a capture, and no run. Raises NeecoError where nothing is there."""
     if not path.exists():
-        raise NeecoError(f"{path}: no such run folder, nor a capture; correct the path")
+        raise NeecoError(f"{path}: neither a run folder nor a capture; correct the path")
     return (path / "transforms.json").is_file() and not (path / "config.yaml").exists()
 
 

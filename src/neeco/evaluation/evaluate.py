@@ -54,10 +54,10 @@ if TYPE_CHECKING:
 class EvaluationSettings:
     """Thresholds of shadows, and the timing of renderings."""
 
-    missing_light: float = 0.15  # share of the tissue's light, from which a pixel is in shadow
-    min_shadow: float = 1e-3  # share of the image: a smaller shadow has no score
-    timed: int = 7  # renderings, after two to warm up
-    max_timed_s: float = 10.0  # after which a slow scene is not rendered again
+    missing_light: float = 0.15  # share of the tissue's light that is lost, from which a pixel is in shadow
+    min_shadow: float = 1e-3  # minimum area of a shadow that is scored, as a share of the image
+    timed: int = 7  # number of timed renderings, after two to warm up
+    max_timed_s: float = 10.0  # time after which a slow scene is not rendered again
 
 
 SETTINGS = EvaluationSettings()
@@ -283,15 +283,15 @@ def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[
     quality = quality_of(tally.counts)
     numbers |= {"estimated_iou": quality and quality.iou, "estimated_recall": quality and quality.recall}
     numbers["mask_frames"] = sum(row["psnr_instrument"] is not None for row in tally.scores)
-    known = {part for _, part in scene.label_names}
-    known |= {pair for pair, both in pairs_of(tally.parts.names.values()).items() if known & set(both)}
+    learned = {part for _, part in scene.label_names}
+    learned |= {pair for pair, both in pairs_of(tally.parts.names.values()).items() if learned & set(both)}
     parts: dict[str, float | None] = dict.fromkeys(part_scores(tally.parts.names))
     assignment: dict[str, str] = {}
     if tally.parts.rows:
         means, assignment = tally.parts.result()
-        parts |= {part: value for part, value in means.items() if part in known}
+        parts |= {part: value for part, value in means.items() if part in learned}
     numbers["part_iou"] = parts
-    return numbers, {pair: way for pair, way in assignment.items() if pair in known}
+    return numbers, {pair: way for pair, way in assignment.items() if pair in learned}
 
 
 @torch.no_grad()

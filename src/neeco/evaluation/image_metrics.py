@@ -192,10 +192,10 @@ def find_lpips(folder: Path | None = None) -> dict[str, Lpips]:
         folder, source = Path(value), WEIGHTS_VARIABLE
     if not folder.is_dir():
         raise NeecoError(f"{folder}: {source}: no such folder; name the one that holds alexnet.safetensors")
-    found = {name: load_lpips(path, name) for name in NETWORKS if (path := folder / f"{name}.safetensors").exists()}
-    if not found:
+    loaded = {name: load_lpips(path, name) for name in NETWORKS if (path := folder / f"{name}.safetensors").exists()}
+    if not loaded:
         raise NeecoError(f"{folder}: {source}: holds neither alexnet.safetensors nor vgg16.safetensors")
-    return found
+    return loaded
 
 
 def load_lpips(path: Path, network: str) -> Lpips:

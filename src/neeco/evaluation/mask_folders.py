@@ -128,22 +128,22 @@ def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str
         files = {name.removesuffix(suffix): file for name, file in pictures.items() if name.endswith(suffix)}
         if files:
             break
-    found = {file: set(np.unique(read_ids(file)).tolist()) - {0} for file in files.values()}
-    ids = set().union(*found.values())
+    ids_of_file = {file: set(np.unique(read_ids(file)).tolist()) - {0} for file in files.values()}
+    ids = set().union(*ids_of_file.values())
     notes: tuple[str, ...] = ()
     names = classes if classes is not None or suffix == MASK_SUFFIX else stated_names(path)
-    known = {255: "instrument"} if suffix == MASK_SUFFIX else USUAL_NAMES
+    part_of_id = {255: "instrument"} if suffix == MASK_SUFFIX else USUAL_NAMES
     if names is not None:
-        known = names
+        part_of_id = names
     elif not suffix and ids in ({1}, {255}):
-        known = dict.fromkeys(ids, "instrument")
+        part_of_id = dict.fromkeys(ids, "instrument")
         if ids == {1}:
             notes = (f"{path}: its ids are 0 and 1: read as a mask of the instrument; name parts with {option}",)
     elif suffix != MASK_SUFFIX:
         names = USUAL_NAMES
-    for file, values in found.items():
-        if unknown := sorted(values - set(known)):
-            meaning = ", ".join(f"{number} {part}" for number, part in known.items())
+    for file, values in ids_of_file.items():
+        if unknown := sorted(values - set(part_of_id)):
+            meaning = ", ".join(f"{number} {part}" for number, part in part_of_id.items())
             raise NeecoError(f"{file}: id {unknown[0]} is not among {meaning}; name it with {option} PART={unknown[0]}")
     return Masks(path, files, names, notes)
 

@@ -62,7 +62,7 @@ def pairs_of(parts: Iterable[str]) -> dict[str, tuple[str, str]]:
     names = tuple(parts)
     pairs = {}
     for left in names:
-        right, count = _LEFT.subn(lambda found: found[0].replace("left", "right"), left)
+        right, count = _LEFT.subn(lambda match: match[0].replace("left", "right"), left)
         if count and right in names:
             pairs[_LEFT.sub("", left).strip("_") + "s"] = left, right
     return pairs
@@ -152,13 +152,13 @@ def boundary_f(
     there are pixels but neither has a contour (both fill the image), 0 when only one has.
     """
     everywhere = np.ones(mask.shape, bool) if counted is None else counted
-    shown = [bool((image & everywhere).any()) for image in (mask, truth)]
-    if not any(shown):
+    present = [bool((image & everywhere).any()) for image in (mask, truth)]
+    if not any(present):
         return math.nan
     contours = boundary_pixels(mask), boundary_pixels(truth)
     judged = [int((contour & everywhere).sum()) for contour in contours]
     if not judged[0] or not judged[1]:
-        return float(judged[0] == judged[1] and shown[0] == shown[1])
+        return float(judged[0] == judged[1] and present[0] == present[1])
     radius = math.ceil(tolerance * math.hypot(*mask.shape))
     either = contours[0] | contours[1]
     (window,) = ndimage.find_objects(either.astype(np.uint8))  # distances outside it are never needed

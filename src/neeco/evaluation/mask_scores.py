@@ -56,7 +56,7 @@ def score_masks(
     tables = [_table(names, numbers) for names in (ours, theirs)]
     whole = PartTally({1: "instrument"}, tuple(SCORES.values()))
     parts = PartTally({number: part for part, number in numbers.items()}, tuple(SCORES.values()))
-    shown, visible = list[list[str]](), list[list[str]]()  # of each image: whether its truth has the whole, the parts
+    wholes, visible = list[list[str]](), list[list[str]]()  # of each image: whether its truth has the whole, the parts
     for index, name in enumerate(sorted(truths.files)):
         ids, counted = truths.load(name), truths.counted(name)
         guess = predictions.load(name) if name in predictions.files else np.zeros_like(ids)
@@ -68,7 +68,7 @@ def score_masks(
         parts.add(tables[0][guess], tables[1][ids], counted)
         counting = ids if counted is None else ids[counted]
         present = np.unique(tables[1][counting])
-        shown.append(["instrument"] if counting.any() else [])
+        wholes.append(["instrument"] if counting.any() else [])
         visible.append([part for part, number in numbers.items() if number in present])
         if progress is not None:
             progress(index + 1, len(truths.files))
@@ -95,7 +95,7 @@ def score_masks(
             "truth": str(truths.path),
             "splits": list(dict.fromkeys(frame.split for frame in truths.frames.values())) or None,
             "images": len(truths.files),
-            "instrument": instrument | {"challenge_iou": _challenge(whole, shown, {})},
+            "instrument": instrument | {"challenge_iou": _challenge(whole, wholes, {})},
             "parts": rows if theirs else None,
             "classes": {"challenge_iou": _challenge(parts, visible, swap)} if theirs else None,
             "pair_assignment": assignment,

@@ -84,7 +84,7 @@ class Camera:
         object.__setattr__(self, "world_from_camera", pose)
         try:
             fault = camera_fault(self.fx, self.fy, self.cx, self.cy, self.width, self.height, near=self.near)
-            shown = all(math.isfinite(number) for number in (*self.distortion, *(self.border or ())))
+            finite = all(math.isfinite(number) for number in (*self.distortion, *(self.border or ())))
         except (TypeError, ValueError, OverflowError):
             raise NeecoError("Camera: expected numbers of px; correct them") from None
         if fault is not None:
@@ -93,7 +93,7 @@ class Camera:
             raise NeecoError(
                 f"Camera.distortion: has {len(self.distortion)} coefficients; OpenCV has 4, 5, 8, 12 or 14"
             )
-        if not shown or (self.border is not None and self.border[2] <= 0):
+        if not finite or (self.border is not None and self.border[2] <= 0):
             raise NeecoError("Camera: distortion, border: must be finite, the radius positive; correct them")
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))

@@ -16,11 +16,11 @@ from neeco.geometry.camera import Camera
 class DistortionSettings:
     """Tolerances and steps of undistortion."""
 
-    max_slope: float = 3.0  # (72 degrees) of a ray that a lens may bend into the image
+    max_slope: float = 3.0  # limit on the slope of a ray that a lens may bend into the image (72 degrees)
     max_miss_px: float = 0.05  # distance of a distorted ray from the pixel that it was found for
-    n_newton_steps: int = 6  # at most, from a first guess
+    n_newton_steps: int = 6  # limit on the steps of Newton's method from a first guess
     node_spacing_px: int = 4  # between pixels whose rays are computed; the others are interpolated, to 0.01 px
-    derivative_step: float = 1e-6  # slope, over which the derivative of a distortion is taken
+    derivative_step: float = 1e-6  # slope over which the derivative of a distortion is taken
 
 
 DISTORTION = DistortionSettings()
@@ -39,8 +39,8 @@ def distorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
     if not len(slopes) or not any(distortion):
         return slopes
     points = np.concatenate([slopes, np.ones((len(slopes), 1))], 1)
-    found = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), np.array(distortion))[0]
-    return np.asarray(found[:, 0])
+    pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), np.array(distortion))[0]
+    return np.asarray(pixels[:, 0])
 
 
 def undistorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
@@ -50,21 +50,21 @@ def undistorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray
     """
     if not len(slopes) or not any(distortion):
         return slopes
-    found = slopes.astype(np.float64)
+    estimate = slopes.astype(np.float64)
     with np.errstate(all="ignore"):
         for _ in range(DISTORTION.n_newton_steps):
-            here = distorted(found, distortion)
+            here = distorted(estimate, distortion)
             (a, c), (b, d) = (
                 (
-                    (distorted(found + DISTORTION.derivative_step * axis, distortion) - here)
+                    (distorted(estimate + DISTORTION.derivative_step * axis, distortion) - here)
                     / DISTORTION.derivative_step
                 ).T
                 for axis in np.eye(2)
             )  # columns of the Jacobian
             x, y = (slopes - here).T
-            found = found + (np.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)).T
-            found = np.clip(np.nan_to_num(found), -2 * DISTORTION.max_slope, 2 * DISTORTION.max_slope)
-    return found
+            estimate = estimate + (np.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)).T
+            estimate = np.clip(np.nan_to_num(estimate), -2 * DISTORTION.max_slope, 2 * DISTORTION.max_slope)
+    return estimate
 
 
 def pixels_of_rays(slopes: np.ndarray, camera: Camera) -> np.ndarray:
@@ -73,9 +73,9 @@ def pixels_of_rays(slopes: np.ndarray, camera: Camera) -> np.ndarray:
     margin = 1 / camera.fx  # to the edges of the outermost pixels
     with np.errstate(invalid="ignore"):
         inside = ((slopes > field.lowest - margin) & (slopes < field.highest + margin)).all(1)
-    found = np.full(slopes.shape, np.nan)
-    found[inside] = distorted(slopes[inside], camera.distortion) * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    return found if camera.border is None else np.where(within(found, camera.border)[:, None], found, np.nan)
+    pixels = np.full(slopes.shape, np.nan)
+    pixels[inside] = distorted(slopes[inside], camera.distortion) * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    return pixels if camera.border is None else np.where(within(pixels, camera.border)[:, None], pixels, np.nan)
 
 
 def rays_of_pixels(pixels: np.ndarray, camera: Camera) -> np.ndarray:
@@ -129,15 +129,15 @@ def _lens_field(
     )
     slopes = undistorted((nodes.reshape(-1, 2) - center) / focal, distortion)
     again = distorted(slopes, distortion) * focal + center
-    shown = (np.abs(slopes) <= DISTORTION.max_slope).all(1) & (
+    valid = (np.abs(slopes) <= DISTORTION.max_slope).all(1) & (
         np.abs(again - nodes.reshape(-1, 2)) < DISTORTION.max_miss_px
     ).all(1)
-    slopes = np.where(shown[:, None], slopes, np.nan).reshape(nodes.shape).astype(np.float32)
+    slopes = np.where(valid[:, None], slopes, np.nan).reshape(nodes.shape).astype(np.float32)
     slopes = _between(_between(slopes, height).transpose(1, 0, 2), width).transpose(1, 0, 2)
     if border is not None:
         slopes = np.where(within(_centers(width, height), border)[..., None], slopes, np.float32(np.nan))
-    known = slopes[~np.isnan(slopes[..., 0])]
-    lowest, highest = (pick(known, 0).astype(np.float64) if len(known) else np.zeros(2) for pick in (np.min, np.max))
+    rays = slopes[~np.isnan(slopes[..., 0])]
+    lowest, highest = (pick(rays, 0).astype(np.float64) if len(rays) else np.zeros(2) for pick in (np.min, np.max))
     return LensField(np.ascontiguousarray(slopes), lowest, highest)
 
 

@@ -69,16 +69,16 @@ class Lens:
 
     def intrinsics_json(self) -> dict[str, Any]:
         """Intrinsics fl_x, fl_y, cx, cy, px, and where given k1, k2, p1, p2, k3 ... and border {cx, cy, radius}, px."""
-        found: dict[str, Any] = dict(zip(INTRINSICS, self.intrinsics, strict=True))
-        found |= dict(zip(COEFFICIENT_NAMES, self.distortion, strict=False))
-        return found if self.border is None else found | {"border": dict(zip(BORDER, self.border, strict=True))}
+        values: dict[str, Any] = dict(zip(INTRINSICS, self.intrinsics, strict=True))
+        values |= dict(zip(COEFFICIENT_NAMES, self.distortion, strict=False))
+        return values if self.border is None else values | {"border": dict(zip(BORDER, self.border, strict=True))}
 
     def check_size(self, size: tuple[int, int], source: object) -> None:
         """Raise NeecoError naming `source` when the lens was measured on images of another size (width, height)."""
         if self.size is not None and self.size != tuple(size):
-            measured, found = "x".join(map(str, self.size)), "x".join(map(str, size))
+            measured, actual = "x".join(map(str, self.size)), "x".join(map(str, size))
             raise NeecoError(
-                f"{source}: calibrated on {measured} images, the video is {found}; calibrate at the video's size, or "
+                f"{source}: calibrated on {measured} images, the video is {actual}; calibrate at the video's size, or "
                 "scale fl_x, fl_y, cx, cy and the size if the video was only resized"
             )
         fault = center_fault(self.cx, self.cy, *size) or focal_fault(self.fl_x, self.fl_y, *size)
@@ -92,11 +92,11 @@ class Lens:
             return Lens(*self.intrinsics, (), size)
         matrix, _ = cv2.getOptimalNewCameraMatrix(self._matrix(), self._coefficients(), size, 0.0)
         fl_x, fl_y, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        found = Lens(fl_x, fl_y, cx + 0.5, cy + 0.5, (), size)
-        if not (0.2 < fl_x / self.fl_x < 5 and 0.2 < fl_y / self.fl_y < 5) or self._folds(found, size):
+        pinhole = Lens(fl_x, fl_y, cx + 0.5, cy + 0.5, (), size)
+        if not (0.2 < fl_x / self.fl_x < 5 and 0.2 < fl_y / self.fl_y < 5) or self._folds(pinhole, size):
             listed = ", ".join(f"{value:g}" for value in self.distortion)
             raise NeecoError(f"lens: distortion {listed} folds the image over; calibrate again")
-        return found
+        return pinhole
 
     def undistort(self, image: np.ndarray) -> np.ndarray:
         """Undistort an image uint8 [H, W, 3] (or [H, W]) to that of `pinhole`, bilinear."""

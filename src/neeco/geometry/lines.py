@@ -43,12 +43,12 @@ def robust_nearest_point(
 ) -> np.ndarray:
     """`nearest_point` under a Cauchy loss whose scale is the median distance, at least `min_scale`."""
     weights = np.ones(len(points))
-    found = points.mean(0)
+    point = points.mean(0)
     for _ in range(iterations):
-        found = nearest_point(points, directions, weights=weights, ridge=1e-9)
-        distances = distances_to_lines(found, points, directions)
+        point = nearest_point(points, directions, weights=weights, ridge=1e-9)
+        distances = distances_to_lines(point, points, directions)
         weights = 1 / (1 + (distances / max(float(np.median(distances)), min_scale)) ** 2)
-    return found
+    return point
 
 
 def distances_to_lines(point: np.ndarray, points: np.ndarray, directions: np.ndarray) -> np.ndarray:

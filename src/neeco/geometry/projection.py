@@ -50,8 +50,8 @@ def unproject_world(pixels: Tensor, depths: Tensor, camera: Camera) -> Tensor:
     if camera.is_pinhole:
         slopes = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1)
     else:
-        given = pixels.detach().cpu().double().numpy()
-        slopes = torch.from_numpy(rays_of_pixels(given.reshape(-1, 2), camera).reshape(given.shape)).to(pixels)
+        array = pixels.detach().cpu().double().numpy()
+        slopes = torch.from_numpy(rays_of_pixels(array.reshape(-1, 2), camera).reshape(array.shape)).to(pixels)
     rays = torch.cat([slopes, torch.ones_like(u)[..., None]], -1)
     return (rays * depths[..., None]) @ pose[:3, :3].T + pose[:3, 3]
 

@@ -11,10 +11,10 @@ import numpy as np
 class TrocarSettings:
     """Thresholds of motion about a trocar."""
 
-    min_lever_mm: float = 40.0  # from the instrument to its trocar
+    min_lever_mm: float = 40.0  # least distance in mm from the instrument to its trocar
     # root mean square distance of a trocar from the line: beyond, a wrist bends the tracked frame
     max_bend_mm: float = 0.3
-    min_travel_mm: float = 2.0  # in and out, from which a line has a direction
+    min_travel_mm: float = 2.0  # least travel in and out, in mm, of a line with a direction
 
 
 TROCAR = TrocarSettings()
@@ -42,12 +42,12 @@ def line_through_trocar(poses: np.ndarray, max_bend_mm: float = TROCAR.max_bend_
         axis = np.linalg.svd(local, full_matrices=False)[2][0]
         return np.asarray((local - np.outer(local @ axis, axis)).ravel())
 
-    found = least_squares(off, np.zeros(3))  # where arms with a remote centre of motion have it
-    local = np.einsum("fij,fj->fi", back, found.x - places)
+    solution = least_squares(off, np.zeros(3))  # where arms with a remote centre of motion have it
+    local = np.einsum("fij,fj->fi", back, solution.x - places)
     middle = local.mean(0)
     axis = np.linalg.svd(local - middle, full_matrices=False)[2][0]
     travel = float(np.ptp(local @ axis))
-    rms = float(np.sqrt(np.square(found.fun).sum() / len(poses)))
+    rms = float(np.sqrt(np.square(solution.fun).sum() / len(poses)))
     if np.linalg.norm(local, axis=1).min() < TROCAR.min_lever_mm or rms > max_bend_mm or travel < TROCAR.min_travel_mm:
         return None
     axis = -axis if axis @ middle > 0 else axis

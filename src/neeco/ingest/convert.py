@@ -45,8 +45,8 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
         capture, notes = capture_of(parsed), _absent_images(parsed)
         frames = list(capture.frames)
         if tool_masks:
-            frames, found = _with_tool_masks(frames, tool_masks, work / "tool")
-            notes += found
+            frames, mask_notes = _with_tool_masks(frames, tool_masks, work / "tool")
+            notes += mask_notes
         border = None if any(frame.mask_path for frame in frames) else _shared_border(frames)
         if border is not None:
             visible = visible_mask(border, (frames[0].camera.width, frames[0].camera.height))
@@ -75,12 +75,12 @@ def _absent_images(parsed: Parsed) -> list[str]:
 def _inverted_masks(capture: Capture) -> list[str]:
     """Return notes on loss masks that may be inverted."""
     masked = [frame for frame in capture.frames if frame.mask_path is not None]
-    points, found = measured_sample(capture.points), []
+    points, hidden = measured_sample(capture.points), []
     for index in evenly_spaced(len(masked), BORDERS.max_frames, floor=True):
         frame, mask = masked[index], masked[index].load_mask_pixels()
         assert mask is not None
-        found.append(measure_hidden(frame.load_pixels(), mask, frame.camera, points))
-    fault = masks_fault(found)
+        hidden.append(measure_hidden(frame.load_pixels(), mask, frame.camera, points))
+    fault = masks_fault(hidden)
     return [] if fault is None else [f"Warning: {fault[0]} {fault[1]}."]
 
 
@@ -116,9 +116,9 @@ def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path)
     fault = masks_fault(white)
     masked = []
     for frame, mask, size in zip(frames, masks, sizes, strict=True):
-        shown = read_mask(mask, size)
+        is_white = read_mask(mask, size)
         path = work / f"{frame.name}.png"
-        write_labels(path, (shown if fault is not None else ~shown).to(torch.uint8) * 255)
+        write_labels(path, (is_white if fault is not None else ~is_white).to(torch.uint8) * 255)
         masked.append(replace(frame, mask_path=path))
     if fault is None:
         return masked, []
@@ -147,9 +147,9 @@ def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
             "The source names no unit of length: numbers are kept and read as mm, so lengths may be off by one factor."
         )
     if parsed.points is None or not parsed.points.measured:
-        sentences.append("No sparse points: training starts from random ones, and gets less.")
+        sentences.append("No sparse points: training starts from random ones, with a poorer result.")
     if not parsed.timed:
-        sentences.append("No times: the order of the frames stands in for seconds.")
+        sentences.append("No times: the order of the frames is used instead of seconds.")
     if masked:
         sentences.append("Tool masks became loss masks: the tool's pixels are ignored, so the tool is not learned.")
     if all(frame.split != "test" for frame in parsed.frames):

@@ -44,7 +44,7 @@ class SplitSettings:
     """Settings of the choice of frames that test."""
 
     unseen_margin: int = 3  # video frames on each side of an unseen one chosen by us that no other split may use
-    min_range: float = 0.1  # rad that a joint's readings must span to be split by
+    min_range: float = 0.1  # minimum range of a joint's readings, rad, by which frames are split
     test_every: int = 8  # frames, or episodes, of which one tests unless the recording states otherwise
 
 
@@ -133,16 +133,16 @@ def _right_frames(data: Episodes, right: RightCamera, frames: Sequence[Frame], r
     if not taken:
         return ()
     times = np.array([frame.state.time + right.delays[row] for frame, row in taken])
-    states, known = data.states_at(times)
-    camera, found = right.pinhole.camera(right.world_from_camera), []
+    states, valid = data.states_at(times)
+    camera, right_frames = right.pinhole.camera(right.world_from_camera), []
     for index, (frame, row) in enumerate(taken):
-        if known[index]:
+        if valid[index]:
             path, state = right.folder / right.names[row], frame.state
             if right.delays[row] != 0:
                 uncertainty = next((item.uncertainty for item in state.instruments.values()), None)
                 state = _state(states, index, float(times[index]), uncertainty)
-            found.append(replace(frame, image_path=path, camera=camera, state=state, mask_path=right.mask))
-    return tuple(found)
+            right_frames.append(replace(frame, image_path=path, camera=camera, state=state, mask_path=right.mask))
+    return tuple(right_frames)
 
 
 def _result(
@@ -187,8 +187,8 @@ def _result(
 def _left_out(world: World, splits: np.ndarray) -> dict[int, DropReason]:
     """Return why chosen video frames are not in the capture, by frame."""
     views, shaft = world.views, world.shaft
-    found = set(world.images.selected.tolist()) - set(views.frames.tolist())
-    reasons = dict.fromkeys(found, DropReason("no camera: too few of its features match other frames"))
+    without_camera = set(world.images.selected.tolist()) - set(views.frames.tolist())
+    reasons = dict.fromkeys(without_camera, DropReason("no camera: too few of its features match other frames"))
     for row in np.flatnonzero(~world.usable).tolist():
         unseen = shaft is not None and not shaft.known[row]
         why = NOT_VISIBLE if unseen else "no instrument state at its time (gap in a log)"

@@ -54,5 +54,5 @@ class IngestRequest:
     @property
     def options(self) -> list[str]:
         """The options that state a recording and are given, as the command line spells them."""
-        given = (item.name for item in fields(IngestRequest) if getattr(self, item.name) != item.default)
-        return [f"--{name.replace('_', '-')}" for name in given if name != "source"]
+        names = (item.name for item in fields(IngestRequest) if getattr(self, item.name) != item.default)
+        return [f"--{name.replace('_', '-')}" for name in names if name != "source"]

@@ -68,9 +68,9 @@ class IngestResult:
         name = self._episode_of(frame)
         if name is None:
             return {clock: float(ahead.at(np.array(seconds))) for clock, ahead in self.clocks.items()}
-        own = seconds - self.episode_starts[name]
+        local = seconds - self.episode_starts[name]
         return {
-            clock: float(ahead.at(np.array(own)))
+            clock: float(ahead.at(np.array(local)))
             for clock, ahead in self.clocks.items()
             if clock.endswith(f" of {name}")
         }
@@ -120,39 +120,39 @@ class IngestResult:
     def lines(self) -> list[str]:
         """Return what was found, for a terminal."""
         numbers = self.as_json()
-        shown = [f"{numbers['kept']} of {numbers['video_frames']} video frames kept, {numbers['points']} points"]
+        lines = [f"{numbers['kept']} of {numbers['video_frames']} video frames kept, {numbers['points']} points"]
         for name, (first, last) in self.episodes.items():
             count = int(((self.selected >= first) & (self.selected <= last)).sum())
-            shown.append(f"episode {name}: {count} of {last + 1 - first} frames kept")
+            lines.append(f"episode {name}: {count} of {last + 1 - first} frames kept")
         if self.still:
-            shown.append(f"still scope: the world is its camera's frame; the tissue's depth is {self.depth_source}")
+            lines.append(f"still scope: the world is its camera's frame; the tissue's depth is {self.depth_source}")
         if not self.registered:
-            shown.append("not registered: instrument poses stay in their tracker's frame")
+            lines.append("not registered: instrument poses stay in their tracker's frame")
         elif self.registration is not None:
             fit = numbers["registration"]
-            shown.append(f"registered to {fit['position_rms_mm']:.2f} mm, {fit['rotation_rms_deg']:.2f} deg rms")
-        shown += [f"clock {name}: {clock} ({clock.source})" for name, clock in self.clocks.items()]
-        shown += [f"cameras: {sentence}" for sentence in self.search]
-        return shown + [f"note: {note}" for note in self.notes]
+            lines.append(f"registered to {fit['position_rms_mm']:.2f} mm, {fit['rotation_rms_deg']:.2f} deg rms")
+        lines += [f"clock {name}: {clock} ({clock.source})" for name, clock in self.clocks.items()]
+        lines += [f"cameras: {sentence}" for sentence in self.search]
+        return lines + [f"note: {note}" for note in self.notes]
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictSettings:
     """Limits beyond which there is a warning: conventions, not measurements."""
 
-    position_mm: float = 1.0  # rms
-    rotation_deg: float = 0.5  # rms
+    position_mm: float = 1.0  # RMS position residual of the registration
+    rotation_deg: float = 0.5  # RMS rotation residual of the registration
     reprojection_px: float = 1.0
-    scale: float = 0.015  # standard deviation, share
-    clock_mm: float = 0.5  # that an instrument moves within the standard deviation of its clock
+    scale: float = 0.015  # standard deviation of the scale, share
+    clock_mm: float = 0.5  # motion of an instrument within the standard deviation of its clock
     base_mm: float = 2.0  # standard deviation of a base
-    base_deg: float = 1.5  # the same
-    severe: float = 3.0  # times the limit
-    min_points: int = 100  # of the tissue
-    min_overlap: float = 0.85  # of a base's outline with what moves: right bases reach 0.92 to 0.97 (measured once)
-    min_plausible_overlap: float = 0.7  # the same, below which the base is doubtful
-    max_shown: int = 5  # warnings listed by `lines`
-    facts: int = 2  # of an assessment
+    base_deg: float = 1.5  # standard deviation of a base's rotation
+    severe: float = 3.0  # factor on a limit, above which a capture is doubtful
+    min_points: int = 100  # minimum number of tissue points
+    min_overlap: float = 0.85  # minimum overlap of a base's outline with what moves: right bases reach 0.92 to 0.97
+    min_plausible_overlap: float = 0.7  # minimum overlap; below it, the base is doubtful
+    max_shown: int = 5  # maximum number of warnings listed by `lines`
+    facts: int = 2  # number of facts of an assessment
 
 
 LIMITS = VerdictSettings()
@@ -186,15 +186,15 @@ class Assessment:
         verdict, _, rest = self.headline.partition(":")
         others = self.others
         words = {"good": f"good. {self.headline}", "careful": self.headline, "bad": f"{verdict.upper()}:{rest}"}
-        shown = [words[self.level]]
-        shown += [f"  - {warning}" for warning in others[: LIMITS.max_shown]]
+        lines = [words[self.level]]
+        lines += [f"  - {warning}" for warning in others[: LIMITS.max_shown]]
         left = len(others) - LIMITS.max_shown
-        return shown + ([f"  - and {left} more warnings"] if left > 0 else [])
+        return lines + ([f"  - and {left} more warnings"] if left > 0 else [])
 
     def as_json(self) -> dict[str, Any]:
         """Return the verdict for scripts (`--json`)."""
-        found = {"verdict": VERDICTS[self.level], "headline": self.headline, "doubts": list(self.warnings)}
-        return found | {"advice": ADVICE[self.level], "facts": list(self.facts)}
+        verdict = {"verdict": VERDICTS[self.level], "headline": self.headline, "doubts": list(self.warnings)}
+        return verdict | {"advice": ADVICE[self.level], "facts": list(self.facts)}
 
 
 @dataclass(frozen=True)
@@ -292,38 +292,38 @@ def _lower(sentence: str) -> str:
 def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
     """Return what was measured, the most telling first."""
     linked = {item.name for item in capture.instruments if item.kinematics is not None}
-    found = [item for name, base in result.bases.items() for item in _of_base(name, base, linked=name in linked)]
+    evidence = [item for name, base in result.bases.items() for item in _of_base(name, base, linked=name in linked)]
     registration = result.registration
     if registration is not None:
         position = rms(registration.position_residual)
         says = f"cameras and laparoscope tracker agree to {position:.2f} mm rms (usual: {LIMITS.position_mm:g} or less)"
         warning = f"Cameras and laparoscope tracker disagree by {position:.2f} mm rms."
-        found.append(_Evidence.measured(says, position, LIMITS.position_mm, warning))
+        evidence.append(_Evidence.measured(says, position, LIMITS.position_mm, warning))
     if (pixels := result.reprojection_px) is not None:
         says = f"tissue points are reprojected to {pixels:.2f} px (usual: {LIMITS.reprojection_px:g} or less)"
         warning = f"Tissue points are off by {pixels:.2f} px on average in the images they were found in."
-        found.append(_Evidence.measured(says, pixels, LIMITS.reprojection_px, warning))
+        evidence.append(_Evidence.measured(says, pixels, LIMITS.reprojection_px, warning))
     if registration is not None:
         rotation = float(np.degrees(rms(registration.rotation_residual)))
         says = f"cameras and laparoscope tracker agree to {rotation:.2f}° rms (usual: {LIMITS.rotation_deg:g} or less)"
         warning = f"Cameras and laparoscope tracker disagree by {rotation:.2f}° rms."
-        found.append(_Evidence.measured(says, rotation, LIMITS.rotation_deg, warning))
+        evidence.append(_Evidence.measured(says, rotation, LIMITS.rotation_deg, warning))
         says = f"lengths are known to {registration.scale_sd:.1%} (usual: {LIMITS.scale:.1%} or less)"
         warning = f"Lengths are known to {registration.scale_sd:.1%} only: the scope travelled too little."
-        found.append(_Evidence.measured(says, registration.scale_sd, LIMITS.scale, warning))
-        found += _placed(registration, capture, result.bases)
+        evidence.append(_Evidence.measured(says, registration.scale_sd, LIMITS.scale, warning))
+        evidence += _placed(registration, capture, result.bases)
     for name, clock in result.clocks.items():
         moved = clock_cost_mm(name, clock.sd, capture)
         if moved is not None:
-            known = f"Clock {name} is known to ±{clock.sd * 1000:.0f} ms, up to {moved:.1f} mm of instrument motion."
-            fact = f"{_lower(known).rstrip('.')} (usual: {LIMITS.clock_mm:g} or less)"
-            found.append(_Evidence.measured(fact, moved, LIMITS.clock_mm, known))
+            sentence = f"Clock {name} is known to ±{clock.sd * 1000:.0f} ms, up to {moved:.1f} mm of instrument motion."
+            fact = f"{_lower(sentence).rstrip('.')} (usual: {LIMITS.clock_mm:g} or less)"
+            evidence.append(_Evidence.measured(fact, moved, LIMITS.clock_mm, sentence))
     train = len(capture.split("train"))
     fact = f"{train} frames to train on (usual: {PLAUSIBLE.few_train_frames} or more)"
     few = train < PLAUSIBLE.few_train_frames
-    found.append(_Evidence(fact, 2 if few else 0, f"Only {train} frames are left to train on."))
-    found.append(_Evidence(f"{result.points:,} tissue points (usual: {LIMITS.min_points} or more)", 0))
-    return found
+    evidence.append(_Evidence(fact, 2 if few else 0, f"Only {train} frames are left to train on."))
+    evidence.append(_Evidence(f"{result.points:,} tissue points (usual: {LIMITS.min_points} or more)", 0))
+    return evidence
 
 
 def _placed(registration: Registration, capture: Capture, found_in_images: Collection[str]) -> list[_Evidence]:
@@ -338,12 +338,12 @@ def _placed(registration: Registration, capture: Capture, found_in_images: Colle
     if not places:
         return []
     sds = registration.placement_sd(np.stack(places))
-    found = []
+    evidence = []
     for sd, unit, limit in zip(sds, (" mm", "°"), (HAND_EYE.placed_mm, HAND_EYE.placed_deg), strict=True):
-        known = f"the place of instruments in the images is known to ±{sd:.1f}{unit}"
-        warning = f"{known[0].upper()}{known[1:]} only (hand-eye calibration): record more turns of the scope."
-        found.append(_Evidence(f"{known} (usual: {limit:g} or less)", 0 if sd <= limit else 1, warning))
-    return found
+        fact = f"the place of instruments in the images is known to ±{sd:.1f}{unit}"
+        warning = f"{fact[0].upper()}{fact[1:]} only (hand-eye calibration): record more turns of the scope."
+        evidence.append(_Evidence(f"{fact} (usual: {limit:g} or less)", 0 if sd <= limit else 1, warning))
+    return evidence
 
 
 def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Evidence]:
@@ -353,33 +353,33 @@ def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Eviden
     linked: its links are stated in its frame, so that every error of the base counts; else a learned shape makes up for
     a constant offset.
     """
-    found = []
+    evidence = []
     if np.isfinite(overlap := base.overlap):
         level = 0 if overlap >= LIMITS.min_overlap else 1 if overlap >= LIMITS.min_plausible_overlap else 2
         says = f"the outline of {name} and what moves overlap by {overlap:.2f}"
-        warning = f"{says[0].upper()}{says[1:]} only: is its clock right?"
-        found.append(_Evidence(f"{says} (usual: {LIMITS.min_overlap:g} or more)", level, warning))
+        warning = f"{says[0].upper()}{says[1:]} only; check its clock."
+        evidence.append(_Evidence(f"{says} (usual: {LIMITS.min_overlap:g} or more)", level, warning))
     limit_mm, limit_deg = (
         (HAND_EYE.placed_mm, HAND_EYE.placed_deg) if base.tracked else (LIMITS.base_mm, LIMITS.base_deg)
     )
     what = f"the {'place' if base.tracked else 'base'} of {name}"
-    known = [(what, "mm", limit_mm, base.sd_mm), (what, "deg", limit_deg, base.sd_deg)]
+    measured = [(what, "mm", limit_mm, base.sd_mm), (what, "deg", limit_deg, base.sd_deg)]
     if base.shaft is not None and linked:
         sd_mm, sd_deg = base.deviations(frame_about(base.shaft).T)
-        known = [
+        measured = [
             (f"the place of {name} along its shaft", "mm", limit_mm, sd_mm[2:]),
             (f"the place of {name} across its shaft", "mm", limit_mm, sd_mm[:2]),
             (f"the direction of {name}", "deg", limit_deg, sd_deg),
         ]
     elif np.isfinite(base.sd_motion_mm):
-        known = [(f"the motion of {name}", "mm", limit_mm, np.array(base.sd_motion_mm))]
-    for what, unit, limit, sds in known:
+        measured = [(f"the motion of {name}", "mm", limit_mm, np.array(base.sd_motion_mm))]
+    for what, unit, limit, sds in measured:
         worst = float(np.max(sds))
         size = f"±{worst:.1f} {unit}" if np.isfinite(worst) else f"no {unit}"
         fact = f"{what} is known to {size} (usual: {limit:g} or less)"
         warning = f"{what[0].upper()}{what[1:]} is known to {size} only."
-        found.append(_Evidence(fact, 0 if worst <= limit else 1, warning))
-    return found
+        evidence.append(_Evidence(fact, 0 if worst <= limit else 1, warning))
+    return evidence
 
 
 def clock_cost_mm(name: str, sd: float, capture: Capture) -> float | None:

@@ -61,7 +61,7 @@ def sources_of(request: IngestRequest, output: Path | None) -> tuple[Path | None
         raise NeecoError("--output: give the folder of the capture to write")
     ignored = [option for option in request.options if folder is not None or option != "--frames"]
     if request.source and ignored:
-        raise NeecoError(f"{request.source[0]}: {ignored[0]} would be ignored with it; leave one of them out")
+        raise NeecoError(f"{request.source[0]}: {ignored[0]} has no effect with it; leave one of them out")
     if request.frames is not None and request.frames < MIN_FRAMES:
         raise NeecoError(f"--frames: {request.frames} is too few; give {MIN_FRAMES} or more")
     if folder is not None:
@@ -78,9 +78,9 @@ def _folder_to_convert(sources: Sequence[Path]) -> Path | None:
     for source in sources:
         if source.suffix.lower() in VIDEOS:
             raise NeecoError(f"{source}: is a video; give it as --video {shlex.quote(str(source))}")
-        if (known := format_of(source)) is not None and source.exists():
+        if (kind := format_of(source)) is not None and source.exists():
             raise NeecoError(
-                f"{source}: is in a recording's format ({known.format}) but does not state the meaning of its streams; "
+                f"{source}: is in a recording's format ({kind.format}) but does not state the meaning of its streams; "
                 f"write that down first: neeco ingest --init {source}"
             )
         if source.is_dir():

@@ -49,9 +49,9 @@ from neeco.ingest.timing.reading import require_lens
 class WorldSettings:
     """Thresholds between episodes and cameras of a scope that stands still."""
 
-    same_place: float = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
-    mostly_similar: float = 0.7  # of them: less is worth a note
-    same_moment_s: float = 1e-3  # between two cameras' images
+    same_place: float = 0.4  # minimum share of features of one episode's background in place in another's
+    mostly_similar: float = 0.7  # share of these features, below which the change is noted
+    same_moment_s: float = 1e-3  # maximum time between two cameras' images of one moment
 
 
 WORLD = WorldSettings()
@@ -99,8 +99,8 @@ def note_motion_contradiction(data: Episodes, name: str, moves: bool, lag: float
     if lag and not data.notes.is_contradicted(f"sync {clock}"):
         after = "later" if lag > 0 else "earlier"
         sentence = (
-            f"what moves in the images fits the poses of {name} that its log has {abs(lag):.1f} s {after}: is its "
-            f"clock {clock!r} that of the other logs? Give it one of its own (poses: clock), or correct `sync`"
+            f"what moves in the images fits the poses of {name} that its log has {abs(lag):.1f} s {after}: if its "
+            f"clock {clock!r} is not that of the other logs, give it one of its own (poses: clock), else correct `sync`"
         )
     elif lag or not moves:
         sentence = (
@@ -272,8 +272,8 @@ def _compare_motion(
     for name in data.parts[0].poses:
 
         def before_cameras(lag: float, of: str = name) -> tuple[np.ndarray, np.ndarray]:
-            poses, known = data.instrument_poses(of, views.times[rows], lag)
-            return camera_from_world @ np.where(known[:, None, None], poses, np.eye(4)), known
+            poses, valid = data.instrument_poses(of, views.times[rows], lag)
+            return camera_from_world @ np.where(valid[:, None, None], poses, np.eye(4)), valid
 
         lag = best_lag(moved, before_cameras, pinhole, longest_lag(data))
         note_motion_contradiction(data, name, name in shapes, lag)
@@ -362,8 +362,8 @@ def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgre
     backgrounds = {}
     for episode, rows in _rows_by_episode(data, images).items():
         load = images.loader(rows[evenly_spaced(len(rows), STILL_SCOPE.n_frames)])
-        found = find_background(load, min(len(rows), STILL_SCOPE.n_frames))
-        backgrounds[episode] = np.clip(found.colors, 0, 255).astype(np.uint8)
+        background = find_background(load, min(len(rows), STILL_SCOPE.n_frames))
+        backgrounds[episode] = np.clip(background.colors, 0, 255).astype(np.uint8)
     first, *others = backgrounds
     for episode in others:
         share = same_place(backgrounds[first], backgrounds[episode])
@@ -387,16 +387,16 @@ def _right_camera(data: Episodes, images: ChosenImages, folder: Path, progress: 
     camera, names_by_row, delays = None, dict[int, str](), dict[int, float]()
     for episode, rows in _rows_by_episode(data, images).items():
         part = data.parts[episode]
-        own, stems = images.selected[rows] - part.first_frame, [names[row] for row in rows]
-        found = read_right_camera(part.recording, own, part.times, stems, folder / "right", progress)
-        late = np.array([*found.delays.values()])
+        frames, stems = images.selected[rows] - part.first_frame, [names[row] for row in rows]
+        right = read_right_camera(part.recording, frames, part.times, stems, folder / "right", progress)
+        late = np.array([*right.delays.values()])
         if np.median(np.abs(late)) > WORLD.same_moment_s:
             data.notes.add(
                 f"the right camera's images were taken {1000 * np.median(late):+.0f} ms after the left one's (median; "
                 f"{1000 * late.min():+.0f} to {1000 * late.max():+.0f} ms): theirs are the states of these moments",
                 episode,
             )
-        camera = camera or found
-        names_by_row |= {int(rows[row]): name for row, name in found.names.items()}
-        delays |= {int(rows[row]): delay for row, delay in found.delays.items()}
+        camera = camera or right
+        names_by_row |= {int(rows[row]): name for row, name in right.names.items()}
+        delays |= {int(rows[row]): delay for row, delay in right.delays.items()}
     return None if camera is None else replace(camera, names=names_by_row, delays=delays)

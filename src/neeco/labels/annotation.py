@@ -163,8 +163,8 @@ def keypoint_names(scene: GaussianScene) -> tuple[str, ...]:
     """Return the names of all keypoints of the scene's instruments."""
     if not scene.recorded.states:
         return ()
-    known = scene.keypoints(scene.recorded.states[0]).values()
-    return tuple(dict.fromkeys(name for points in known for name in points))
+    keypoints = scene.keypoints(scene.recorded.states[0]).values()
+    return tuple(dict.fromkeys(name for points in keypoints for name in points))
 
 
 @torch.no_grad()
@@ -216,13 +216,13 @@ def minimum_rectangle(mask: np.ndarray) -> np.ndarray | None:
     last = left + width - inside[rows, ::-1].argmax(1)
     rows += top
     corners = np.concatenate([np.stack([x, rows + dy], 1) for x in (first, last) for dy in (0, 1)]).astype(float)
-    found = []
+    rectangles = []
     for turn in (0.0, np.radians(cv2.minAreaRect(corners.astype(np.float32))[2])):
         axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         (low_u, low_v), (high_u, high_v) = (find(corners @ axes.T, axis=0) for find in (np.min, np.max))
         ends = np.array([[low_u, low_v], [high_u, low_v], [high_u, high_v], [low_u, high_v]])
-        found.append(((high_u - low_u) * (high_v - low_v), ends @ axes))
-    return min(found, key=lambda rectangle: rectangle[0])[1]
+        rectangles.append(((high_u - low_u) * (high_v - low_v), ends @ axes))
+    return min(rectangles, key=lambda rectangle: rectangle[0])[1]
 
 
 def outer_polygons(mask: np.ndarray) -> list[np.ndarray]:
@@ -400,8 +400,8 @@ def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bo
         rendering = scene.render(state, scene.recorded.as_learned(camera))
         depth = torch.from_numpy(surface_depth(rendering)).float()
         return RGBDImage(rendering.color.clamp(0, 1).cpu(), depth)
-    known = require_gaussians(scene, "render labels")
-    labeller = CompositedLabels(known)
-    drawing = draw_layers(known, labeller, state, camera, LABELS.min_component)
-    found = annotate(known, drawing, labeller.names)
-    return LabelledImage.from_drawing(drawing, found, labeller.names, keypoint_names(known))
+    gaussians = require_gaussians(scene, "render labels")
+    labeller = CompositedLabels(gaussians)
+    drawing = draw_layers(gaussians, labeller, state, camera, LABELS.min_component)
+    annotations = annotate(gaussians, drawing, labeller.names)
+    return LabelledImage.from_drawing(drawing, annotations, labeller.names, keypoint_names(gaussians))

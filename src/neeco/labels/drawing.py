@@ -92,15 +92,15 @@ def draw_layers(
     gaussians = scene.at(state)
     owners = labeller.owners(state, gaussians)
     unobserved = scene.unobserved(gaussians, camera)
-    shown = {k: name for k, name in enumerate(instruments_of(labeller.names)) if name in state.instruments}
-    alone = [owners == k for k in shown] + [owners < 0]
+    instruments = {k: name for k, name in enumerate(instruments_of(labeller.names)) if name in state.instruments}
+    alone = [owners == k for k in instruments] + [owners < 0]
     rendering, parts, share = labeller.draw(gaussians, camera, owners, unobserved, alone)
     assert rendering.channels is not None
     parts, share = _drop_small_components(parts.cpu(), share.clamp(0, 1).cpu(), labeller.names, min_component)
     threshold = threshold_of(scene)
     layers = {
         name: InstrumentLayer((single.alpha > threshold).cpu().numpy(), surface_depth(single))
-        for name, single in zip(shown.values(), rendering.alone, strict=False)
+        for name, single in zip(instruments.values(), rendering.alone, strict=False)
     }
     tissue = rasterize(gaussians.select(owners < 0), camera).color.clamp(0, 1).cpu() if tissue_image else None
     return LayeredDrawing(
@@ -232,19 +232,19 @@ def without_components(share: np.ndarray, remaining: np.ndarray, dropped: np.nda
 def _drop_small_components(
     parts: Tensor, share: Tensor, names: tuple[tuple[str, str], ...], min_component: float
 ) -> tuple[Tensor, Tensor]:
-    found, cleaned = parts.numpy(), np.zeros_like(parts.numpy())
+    original, cleaned = parts.numpy(), np.zeros_like(parts.numpy())
     for instrument in instruments_of(names):
         ids = [k + 1 for k, (owner, _) in enumerate(names) if owner == instrument]
-        mask = shows_any(found, ids)
+        mask = shows_any(original, ids)
         x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
         if not width:
             continue
         box = slice(y, y + height), slice(x, x + width)
-        own = np.where(without_small_components(mask[box], min_component), found[box], 0)
-        own = without_part_islands(own, ids, min_component)
-        np.copyto(cleaned[box], own, where=own > 0)
+        large_parts = np.where(without_small_components(mask[box], min_component), original[box], 0)
+        large_parts = without_part_islands(large_parts, ids, min_component)
+        np.copyto(cleaned[box], large_parts, where=large_parts > 0)
     remaining = cleaned > 0
-    dropped = (found > 0) & ~remaining
+    dropped = (original > 0) & ~remaining
     return torch.from_numpy(cleaned), torch.from_numpy(without_components(share.numpy(), remaining, dropped))
 
 

@@ -199,9 +199,9 @@ def find_thresholds(scene: GaussianScene) -> DeltaThresholds:
     """
     states = scene.recorded.states
     chosen = evenly_spaced(len(states), LABELS.n_threshold_states, floor=True)
-    found = [delta_magnitudes(scene, states[k]) for k in chosen]
+    deltas = [delta_magnitudes(scene, states[k]) for k in chosen]
     limits = {
-        kind: otsu_of_magnitudes(torch.cat([magnitudes[kind].cpu() for magnitudes in found])) if found else None
+        kind: otsu_of_magnitudes(torch.cat([magnitudes[kind].cpu() for magnitudes in deltas])) if deltas else None
         for kind in DELTAS
     }
     if all(limit is None for limit in limits.values()):

@@ -121,15 +121,15 @@ def pose_bodies_reference(
     for count, body in zip(counts, bodies, strict=True):
         rows = slice(start, start + count)
         still = constant((1.0, 0.0, 0.0, 0.0), means.device).to(means.dtype).expand(count, 4)
-        given = means[rows], quats[rows], log_scales[rows].exp(), still
-        posed.append(given if body is None else _pose_body(given, None if logits is None else logits[rows], body))
+        at_rest = means[rows], quats[rows], log_scales[rows].exp(), still
+        posed.append(at_rest if body is None else _pose_body(at_rest, None if logits is None else logits[rows], body))
         start += count
     moved, turned, scales, frames = (torch.cat(column) for column in zip(*posed, strict=True))
     return moved, turned, scales, frames.detach()
 
 
-def _pose_body(given: Rows, logits: Tensor | None, body: ArticulatedBody) -> Rows:
-    points, quats, scales, frames = given
+def _pose_body(at_rest: Rows, logits: Tensor | None, body: ArticulatedBody) -> Rows:
+    points, quats, scales, frames = at_rest
     quats = torch.nn.functional.normalize(quats, dim=-1)
 
     def turn(axis: Tensor, origin: Tensor, angle: Tensor) -> Rows:
@@ -159,11 +159,11 @@ def _pose_body(given: Rows, logits: Tensor | None, body: ArticulatedBody) -> Row
     return points @ rotation.T + translation, quat_multiply(quat, quats), scales, quat_multiply(quat, frames)
 
 
-def _kernel(given: Sequence[Tensor]) -> Any:
+def _kernel(tensors: Sequence[Tensor]) -> Any:
     """Return the kernel class that poses such tensors; None: the definition."""
-    if all_run_native(*given):
+    if all_run_native(*tensors):
         return native().Posing
-    if all(runs_triton(t) for t in given):
+    if all(runs_triton(t) for t in tensors):
         from neeco.raster.triton.articulated import Posing
 
         return Posing
@@ -183,14 +183,14 @@ class _Pose(torch.autograd.Function):
         how: list[tuple[int, int, float]],
         *numbers: Tensor | None,
     ) -> Any:
-        given = [means, quats, log_scales, logits, *numbers]
-        plain = [None if t is None else t.detach().contiguous() for t in given]
+        inputs = [means, quats, log_scales, logits, *numbers]
+        plain = [None if t is None else t.detach().contiguous() for t in inputs]
         posing = kernel(*plain[:4], counts, plain[4:], how)
         posed = [means.new_empty(len(means), columns) for columns in (3, 4, 3, 4)]
         posing.forward(*posed)
         ctx.mark_non_differentiable(posed[3])
         # saved so that autograd detects a modified input before the backward pass
-        ctx.save_for_backward(*given)
+        ctx.save_for_backward(*inputs)
         ctx.posing = posing
         return tuple(posed)
 
@@ -221,8 +221,8 @@ def _check(
         raise NeecoError(f"pose_bodies: counts: {tuple(counts)} of {len(bodies)} bodies do not share out {n} Gaussians")
     for body in bodies:
         if body is not None and (len(body.origins) > MAX_JOINTS or body.link_count > MAX_LINKS):
-            found = f"{len(body.origins)} joints and {body.link_count} links"
-            raise NeecoError(f"pose_bodies: a body of {found}; at most {MAX_JOINTS} and {MAX_LINKS} can be posed")
+            size = f"{len(body.origins)} joints and {body.link_count} links"
+            raise NeecoError(f"pose_bodies: a body of {size}; at most {MAX_JOINTS} and {MAX_LINKS} can be posed")
     columns = max((body.link_count for body in bodies if body is not None and len(body.origins)), default=0)
     has = 0 if logits is None else logits.shape[1] if logits.dim() == 2 and logits.shape[0] == n else -1
     if has < columns:

@@ -23,8 +23,8 @@ def rasterize_cpu(
     alone: Sequence[Tensor] = (),
 ) -> Rendering:
     """`rasterize` with neeco's own C++ kernels. Inputs are taken as float32 on the CPU."""
-    given = differentiable(gaussians, camera, channels, background)
-    tensors = [None if t is None else _prepared(t) for t in given]
+    inputs = differentiable(gaussians, camera, channels, background)
+    tensors = [None if t is None else _prepared(t) for t in inputs]
     frames = None if gaussians.sh_frames is None else _prepared(gaussians.sh_frames.detach())
     wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     offsets = torch.zeros(len(gaussians), 2, requires_grad=wanted)

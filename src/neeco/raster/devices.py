@@ -102,8 +102,8 @@ def _not_built_for(device: torch.device) -> str | None:
     the same major and no lower minor number, intermediate code (compute_XY) on all that are no older."""
     card = torch.cuda.get_device_capability(device)
     names = torch.cuda.get_arch_list()
-    parsed = [found for name in names if (found := re.fullmatch(r"(sm|compute)_(\d+)(\d)[a-z]?", name))]
-    built = [(kind, (int(major), int(minor))) for kind, major, minor in (found.groups() for found in parsed)]
+    parsed = [match for name in names if (match := re.fullmatch(r"(sm|compute)_(\d+)(\d)[a-z]?", name))]
+    built = [(kind, (int(major), int(minor))) for kind, major, minor in (match.groups() for match in parsed)]
     if not built or any(v <= card and (kind == "compute" or v[0] == card[0]) for kind, v in built):
         return None
     return (
@@ -132,8 +132,8 @@ class CachedPredicate:
         self._answer = False
 
     def __call__(self, tensor: Tensor) -> bool:
-        known = self._about
-        if known is None or known[0] is not tensor or known[1] != tensor._version:
+        cached = self._about
+        if cached is None or cached[0] is not tensor or cached[1] != tensor._version:
             self._answer = not tensor.is_meta and bool(self.question(tensor.detach()))
             self._about = tensor, tensor._version
         return self._answer

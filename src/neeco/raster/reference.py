@@ -18,7 +18,7 @@ from neeco.raster.types import Gaussians, Headlight, Rendering
 LOW_PASS = 0.3  # px^2 added to projected covariances
 MIN_ALPHA = 1 / 255  # smaller ones are not rendered
 MAX_ALPHA = 0.999
-MIN_TRANSMITTANCE = 1e-4  # at which a pixel is full
+MIN_TRANSMITTANCE = 1e-4  # transmittance below which a pixel is full
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def _hide(
     if light is not None:
         left = None if light.left is None else but(light.left, 1.0)
         light = Headlight(but(light.falloff, 0.0), light.vignette, left=left)
-    shown = Gaussians(
+    visible = Gaussians(
         means=but(gaussians.means, pose[:3, 3] + pose[:3, 2]),
         quats=but(gaussians.quats, 1.0),
         scales=but(gaussians.scales, 1.0),
@@ -166,7 +166,7 @@ def _hide(
         sh_frames=None if gaussians.sh_frames is None else but(gaussians.sh_frames, 1.0),
         headlight=light,
     )
-    return shown, None if channels is None else but(channels, 0.0)
+    return visible, None if channels is None else but(channels, 0.0)
 
 
 @torch.no_grad()

@@ -45,15 +45,15 @@ def draw_through(camera: Camera, draw: Draw) -> Rendering:
         *(plane[..., None] for each in layers for plane in (each.alpha, each.depth * each.alpha)),
     ]
     planes += [] if rendering.channels is None else [rendering.channels]
-    found = resampled(torch.cat(planes, -1), source, fine, camera)
+    image = resampled(torch.cat(planes, -1), source, fine, camera)
     end = 3 + 2 * len(layers)
-    (alpha, weighted), *alone = found[..., 3:end].unflatten(-1, (-1, 2)).permute(2, 3, 0, 1)
+    (alpha, weighted), *alone = image[..., 3:end].unflatten(-1, (-1, 2)).permute(2, 3, 0, 1)
     return replace(
         rendering,
-        color=found[..., :3],
+        color=image[..., :3],
         alpha=alpha,
         depth=_divided(weighted, alpha),
-        channels=None if rendering.channels is None else found[..., end:],
+        channels=None if rendering.channels is None else image[..., end:],
         alone=tuple(Layer(alpha, _divided(weighted, alpha)) for alpha, weighted in alone),
     )
 
@@ -110,7 +110,7 @@ def resampled(image: Tensor, source: Camera, fine: Camera, camera: Camera) -> Te
         image = planes[0].permute(1, 2, 0).contiguous()
     if _size(fine) == _size(camera):
         return image
-    pixels, shares = (given.to(image.device) for given in _covered_pixels(_size(fine), _size(camera)))
+    pixels, shares = (table.to(image.device) for table in _covered_pixels(_size(fine), _size(camera)))
     reduced = embedding_bag(pixels, image.flatten(0, 1), per_sample_weights=shares.to(image), mode="sum")
     return reduced.view(camera.height, camera.width, -1)
 

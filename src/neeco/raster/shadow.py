@@ -76,8 +76,9 @@ def _left_by(
 def _relative_to_camera(falloff: Tensor, means: Tensor, camera: Camera, world_from_lamps: Tensor) -> Tensor:
     """Return the brightness [N] of the headlight at lamps elsewhere, relative to one at the camera."""
     places = (pose[:3, 3].detach().to(means) for pose in (camera.world_from_camera, world_from_lamps))
-    own, lamps = ((means.detach() - place).norm(dim=1).clamp_min(SHADOWS.min_distance).log() for place in places)
-    return torch.exp(falloff * (own - lamps))
+    distances = ((means.detach() - place).norm(dim=1) for place in places)
+    at_camera, at_lamps = (distance.clamp_min(SHADOWS.min_distance).log() for distance in distances)
+    return torch.exp(falloff * (at_camera - at_lamps))
 
 
 @dataclass(frozen=True)
@@ -163,24 +164,24 @@ class _Blocked(torch.autograd.Function):
             maps = torch.empty(3, at_light.height, at_light.width)
             intrinsics = (at_light.fx, at_light.fy, at_light.cx, at_light.cy)
             focus = (*intrinsics, float(width) * at_light.fx, SHADOWS.min_distance)
-            given = torch.tensor([*view, *offsets[lamp].tolist(), *focus], dtype=torch.float32)
+            parameters = torch.tensor([*view, *offsets[lamp].tolist(), *focus], dtype=torch.float32)
             wanted = ctx.needs_input_grad[0]
             alpha, depth = (image.detach().contiguous() for image in (from_light.alpha, from_light.depth))
             place = torch.empty(4, dtype=torch.int32)
-            native().cast(alpha, depth, means, among.casters, given, wanted, maps, place, shares[lamp])
-            ctx.lamps.append((lamp, given, maps, place, at_light.fx))
+            native().cast(alpha, depth, means, among.casters, parameters, wanted, maps, place, shares[lamp])
+            ctx.lamps.append((lamp, parameters, maps, place, at_light.fx))
         return shares
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         width, offsets, means, casters, shares = ctx.saved_tensors
-        to_width, to_offsets, found = torch.zeros_like(width), torch.zeros_like(offsets), torch.empty(4)
+        to_width, to_offsets, sums = torch.zeros_like(width), torch.zeros_like(offsets), torch.empty(4)
         gradient = gradients[0].contiguous()
-        for lamp, given, maps, place, focal in ctx.lamps:
-            native().cast_backward(means, casters, given, maps, place, shares[lamp], gradient[lamp], found)
-            to_offsets[lamp] = found[:3]
-            to_width += focal * found[3]
+        for lamp, parameters, maps, place, focal in ctx.lamps:
+            native().cast_backward(means, casters, parameters, maps, place, shares[lamp], gradient[lamp], sums)
+            to_offsets[lamp] = sums[:3]
+            to_width += focal * sums[3]
         return to_width, to_offsets, None, None, None
 
 

@@ -57,8 +57,8 @@ def rasterize_triton(
 
 
 def _inputs(tensors: Iterable[Tensor | None]) -> Inputs:
-    given: dict[str, Any] = dict(zip(INPUTS, tensors, strict=True))
-    return Inputs(**given)
+    fields: dict[str, Any] = dict(zip(INPUTS, tensors, strict=True))
+    return Inputs(**fields)
 
 
 class _Rasterize(torch.autograd.Function):

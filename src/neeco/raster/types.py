@@ -99,9 +99,9 @@ class Gaussians:
 Held = TypeVar("Held", Shadow, Headlight, Gaussians)
 
 
-def _moved(held: Held, device: torch.device | str) -> Held:
-    values = {field.name: getattr(held, field.name) for field in fields(held)}
-    return replace(held, **{name: value.to(device) for name, value in values.items() if value is not None})
+def _moved(group: Held, device: torch.device | str) -> Held:
+    values = {field.name: getattr(group, field.name) for field in fields(group)}
+    return replace(group, **{name: value.to(device) for name, value in values.items() if value is not None})
 
 
 def differentiable(

@@ -112,7 +112,7 @@ def inline_svg(axes: Axes, label: str) -> Markup:
     body = stream.getvalue().partition("</defs>")[2]  # after the XML header and a style that would be the whole page's
     body = re.sub('<g id="([a-z-]+)"', r'<g class="\1"', body)
     body = re.sub('<g id="[^"]*"', "<g", body)
-    body = re.sub("#0101([0-9a-f]{2})", lambda found: f"var(--{VARIABLES[int(found[1], 16)]})", body)
+    body = re.sub("#0101([0-9a-f]{2})", lambda match: f"var(--{VARIABLES[int(match[1], 16)]})", body)
     body = re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", body)  # what markup cannot hold
     width, height = figure.get_size_inches() * 72
     return Markup(f'<svg viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{escape(label)}">{body}')
@@ -189,11 +189,11 @@ def line_chart(
 
 
 @page_style()
-def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, Markup]]:
+def legend(names: Sequence[str], used: Sequence[str]) -> list[tuple[str, Markup]]:
     """(name, its line and mark as inline SVG) of every method shown; `names`: all, whose order gives them these."""
     entries = []
     for order, name in enumerate(names):
-        if name in shown:
+        if name in used:
             axes = new_axes((46, 14), 0, 0, 0, 0)
             axes.set_axis_off()
             _draw_line(axes, order, ((1, 7), (45, 7)), linewidth=2, dashes=CHARTS.dashes[order % len(CHARTS.dashes)])

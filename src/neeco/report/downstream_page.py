@@ -112,10 +112,10 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
     if not rows:
         return []
     most = max(rows, key=lambda row: row["difference"])
-    shown = [(most["against"], most["against_real"]), (most["condition"], most["real"])]
+    arms = [(most["against"], most["against_real"]), (most["condition"], most["real"])]
     key = "iou" if model["predicts"] == "masks" else "box_iou"
     predictions, scores = [], []
-    for condition, real in shown:
+    for condition, real in arms:
         wanted = (model["name"], condition, real, plan.settings.kept_fold)
         predictions.append(read_predictions(plan.settings.job_folder(*wanted), test))
         jobs = [job for job in experiment["jobs"] if tuple(job[name] for name in JOB_KEYS) == wanted]
@@ -123,37 +123,37 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
         scores.append({frame["frame"]: frame[key] for frame in frames if frame[key] is not None})
     gains = {name: scores[1][name] - scores[0][name] for name in scores[1] if name in scores[0]}
     ranked = sorted(
-        (name for name in gains if all(name in found for found in predictions)), key=lambda name: -gains[name]
+        (name for name in gains if all(name in each for each in predictions)), key=lambda name: -gains[name]
     )
     samples = {sample.name: sample for sample in plan.settings.samples(plan.capture, test)}
     sections = []
     for name in dict.fromkeys([*ranked[:2], *ranked[-2:]]):
         example = samples[name].load()
         images = [Images("recorded image", (jpeg(picture(example)),), f"truth, frame {name}")]
-        for arm, found, score in zip(shown, predictions, scores, strict=True):
+        for arm, prediction, score in zip(arms, predictions, scores, strict=True):
             title = title_of(*arm)
-            pixels = jpeg(picture(example, found[name]))
+            pixels = jpeg(picture(example, prediction[name]))
             images.append(Images(title, (pixels,), f"{title}: prediction, frame {name}", f"{score[name]:.3f}"))
         title = f"{model['name']}, {test}: {name}, gain {gains[name]:+.3f}"
         sections.append(Section(title=title, level=3, images=images))
     return sections
 
 
-def picture(example: Example, found: Prediction | None = None) -> Pixels:
+def picture(example: Example, prediction: Prediction | None = None) -> Pixels:
     """The recorded image with a prediction, in the classes' colours, and the truth's outlines or boxes."""
-    if isinstance(found, Detections):
+    if isinstance(prediction, Detections):
         image = Image.fromarray(example.image)
         pen, width = ImageDraw.Draw(image), max(1, image.width // 160)
-        sure = found.scores >= min(0.5, found.scores.max(initial=0.0))
+        sure = prediction.scores >= min(0.5, prediction.scores.max(initial=0.0))
         boxes = [(TRUTH_COLOR, box) for box in example.boxes()[0]]
         boxes += [
             (tuple(PART_COLORS[(number - 1) % len(PART_COLORS)].astype(int).tolist()), box)
-            for box, number in zip(found.boxes[sure], found.classes[sure], strict=True)
+            for box, number in zip(prediction.boxes[sure], prediction.classes[sure], strict=True)
         ]
         for color, (x0, y0, x1, y1) in boxes:
             pen.rectangle((x0, y0, max(x0, x1 - 1), max(y0, y1 - 1)), outline=color, width=width)
         return np.asarray(image)
-    pixels = example.image if found is None else overlay_parts(example.image / 255.0, found)
+    pixels = example.image if prediction is None else overlay_parts(example.image / 255.0, prediction)
     for number in example.shown:
         pixels = overlay_outline(pixels, example.classes == number, TRUTH_COLOR)
     return pixels

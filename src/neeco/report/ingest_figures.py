@@ -31,12 +31,12 @@ SPLIT_COLORS = {"train": "accent", "test": "good", "unseen": "phase"}
 class FigureSettings:
     """Sizes of overlays and charts."""
 
-    samples: int = 12  # frames shown
-    min_depth_mm: float = 1.0  # of points that are shown
-    axis_share: float = 0.16  # of the image's width: length of the frame axes
-    shaft_diameters: float = 30.0  # length shown of a shaft found in video
-    bins: int = 24  # of a histogram
-    constant: float = 1e-6  # mm or deg: a smaller range is one value
+    samples: int = 12  # number of frames shown
+    min_depth_mm: float = 1.0  # least depth in mm of points that are drawn
+    axis_share: float = 0.16  # length of the frame axes as a share of the image's width
+    shaft_diameters: float = 30.0  # length drawn of a shaft from video, in diameters
+    bins: int = 24  # bins of a histogram
+    constant: float = 1e-6  # largest range in mm or deg that counts as one value
 
 
 SETTINGS = FigureSettings()
@@ -190,10 +190,10 @@ def degrees_of_freedom(capture: Capture) -> list[Degree]:
             sliding = instrument.slides(joint)
             columns.append((joint, "mm" if sliding else "deg", values if sliding else np.degrees(values)))
         for name, unit, values in columns:
-            known = np.isfinite(values)
-            shown = tuple(split for split, keep in zip(splits, known, strict=True) if keep)
-            if known.any():
-                degrees.append(Degree(instrument.name, name, unit, values[known], shown))
+            valid = np.isfinite(values)
+            valid_splits = tuple(split for split, keep in zip(splits, valid, strict=True) if keep)
+            if valid.any():
+                degrees.append(Degree(instrument.name, name, unit, values[valid], valid_splits))
     return degrees
 
 

@@ -62,12 +62,12 @@ class Ingested:
 
     def lines(self) -> list[str]:
         """Return what was found, where it lies and how good it is, for a terminal."""
-        shown = [] if self.result is None else self.result.lines()
-        shown += [f"wrong: {problem}" for problem in errors_only(self.problems)]
-        shown.append(f"capture: {self.output}  ({counted(len(self.problems), 'remark')} by `neeco check`)")
+        lines = [] if self.result is None else self.result.lines()
+        lines += [f"wrong: {problem}" for problem in errors_only(self.problems)]
+        lines.append(f"capture: {self.output}  ({counted(len(self.problems), 'remark')} by `neeco check`)")
         verdict: list[str] = []
         if self.assessment is not None:
-            shown.append(f"page: {self.output / PAGE}")
+            lines.append(f"page: {self.output / PAGE}")
             first, *others = self.assessment.lines()
             verdict = [f"verdict: {first}", *others, self.assessment.conclusion]
         stated = " ".join(verdict).casefold()
@@ -76,7 +76,7 @@ class Ingested:
             kind, _, words = line.partition(": ")
             return kind in ("note", "wrong") and words.rstrip(".").casefold() in stated
 
-        return [line for line in shown if not repeats(line)] + verdict
+        return [line for line in lines if not repeats(line)] + verdict
 
 
 def ingest_and_report(recordings: Sequence[Recording], output: Path, progress: StageProgress) -> Ingested:

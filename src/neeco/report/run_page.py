@@ -30,8 +30,8 @@ from neeco.scene import DrawableScene
 class RunPageSettings:
     """Settings of what the pages of a run show."""
 
-    max_points: int = 300  # of a training curve
-    max_frames: int = 60  # frames: the page has to stay a file one can mail
+    max_points: int = 300  # limit on the points of a training curve
+    max_frames: int = 60  # number of frames shown: the page has to stay a file one can mail
     # of the instruments, in turn
     outlines: tuple[tuple[int, int, int], ...] = ((255, 230, 0), (0, 230, 255), (255, 90, 200), (120, 255, 80))
 
@@ -179,8 +179,8 @@ def _poses(frame: Frame, row: dict[str, Any]) -> tuple[State, Camera]:
     pose = torch.tensor(row["world_from_camera"], dtype=camera.world_from_camera.dtype)
     fitted = {name: torch.tensor(matrix, dtype=torch.float64) for name, matrix in row["world_from_instrument"].items()}
     instruments = {
-        name: replace(given, pose=fitted[name]) if name in fitted else given
-        for name, given in state.instruments.items()
+        name: replace(recorded, pose=fitted[name]) if name in fitted else recorded
+        for name, recorded in state.instruments.items()
     }
     return replace(state, instruments=instruments), replace(camera, world_from_camera=pose)
 
@@ -212,10 +212,10 @@ def _tables(evaluation: dict[str, Any]) -> list[Any]:
     """The tables of numbers, of images and of labels: columns that anything is known for, and rows (title of the kind,
     its splits with their cells)."""
     kinds = {kind: evaluation[kind] for kind in KINDS if kind in evaluation}
-    known = [numbers for splits in kinds.values() for numbers in splits.values()]
+    all_numbers = [numbers for splits in kinds.values() for numbers in splits.values()]
     tables = []
     for scores in (IMAGE_SCORES, LABEL_SCORES):
-        columns = [score for score in scores if any(numbers.get(score.key) is not None for numbers in known)]
+        columns = [score for score in scores if any(numbers.get(score.key) is not None for numbers in all_numbers)]
         groups = [
             (KINDS[kind], [(split, [score.written(numbers) for score in columns]) for split, numbers in splits.items()])
             for kind, splits in kinds.items()
@@ -231,11 +231,11 @@ def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
     return [(part_color(part), name.replace("_", " ")) for part, name in enumerate(names, 1)]
 
 
-def _verdicts(found: Mapping[str, Any]) -> list[str]:
-    """Every verdict in what training found, in words."""
+def _verdicts(diagnostics: Mapping[str, Any]) -> list[str]:
+    """Every verdict in what training measured, in words."""
     return [
         verdict
-        for name, item in found.items()
+        for name, item in diagnostics.items()
         for verdict in (_verdicts(item) if isinstance(item, Mapping) else [str(item)] if name == "verdict" else [])
     ]
 
@@ -267,8 +267,8 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: bool = False) -> str:
     """A chart of `key` over iterations, dashed lines where a phase begins; "" when fewer than two rows have numbers."""
-    known = [row for row in rows if type(row.get(key)) in (int, float) and math.isfinite(row[key])]
-    points = [(float(row["iteration"]), float(row[key])) for row in known if row[key] > 0 or not logarithmic]
+    valid = [row for row in rows if type(row.get(key)) in (int, float) and math.isfinite(row[key])]
+    points = [(float(row["iteration"]), float(row[key])) for row in valid if row[key] > 0 or not logarithmic]
     if len(points) < 2:
         return ""
     # means of equally many, so that a noisy curve reads as its trend

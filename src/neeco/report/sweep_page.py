@@ -109,8 +109,8 @@ def _pictures(plan: SweepPlan, rows: Rows) -> list[Section]:
     seeds = {row["configuration"]: row["seed"] for row in reversed(rows) if not row.get("error")}
     for name in (name for name in plan.study.configurations if name in seeds):
         with open_run(plan.request.run_folder(name, seeds[name])) as run:
-            shown = replace(plan.capture, frames=tuple(frames))
-            completed = run.scene.recorded.completed(shown, run.scene.instruments)
+            subset = replace(plan.capture, frames=tuple(frames))
+            completed = run.scene.recorded.completed(subset, run.scene.instruments)
             for frame, row in zip(completed.frames, images, strict=True):
                 image, target, counted = (
                     draw(run.scene, frame.state, frame.camera).image,

@@ -21,9 +21,9 @@ from neeco.tracking.track import Tracked, state_of
 class TrackPageSettings:
     """Frames and bands on the page."""
 
-    spread: int = 24  # frames, spread over the footage
-    least_trusted: int = 12  # frames
-    band: float = 2.0  # standard deviations to either side
+    spread: int = 24  # number of frames spread over the footage
+    least_trusted: int = 12  # number of frames of least trust
+    band: float = 2.0  # half width of the bands in standard deviations
 
 
 SETTINGS = TrackPageSettings()
@@ -77,11 +77,11 @@ def _charts(tracked: Tracked) -> list[str]:
     rows = [k for k, record in enumerate(records) if record["how"] != "lost"]
     at = [times[k] for k in rows]
     for item in tracked.scene.instruments:
-        found = [records[k]["instruments"][item.name] for k in rows]
+        states = [records[k]["instruments"][item.name] for k in rows]
         for name in item.joints:
             unit: Callable[[float], float] = float if item.slides(name) else math.degrees
-            values = [unit(one["joints"][name]) for one in found]
-            deviations = [unit(one["deviation"][f"joint.{name}"]) for one in found]
+            values = [unit(one["joints"][name]) for one in states]
+            deviations = [unit(one["deviation"][f"joint.{name}"]) for one in states]
             bands = tuple(
                 tuple((t, v + way * SETTINGS.band * d) for t, v, d in zip(at, values, deviations, strict=True))
                 for way in (-1, 1)

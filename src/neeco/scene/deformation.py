@@ -255,8 +255,8 @@ def state_of(instrument: Instrument, state: State) -> InstrumentState:
     """Return the state of `instrument`. Raises NeecoError when the instrument or one of its joints is missing."""
     if instrument.name not in state.instruments:
         raise NeecoError(f"state: instrument {instrument.name!r} is missing; give its pose and joints")
-    given = state.instruments[instrument.name]
-    missing = [joint for joint in instrument.joints if joint not in given.joints]
+    instrument_state = state.instruments[instrument.name]
+    missing = [joint for joint in instrument.joints if joint not in instrument_state.joints]
     if missing:
         raise NeecoError(f"state: instrument {instrument.name!r}: joint {missing[0]!r} is missing; give it in rad")
-    return given
+    return instrument_state

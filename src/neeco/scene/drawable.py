@@ -62,9 +62,9 @@ class Recorded:
         for frame in frames:
             chosen = {}
             for instrument in instruments:
-                given = frame.state.instruments[instrument.name]
-                joints = {joint: given.joints[joint] for joint in instrument.joints}
-                chosen[instrument.name] = InstrumentState(given.pose, joints)
+                recorded = frame.state.instruments[instrument.name]
+                joints = {joint: recorded.joints[joint] for joint in instrument.joints}
+                chosen[instrument.name] = InstrumentState(recorded.pose, joints)
             states.append(State(chosen, frame.state.time))
         names, splits = tuple(frame.name for frame in frames), tuple(frame.split for frame in frames)
         cameras = tuple(frame.camera for frame in frames)
@@ -87,14 +87,14 @@ class Recorded:
         """Return `capture`, of the scene's `instruments`, with the joints that neither recording states, interpolated
         from the training frames nearest to each frame."""
         unstated = {item.name: set(item.unrecorded) for item in capture.instruments}
-        found = [
+        incomplete = [
             replace(item, unrecorded=tuple(joint for joint in item.unrecorded if joint in unstated[item.name]))
             for item in instruments
             if unstated.get(item.name, set()) & set(item.unrecorded)
         ]
-        if not found:
+        if not incomplete:
             return capture
-        frames = [replace(frame, state=self.with_unrecorded(frame.state, found)) for frame in capture.frames]
+        frames = [replace(frame, state=self.with_unrecorded(frame.state, incomplete)) for frame in capture.frames]
         return replace(capture, frames=tuple(frames))
 
     def with_unrecorded(self, state: State, instruments: Sequence[Instrument]) -> State:
@@ -110,11 +110,11 @@ class Recorded:
             far = far + np.abs([state.time - other.time for other in self.states])
             nearest = np.argsort(far, kind="stable")[:N_NEIGHBOURS]
             shares = 1 / (far[nearest] + 1e-6)
-            found = {}
+            interpolated = {}
             for joint in item.unrecorded:
                 values = [self.states[k].instruments[item.name].joints[joint] for k in nearest]
-                found[joint] = float(np.average(values, weights=shares))
-            filled[item.name] = replace(filled[item.name], joints={**filled[item.name].joints, **found})
+                interpolated[joint] = float(np.average(values, weights=shares))
+            filled[item.name] = replace(filled[item.name], joints={**filled[item.name].joints, **interpolated})
         return replace(state, instruments=filled)
 
     @cached_property

@@ -189,13 +189,13 @@ class GaussianScene(nn.Module):
         if not state.instruments or not (corrects or bases):
             return state
         center, moved = self.center, dict(state.instruments)
-        for name, given in state.instruments.items():
-            pose = given.pose.to(center)
+        for name, instrument_state in state.instruments.items():
+            pose = instrument_state.pose.to(center)
             if name in bases:
                 pose = _moved_about(center, pose, bases[name])
             if corrects:
                 pose = _moved_about(center, pose, registration[:6], registration[6].exp())
-            moved[name] = InstrumentState(pose, given.joints)
+            moved[name] = InstrumentState(pose, instrument_state.joints)
         return dataclasses.replace(state, instruments=moved)
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
@@ -279,9 +279,9 @@ def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> Canonical
     if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
         raise ValueError(f"{missing[0]} is missing")
     for name, tensor in tensors.items():
-        found, wanted = tuple(tensor.shape), (sum(counts), *CANONICAL_SHAPES.get(name, tensor.shape[1:]))
-        if found != wanted:
-            raise ValueError(f"{name} has shape {list(found)}, not {list(wanted)}")
+        shape, wanted = tuple(tensor.shape), (sum(counts), *CANONICAL_SHAPES.get(name, tensor.shape[1:]))
+        if shape != wanted:
+            raise ValueError(f"{name} has shape {list(shape)}, not {list(wanted)}")
         if tensor.dtype != torch.float32:
             raise ValueError(f"{name} is {tensor.dtype}, not float32")
     return CanonicalGaussians.from_tensors(tensors, counts)

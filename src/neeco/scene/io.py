@@ -176,10 +176,10 @@ def require_numbers(tensors: Mapping[str, Tensor]) -> None:
     for name, tensor in tensors.items():
         if tensor.is_floating_point():
             unknown = UNKNOWN.get(name.rpartition(".")[2])
-            known = tensor.abs() <= MAX_NUMBER
+            valid = tensor.abs() <= MAX_NUMBER
             if unknown is not None:
-                known |= tensor.isnan() if math.isnan(unknown) else tensor == unknown
-            if not known.all():
+                valid |= tensor.isnan() if math.isnan(unknown) else tensor == unknown
+            if not valid.all():
                 raise ValueError(f"{name} contains NaN, infinity or a number beyond {MAX_NUMBER:g}")
 
 
@@ -251,9 +251,9 @@ def _pose(pose: Tensor, what: str) -> Tensor:
     return pose
 
 
-def _camera(pose: Tensor, given: dict[str, float]) -> Camera:
+def _camera(pose: Tensor, values: dict[str, float]) -> Camera:
     """Return the camera of intrinsics by name (INTRINSICS). Raises ValueError for impossible ones."""
-    fx, fy, width, height = given["fx"], given["fy"], given["width"], given["height"]
-    if min(fx, fy, given["near"]) <= 0 or min(width, height) < 1 or width * height > MAX_PIXELS:
+    fx, fy, width, height = values["fx"], values["fy"], values["width"], values["height"]
+    if min(fx, fy, values["near"]) <= 0 or min(width, height) < 1 or width * height > MAX_PIXELS:
         raise ValueError(f"a recorded camera of {width} x {height} px and focal lengths {fx}, {fy} px is not possible")
-    return Camera(pose, fx, fy, given["cx"], given["cy"], width=int(width), height=int(height), near=given["near"])
+    return Camera(pose, fx, fy, values["cx"], values["cy"], width=int(width), height=int(height), near=values["near"])

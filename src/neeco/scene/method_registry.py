@@ -24,8 +24,8 @@ REMOVED_IF_OFF = ("gate_mm", "carried_places")  # the same of 0.3 and older; sce
 def methods() -> dict[str, type[Method]]:
     """Return every class with its own `method` name, by name: DEFAULT first, the others sorted. Raises NeecoError when
     two share a name, or an installed package's method cannot be loaded."""
-    found = plugins(Method, "method", PACKAGE)
-    return dict(sorted(found.items(), key=lambda item: item[0] != DEFAULT))
+    classes = plugins(Method, "method", PACKAGE)
+    return dict(sorted(classes.items(), key=lambda item: item[0] != DEFAULT))
 
 
 def add_method(kind: type[Method]) -> type[Method]:

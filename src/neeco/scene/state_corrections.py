@@ -57,18 +57,18 @@ class StateCorrections(nn.Module):
         self.register_buffer("lengths", zeros(len(units)) + 1)
         self._corrects = CachedPredicate(lambda weights: weights.any())
 
-    def features(self, index: int, given: InstrumentState) -> Tensor:
+    def features(self, index: int, state: InstrumentState) -> Tensor:
         """Return the features [F] of a state of instrument `index`, differences of which are compared by kernels."""
-        pose = given.pose.detach().to(self.anchors)
-        joints = [float(torch.as_tensor(given.joints[reading]).detach()) / unit
+        pose = state.pose.detach().to(self.anchors)
+        joints = [float(torch.as_tensor(state.joints[reading]).detach()) / unit
                   for reading, unit in zip(self.readings[index], self._units[index], strict=True)]  # fmt: skip
         joints += [0.0] * (self.anchors.shape[2] - N_POSE_FEATURES - len(joints))
         rotation = pose[:3, :3].flatten() / (2**0.5 * CORRECTIONS.angle_rad)
         return torch.cat([pose[:3, 3] / CORRECTIONS.position_mm, rotation, pose.new_tensor(joints)])
 
-    def increments(self, index: int, given: InstrumentState) -> Tensor:
+    def increments(self, index: int, state: InstrumentState) -> Tensor:
         """Return the increments [6 + R] of a state of instrument `index`."""
-        similar = kernel(self.features(index, given)[None], self.anchors[index], self.lengths[index])
+        similar = kernel(self.features(index, state)[None], self.anchors[index], self.lengths[index])
         return similar[0] @ self.weights[index]
 
     def corrected(self, state: State) -> State:
@@ -78,11 +78,11 @@ class StateCorrections(nn.Module):
         moved = dict(state.instruments)
         for index, (name, readings) in enumerate(zip(self.names, self.readings, strict=True)):
             if name in moved:
-                given, increments = moved[name], self.increments(index, moved[name])
-                joints = {**given.joints}
+                before, increments = moved[name], self.increments(index, moved[name])
+                joints = {**before.joints}
                 for reading, change in zip(readings, increments[6:].tolist(), strict=False):
                     joints[reading] = joints[reading] + change
-                pose = given.pose.to(increments) @ rigid_from_vector(increments[:6])
+                pose = before.pose.to(increments) @ rigid_from_vector(increments[:6])
                 moved[name] = InstrumentState(pose, joints)
         return replace(state, instruments=moved)
 

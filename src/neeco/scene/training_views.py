@@ -101,8 +101,8 @@ def mean_pixels(frames: Sequence[Frame]) -> float:
 
 def _resized(pixels: Tensor, camera: Camera) -> Tensor:
     """Return bytes [H, W, ...] area-averaged to the camera's size, on the same device or in the same kind of memory."""
-    found = torch.from_numpy(area_averaged_bytes(pixels.cpu().numpy(), camera))
-    return found.pin_memory() if pixels.is_pinned() else found.to(pixels.device)
+    resized = torch.from_numpy(area_averaged_bytes(pixels.cpu().numpy(), camera))
+    return resized.pin_memory() if pixels.is_pinned() else resized.to(pixels.device)
 
 
 class PixelPrefetcher:

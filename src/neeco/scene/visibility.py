@@ -157,10 +157,10 @@ def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera])
     cells, depths = grid.cells(means)
     weights = torch.sigmoid(canonical.opacity_logits[rows]).double() * grid.holds(cells)
     weights *= (depths > grid.camera.near) & (count_views(means, cameras) >= SETTINGS.min_frame_share * len(cameras))
-    known = grid.sums(cells, weights, torch.cat([1 / depths[:, None], colors], 1).double())  # [rows, columns, 1 + 4]
-    if not known[..., 0].any():
+    sums = grid.sums(cells, weights, torch.cat([1 / depths[:, None], colors], 1).double())  # [rows, columns, 1 + 4]
+    if not sums[..., 0].any():
         return canonical
-    filled = torch.from_numpy(_filled(known)).to(means)  # [rows, columns, 4] inverse depth, colour
+    filled = torch.from_numpy(_filled(sums)).to(means)  # [rows, columns, 4] inverse depth, colour
     positions = grid.positions(1 / filled[..., 0])  # [rows, columns, 3]
     outside = outside_all_views(positions.reshape(-1, 3), cameras).reshape(positions.shape[:2]).cpu()
     distance = distance_transform_edt(outside.numpy()) * grid.cell
@@ -228,20 +228,20 @@ def _middle_camera(cameras: Sequence[Camera]) -> Camera:
     return cameras[int(deviation.argmin())]
 
 
-def _filled(known: np.ndarray) -> np.ndarray:
+def _filled(sums: np.ndarray) -> np.ndarray:
     """Return means [rows, columns, V] of the known cells around every cell, from sums [rows, columns, 1 + V]: over the
     smallest neighbourhood with enough of them, then smoothed."""
-    found = np.zeros((*known.shape[:2], known.shape[2] - 1))
-    left = np.ones(known.shape[:2], dtype=bool)
-    is_known = (known[..., 0] > 0).astype(float)
+    means = np.zeros((*sums.shape[:2], sums.shape[2] - 1))
+    left = np.ones(sums.shape[:2], dtype=bool)
+    is_known = (sums[..., 0] > 0).astype(float)
     for sigma in SETTINGS.smoothing_cells:
-        blurred = gaussian_filter(known, (sigma, sigma, 0), mode="constant")
+        blurred = gaussian_filter(sums, (sigma, sigma, 0), mode="constant")
         here = left & (gaussian_filter(is_known, sigma, mode="constant") > SETTINGS.min_known_share)
-        found[here] = blurred[here][:, 1:] / blurred[here][:, :1]
+        means[here] = blurred[here][:, 1:] / blurred[here][:, :1]
         left &= ~here
-    mean = known.sum((0, 1))
-    found[left] = mean[1:] / mean[0]
-    return gaussian_filter(found, (2.0, 2.0, 0), mode="nearest")
+    mean = sums.sum((0, 1))
+    means[left] = mean[1:] / mean[0]
+    return gaussian_filter(means, (2.0, 2.0, 0), mode="nearest")
 
 
 def _append_tissue(canonical: CanonicalGaussians, added: CanonicalGaussians) -> CanonicalGaussians:

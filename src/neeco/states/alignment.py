@@ -135,8 +135,8 @@ def align_frame(
             steps=steps / factor,
         )
         starts = [minimise(problem, starts, count).parameters]
-    (found,) = starts
-    return AlignedFrame(parameters.moved(frame.state, found), _camera_at(frame.camera, found), found)
+    (increments,) = starts
+    return AlignedFrame(parameters.moved(frame.state, increments), _camera_at(frame.camera, increments), increments)
 
 
 def _camera_at(camera: Camera, at: Tensor) -> Camera:
@@ -151,27 +151,27 @@ def _deviations(parameters: StateParameters, instruments: list[Instrument], conf
         degrees * torch.pi / 180
         for degrees in (config.sigma_instrument_deg, config.sigma_joint_deg, config.sigma_camera_deg)
     )
-    found = parameters.vector(
+    deviations = parameters.vector(
         instrument, config.sigma_instrument_mm, (joint, config.sigma_joint_mm), (camera, config.sigma_camera_mm)
     )
-    for item, own, (_, rows) in zip(instruments, parameters.instruments, parameters.rows, strict=True):
-        for row, reading in enumerate(own.joints, rows.start):
+    for item, layout, (_, rows) in zip(instruments, parameters.instruments, parameters.rows, strict=True):
+        for row, reading in enumerate(layout.joints, rows.start):
             limits = item.joints[reading] if reading in item.unrecorded else None
             if limits is not None and limits[1] != limits[0]:
-                found[row] = (limits[1] - limits[0]) / 4
-    return found
+                deviations[row] = (limits[1] - limits[0]) / 4
+    return deviations
 
 
 def pose_changes(frame: Frame, state: State, camera: Camera) -> dict[str, dict[str, float]]:
     """Return how far a fit moved every instrument, by name, and the `camera` (see `pose_change`)."""
     moved = {
-        name: pose_change(given.pose, state.instruments[name].pose) for name, given in frame.state.instruments.items()
+        name: pose_change(start.pose, state.instruments[name].pose) for name, start in frame.state.instruments.items()
     }
     return moved | {"camera": pose_change(frame.camera.world_from_camera, camera.world_from_camera)}
 
 
-def pose_change(given: Tensor, fitted: Tensor) -> dict[str, float]:
+def pose_change(recorded: Tensor, fitted: Tensor) -> dict[str, float]:
     """Return the distance between pose `fitted` [4, 4] and `given`: {"mm": of the origins, "deg": of the rotations}."""
-    relative = torch.linalg.inv(given.double()) @ fitted.double()
+    relative = torch.linalg.inv(recorded.double()) @ fitted.double()
     cosine = ((torch.diagonal(relative[:3, :3]).sum() - 1) / 2).clamp(-1, 1)
     return {"mm": float(relative[:3, 3].norm()), "deg": float(torch.rad2deg(torch.arccos(cosine)))}

@@ -28,24 +28,24 @@ class ContradictionSettings:
     """Settings of the search for wrong states."""
 
     outlying: float = 3.0  # robust standard deviations of a log misfit above which a state is an outlier
-    rejected: float = 6.0  # above which a frame that no state explains is left out
-    better: float = 0.7  # of a state's misfit: that of another one which refutes it
+    rejected: float = 6.0  # robust standard deviations above which a frame that no state explains is excluded
+    better: float = 0.7  # ratio of another state's misfit to this state's, below which the other refutes it
     # ratio of another fit's gain to that of the fit about the recorded state, up to which the latter holds
     unclear: float = 1.05
-    min_distance: float = 3.0  # standard deviations of the prior, root mean square, of a state that is another one
+    min_distance: float = 3.0  # RMS distance in standard deviations of the prior, from which two states differ
     explained: float = 1.0  # misfit up to which a state explains its image
-    min_spread: float = 0.25  # standard deviation of log misfits, at least
-    n_others: int = 60  # frames whose states are tried
-    n_tried: int = 3  # of them that are fitted
-    min_frames: int = 8  # with fewer, no state contradicts the others
-    start_scale: float = 3.0  # of the prior about another start, times usual errors
+    min_spread: float = 0.25  # minimum standard deviation of the log misfits
+    n_others: int = 60  # maximum number of frames whose states are tried as starts
+    n_tried: int = 3  # number of starts that are fitted
+    min_frames: int = 8  # minimum number of frames; with fewer, no state contradicts the others
+    start_scale: float = 3.0  # scale of the prior about another start, in units of usual errors
     suspect: float = 1.0  # robust standard deviations of a log misfit above which a state may be wrong
-    alike: float = 1.15  # times a state's misfit, below which the mirrored state may be right instead
+    alike: float = 1.15  # ratio of the mirrored state's misfit to a state's, below which the mirrored one may be right
     n_own: int = 12  # starts sampled from the prior about a recorded state
     n_near: int = 64  # starts sampled from the prior about another state
-    max_share: float = 1 / 3  # of all frames, that are judged again though they are no outliers
-    max_suspects: int = 24  # the same, as a number of frames
-    max_named: int = 8  # frames in a line
+    max_share: float = 1 / 3  # maximum share of frames that are judged again though they are no outliers
+    max_suspects: int = 24  # maximum number of these frames
+    max_named: int = 8  # maximum number of frames named in the summary
 
 
 JUDGE = ContradictionSettings()
@@ -67,14 +67,14 @@ class Misfits:
         """Measure them. With few frames, or where half of them would be, there are no outliers."""
         firsts = [frames[0] for frames in search.refinement.frames_of_instant]
         misfits = {index: search.misfit(index, search.state(index)) for index in firsts}
-        shown = torch.tensor([misfit for misfit in misfits.values() if math.isfinite(misfit)])
-        if len(shown) < JUDGE.min_frames:
+        valid = torch.tensor([misfit for misfit in misfits.values() if math.isfinite(misfit)])
+        if len(valid) < JUDGE.min_frames:
             return cls(misfits, math.inf, math.inf, math.inf)
-        limits = (max(_limit(shown, many), JUDGE.explained) for many in (JUDGE.outlying, JUDGE.rejected, JUDGE.suspect))
-        found = cls(misfits, *limits)
-        if len(found.outliers) > len(shown) // 2:
-            return replace(found, limit=math.inf, rejection_limit=math.inf)
-        return found
+        limits = (max(_limit(valid, many), JUDGE.explained) for many in (JUDGE.outlying, JUDGE.rejected, JUDGE.suspect))
+        measured = cls(misfits, *limits)
+        if len(measured.outliers) > len(valid) // 2:
+            return replace(measured, limit=math.inf, rejection_limit=math.inf)
+        return measured
 
     @property
     def outliers(self) -> list[int]:
@@ -120,10 +120,10 @@ def refit_outliers(search: StateSearch, scale: float, misfits: Misfits) -> None:
     others = _states_of(search, [index for index, misfit in misfits.of_frame.items() if misfit <= misfits.limit])
     for index in misfits.outliers:
         if search.refinement.verdict(index) is Verdict.ACCEPTED:
-            own = _own_fit(search, index, scale)
-            if own is None or own.misfit > misfits.limit:
-                found = _fits_from(search, index, _other_starts(search, index, others))
-                _judge(search, index, scale, own, found, misfits)
+            recorded_fit = _own_fit(search, index, scale)
+            if recorded_fit is None or recorded_fit.misfit > misfits.limit:
+                fits = _fits_from(search, index, _other_starts(search, index, others))
+                _judge(search, index, scale, recorded_fit, fits, misfits)
 
 
 @torch.no_grad()
@@ -138,12 +138,12 @@ def judge_again(search: StateSearch) -> None:
     for index in misfits.of_frame:
         contradicts = refinement.verdict(index) is not Verdict.ACCEPTED
         if contradicts or index in suspects:
-            starts, own = _other_starts(search, index, others), _own_fit(search, index, 1.0)
+            starts, recorded_fit = _other_starts(search, index, others), _own_fit(search, index, 1.0)
             if search.linked:
                 starts.append(mirrored_state(search, index, recorded.states[index]))
             if contradicts:
                 starts.append(search.state(index))
-            _judge(search, index, 1.0, own, _fits_from(search, index, starts), misfits)
+            _judge(search, index, 1.0, recorded_fit, _fits_from(search, index, starts), misfits)
 
 
 @torch.no_grad()
@@ -170,43 +170,43 @@ def _judge(
     search: StateSearch,
     index: int,
     scale: float,
-    own: StateFit | None,
+    fit: StateFit | None,
     others: Sequence[StateFit],
     misfits: Misfits,
 ) -> None:
     """Refit the state of frame `index` where another explains its image much better, or exclude the frame where none
     does. A frame judged so before is accepted again if no other state explains more of its image.
 
-    own: the best fit about the recorded state; None where it leaves the image, and its gain is 0. others: fits of other
+    fit: the best fit about the recorded state; None where it leaves the image, and its gain is 0. others: fits of other
     states.
     """
-    refinement, given = search.refinement, search.scene.recorded.states[index]
-    misfit, gain = (misfits.of_frame[index], 0.0) if own is None else (own.misfit, max(own.gain, 0.0))
+    refinement, recorded = search.refinement, search.scene.recorded.states[index]
+    misfit, gain = (misfits.of_frame[index], 0.0) if fit is None else (fit.misfit, max(fit.gain, 0.0))
     best = _best(others) if others else None
     verdict = Verdict.ACCEPTED
     # an instrument that is hardly in the image has a low misfit, too
     if best is not None and best.misfit < JUDGE.better * misfit and best.gain > gain:
-        if _distance(search, index, given, best.state, scale) > JUDGE.min_distance:
+        if _distance(search, index, recorded, best.state, scale) > JUDGE.min_distance:
             verdict = Verdict.REFITTED if best.misfit < misfits.limit else Verdict.EXCLUDED
             refitted = Refitted.of(search, index, others)
-            refinement.set_state(index, given, refitted.fit.state, refitted.deviations)
+            refinement.set_state(index, recorded, refitted.fit.state, refitted.deviations)
     elif misfits.rejection_limit < misfit < math.inf:
         verdict = Verdict.EXCLUDED
     explained = not misfits.limit < misfit < math.inf and (best is None or best.gain <= JUDGE.unclear * gain)
     if verdict is not Verdict.ACCEPTED:
         refinement.judge(index, verdict)
     elif explained and refinement.verdict(index) is not Verdict.ACCEPTED:
-        recorded = given if own is None else own.state
-        refinement.set_state(index, given, recorded, search.deviations(index, scale))
+        refined = recorded if fit is None else fit.state
+        refinement.set_state(index, recorded, refined, search.deviations(index, scale))
         refinement.judge(index, Verdict.ACCEPTED)
 
 
 def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:
     """Return the best fit of a frame with the prior about its recorded state, from several starts: a single fit may end
     in a local minimum. None where all leave the image."""
-    given, precision = search.scene.recorded.states[index], search.precision(index, scale)
-    starts = [given, search.state(index), *_sampled(search, index, given, precision, JUDGE.n_own)]
-    return max(_fits(search, index, starts, precision, given), key=lambda fit: fit.gain, default=None)
+    recorded, precision = search.scene.recorded.states[index], search.precision(index, scale)
+    starts = [recorded, search.state(index), *_sampled(search, index, recorded, precision, JUDGE.n_own)]
+    return max(_fits(search, index, starts, precision, recorded), key=lambda fit: fit.gain, default=None)
 
 
 def _sampled(search: StateSearch, index: int, state: State, precision: Tensor, count: int) -> list[State]:
@@ -240,16 +240,16 @@ def _states_of(search: StateSearch, frames: Sequence[int]) -> list[State]:
     return [search.state(frames[place]) for place in evenly_spaced(len(frames), JUDGE.n_others)]
 
 
-def _distance(search: StateSearch, index: int, given: State, state: State, scale: float) -> float:
+def _distance(search: StateSearch, index: int, recorded: State, state: State, scale: float) -> float:
     """Return the root mean square of a correction of frame `index` in standard deviations of the prior."""
-    apart = search.refinement.layout.increments_between(given, state)
+    apart = search.refinement.layout.increments_between(recorded, state)
     return math.sqrt(float((apart @ search.precision(index, scale) @ apart) / len(apart)))
 
 
 def mirrored_state(search: StateSearch, index: int, state: State) -> State:
     """Return the state that looks alike from afar in frame `index`, of instruments with stated links."""
     camera_from_world = search.scene.recorded.cameras[index].world_from_camera.inverse().cpu().double().numpy()
-    return _changed(search, state, lambda tree, shaft, *own: mirrored(tree, shaft, camera_from_world, *own))
+    return _changed(search, state, lambda tree, shaft, *pose: mirrored(tree, shaft, camera_from_world, *pose))
 
 
 def half_turned_state(search: StateSearch, state: State) -> State:
@@ -263,14 +263,14 @@ def _changed(
     change: Callable[[KinematicTree, np.ndarray, np.ndarray, dict[str, float]], tuple[np.ndarray, dict[str, float]]],
 ) -> State:
     """Return the state with pose and readings of each instrument by `change` of (tree, shaft, pose, readings)."""
-    found: dict[str, InstrumentState] = {}
+    changed: dict[str, InstrumentState] = {}
     for item, shaft in zip(search.scene.instruments, search.shafts, strict=True):
-        own = state.instruments[item.name]
+        previous = state.instruments[item.name]
         assert item.kinematics is not None
-        joints = {name: float(value) for name, value in own.joints.items()}
-        pose, joints = change(item.kinematics, shaft.numpy(), own.pose.cpu().double().numpy(), joints)
-        found[item.name] = InstrumentState(torch.from_numpy(pose).to(own.pose), joints)
-    return replace(state, instruments={**state.instruments, **found})
+        joints = {name: float(value) for name, value in previous.joints.items()}
+        pose, joints = change(item.kinematics, shaft.numpy(), previous.pose.cpu().double().numpy(), joints)
+        changed[item.name] = InstrumentState(torch.from_numpy(pose).to(previous.pose), joints)
+    return replace(state, instruments={**state.instruments, **changed})
 
 
 def describe_contradictions(refinement: Refinement, names: Sequence[str]) -> str:
@@ -291,12 +291,12 @@ def describe_contradictions(refinement: Refinement, names: Sequence[str]) -> str
 
 def _other_starts(search: StateSearch, index: int, others: Sequence[State]) -> list[State]:
     """Return states from which a frame is fitted: those of others, and its own with joints bent the other way."""
-    given, layout = search.scene.recorded.states[index], search.fitter.parameters
-    bent = [[-2 * given.instruments[own.name].joints[joint] for joint in own.joints] for own in layout.instruments]
+    recorded, layout = search.scene.recorded.states[index], search.fitter.parameters
+    bent = [[-2 * recorded.instruments[p.name].joints[joint] for joint in p.joints] for p in layout.instruments]
     still = [torch.zeros(6, dtype=torch.float64)] * len(bent)
     return [
-        *(replace(given, instruments=state.instruments) for state in others),
-        layout.moved_by_parts(given, still, bent),
+        *(replace(recorded, instruments=state.instruments) for state in others),
+        layout.moved_by_parts(recorded, still, bent),
     ]
 
 

@@ -27,14 +27,14 @@ class CropSettings:
 
     # images are trimmed and crops rounded to multiples of it, so that they can be halved three times exactly
     block_px: int = 8
-    max_pixels: int = 160_000  # of images worked on, to which larger ones are reduced
-    min_opacity: float = 0.2  # of Gaussians that say where the instrument is
-    margin_quantile: float = 0.002  # share of them at each side that a crop need not hold
-    n_posed: int = 8  # states whose posed Gaussians are kept
-    n_trimmings: int = 5  # of pixels that a linear map of colours does not explain: instruments and foreground
+    max_pixels: int = 160_000  # maximum pixels of an image worked on; larger ones are reduced
+    min_opacity: float = 0.2  # minimum opacity of Gaussians that bound the instrument
+    margin_quantile: float = 0.002  # share of these Gaussians that a crop may leave out at each side
+    n_posed: int = 8  # number of states whose posed Gaussians are cached
+    n_trimmings: int = 5  # trimmings of pixels that a linear colour map does not explain (instruments, foreground)
     same_color: float = 0.02  # mean difference of colours in [0, 1] below which they are left as they are
-    max_unexplained: float = 0.5  # of the colours' standard deviation
-    gain_range: tuple[float, float] = (0.2, 3.0)  # of a colour's light, within which a map is plausible
+    max_unexplained: float = 0.5  # ratio of the mean unexplained colour difference to the colours' standard deviation
+    gain_range: tuple[float, float] = (0.2, 3.0)  # plausible gains of a colour's light
 
 
 CROPS = CropSettings()
@@ -79,11 +79,11 @@ def working_size(camera: Camera, recorded: Recorded) -> Camera:
 def view_of(frame: Frame, camera: Camera, tissue: TissueRenderer, state: State | None) -> FrameView:
     """Return a frame at the size of `camera` (see `working_size`), over the tissue with the shadow of instruments in
     `state`. Raises NeecoError when its image cannot be read."""
-    image, mask, given = frame.load_image(), frame.load_mask(), frame.camera
-    counted = torch.ones(given.height, given.width) if mask is None else mask.float()
-    factor = camera.fx / given.fx
-    width, height = max(camera.width, round(given.width * factor)), max(camera.height, round(given.height * factor))
-    if (width, height) != (given.width, given.height):
+    image, mask, full = frame.load_image(), frame.load_mask(), frame.camera
+    counted = torch.ones(full.height, full.width) if mask is None else mask.float()
+    factor = camera.fx / full.fx
+    width, height = max(camera.width, round(full.width * factor)), max(camera.height, round(full.height * factor))
+    if (width, height) != (full.width, full.height):
         image, counted = area_averaged(image, width, height), area_averaged(counted[..., None], width, height)[..., 0]
     inside = slice(0, camera.height), slice(0, camera.width)
     weight = torch.where(counted[inside] > 0.99, 1.0, 0.0)
@@ -168,8 +168,8 @@ class InstrumentRenderer:
     @torch.no_grad()
     def _posed(self, state: State) -> tuple[State, Gaussians]:
         """Return `state` as registered, and the Gaussians in it."""
-        for known, registered, posed in self._latest:
-            if known is state:
+        for cached, registered, posed in self._latest:
+            if cached is state:
                 return registered, posed
         registered = self.alone.registered(state)
         moved = self._poser(registered)
@@ -263,8 +263,8 @@ def _without_tissue(scene: GaussianScene) -> GaussianScene:
     """Return a scene of the instruments alone: the same modules, Gaussians of its own."""
     tissue, *others = scene.canonical.counts
     tensors = {name: tensor[tissue:].detach().contiguous() for name, tensor in scene.canonical.tensors().items()}
-    own = CanonicalGaussians.from_tensors(tensors, (0, *others))
-    alone = GaussianScene(scene.method, own, scene.deformation, scene.instruments, scene.recorded, scene.center)
+    gaussians = CanonicalGaussians.from_tensors(tensors, (0, *others))
+    alone = GaussianScene(scene.method, gaussians, scene.deformation, scene.instruments, scene.recorded, scene.center)
     alone.load_state_dict(scene.state_dict())
     alone.sh_degree = scene.sh_degree
     for parameter in alone.parameters(recurse=False):  # the modules are the scene's, which may be training

@@ -37,17 +37,17 @@ class FitterSettings:
     huber: float = 0.05  # colour residual beyond which the cost of a pixel is linear
     # pixels of the full size that count as one observation, since residuals of neighbours correlate
     correlation_px: float = 25.0
-    # deg, mm, deg and mm of joints: finite differences at full size
+    # finite differences at full size: deg, mm, deg and mm of joints
     steps: tuple[float, float, float, float] = (0.2, 0.1, 0.5, 0.1)
-    small_step: tuple[float, float, float, float] = (0.05, 0.05, 0.1, 0.05)  # the same: a smaller step is the last
+    small_step: tuple[float, float, float, float] = (0.05, 0.05, 0.1, 0.05)  # the same: steps of a converged fit
     steps_at_once: int = 2  # steps between new differences and shadows; more would attract the fit to where it was
-    neighbourhood: float = 0.015  # of the image's diagonal: pixels this close to an instrument belong to its misfit
-    # of the diagonal: areas as wide that neither instrument nor tissue explains are foreground
+    neighbourhood: float = 0.015  # share of the image's diagonal: distance within which pixels count in a misfit
+    # minimum width, as a share of the diagonal, of areas that neither instrument nor tissue explains: foreground
     foreground_width: float = 0.02
     foreground_error: float = 3 * huber * (0.1 - huber / 2)  # Huber error of a pixel whose colours are off by 0.1
     foreground_rim_px: int = 5  # side of the square by which such areas are widened
-    max_hidden: float = 0.3  # share of an instrument behind the foreground; if more, it is rather somewhere else
-    margin_px: int = 28  # about the instruments, that a fit looks at
+    max_hidden: float = 0.3  # maximum share of an instrument behind the foreground
+    margin_px: int = 28  # margin of a fit's crop about the instruments
 
 
 FIT = FitterSettings()
@@ -120,8 +120,8 @@ class MovedStates:
 
     def at(self, increments: Tensor) -> State:
         """Return the state moved by increments [P] float64, which must not be modified afterwards."""
-        for known, state in self._known:
-            if known is increments:
+        for cached, state in self._known:
+            if cached is increments:
                 return state
         state = self.parameters.moved(self.expected, increments)
         self._known.append((increments, state))
@@ -171,10 +171,10 @@ class Fitter(Generic[P]):
                 crop = self.with_shadow(crop, moved.at(increments))
                 problem = _CropProblem(self, crop, level, residual, moved, precision)
                 max_steps = min(count - first, FIT.steps_at_once)
-                found = minimise(problem, [increments], max_steps, small=small, linearised_for=FIT.steps_at_once)
-                increments, cost = found.parameters, found.cost
-                information = information if found.information is None else found.information
-                if found.settled:
+                minimum = minimise(problem, [increments], max_steps, small=small, linearised_for=FIT.steps_at_once)
+                increments, cost = minimum.parameters, minimum.cost
+                information = information if minimum.information is None else minimum.information
+                if minimum.settled:
                     break
         state = moved.at(increments)
         crop = self.crop_around(view, state)

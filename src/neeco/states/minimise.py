@@ -93,7 +93,7 @@ def minimise(
         posed, image = problem.render(at)
         return residual.cost(image) + 0.5 * float(at @ precision @ at), at, posed, image
 
-    cost, parameters, posed, image = min(map(evaluated, starts), key=lambda found: found[0])
+    cost, parameters, posed, image = min(map(evaluated, starts), key=lambda evaluation: evaluation[0])
     damping, information, settled = 1e-3, None, False
     for step in range(max_steps):
         off = residual.of(image)

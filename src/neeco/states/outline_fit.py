@@ -31,24 +31,24 @@ class OutlineFitSettings:
 
     bins: int = 24  # of colours, per channel
     smooth_bins: float = 0.8  # standard deviation of the smoothing of a histogram, in bins
-    common: float = 0.05  # share of pixels whose colour says nothing
-    block_px: int = 8  # of blocks of cells that are chosen together
-    grid_px: int = 4  # of the grid on which colours are attributed
+    common: float = 0.05  # share of pixels whose colour carries no information
+    block_px: int = 8  # side of blocks of cells that are selected together
+    grid_px: int = 4  # spacing of the grid on which colours are attributed
     # pixels that count as one: errors of outlines and of the model are correlated along them
     correlated_px: float = 12.0
-    max_ratio: float = 3.0  # of log likelihoods that count in a misfit
-    min_blocks: float = 40.0  # blocks' worth of the largest ratio, that an instrument counts for at least
-    ears_mm: float = 15.0  # before the first joint, that count neither as shaft nor as beyond it
-    base_sd_rad: float = 0.035  # of the error that all states share
-    base_sd_mm: float = 3.0  # of the error that all states share
-    tube_tilt_sd: float = 0.1  # rad, of the shaft's axis where no trocar gives it
-    end_sd_mm: float = 6.0  # of the shaft's end, there
-    least_end_mm: float = -10.0  # of the shaft's end before the first pivot, there
-    steps: tuple[float, float] = (0.002, 0.05)  # rad, mm, of differences
-    parameter_step: float = 0.02  # standard deviations
-    max_step_sds: float = 3.0  # of one step
-    first_softness: float = 10.0  # px of outlines from which colours are learned at first
-    # px of cells and of the outlines' softness; steps
+    max_ratio: float = 3.0  # maximum log likelihood ratio that counts in a misfit
+    min_blocks: float = 40.0  # minimum weight of an instrument in a misfit, in blocks of the largest ratio
+    ears_mm: float = 15.0  # length before the first joint that counts neither as shaft nor as beyond it
+    base_sd_rad: float = 0.035  # standard deviation of the rotation error that all states share
+    base_sd_mm: float = 3.0  # standard deviation of the translation error that all states share
+    tube_tilt_sd: float = 0.1  # rad, standard deviation of the shaft's axis without a trocar
+    end_sd_mm: float = 6.0  # standard deviation of the shaft's end without a trocar
+    least_end_mm: float = -10.0  # minimum distance of the shaft's end before the first pivot without a trocar
+    steps: tuple[float, float] = (0.002, 0.05)  # finite differences: rad, mm
+    parameter_step: float = 0.02  # finite difference of a shared parameter, standard deviations
+    max_step_sds: float = 3.0  # maximum step, standard deviations
+    first_softness: float = 10.0  # softness of the outlines from which colours are learned first, px
+    # of each stage: size of cells px, softness of the outlines px, number of steps
     stages: tuple[tuple[int, float, int], ...] = ((8, 6.0, 8), (4, 3.0, 8), (4, 2.0, 8))
 
 
@@ -71,8 +71,8 @@ class LinkViews:
     def take(self, rows: np.ndarray, state_of_view: np.ndarray, poses: np.ndarray, readings: np.ndarray) -> LinkViews:
         """Return the views `rows`, of these states."""
         images = ("images", "usable", "camera_from_world", "intrinsics")
-        found = replace(self, **{name: getattr(self, name)[rows] for name in images})
-        return replace(found, state_of_view=state_of_view, poses=poses, readings=readings)
+        views = replace(self, **{name: getattr(self, name)[rows] for name in images})
+        return replace(views, state_of_view=state_of_view, poses=poses, readings=readings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +142,9 @@ class StatesProblem:
         poses[:, :3, 3] = (poses[:, :3, 3] - self.center) @ turn.T + self.center + base[3:]
         poses[:, :3, :3] = turn @ poses[:, :3, :3]
         values = joint_values(views.tree, dict(zip(views.tree.readings, readings.T, strict=True)))
-        shown = views.state_of_view
+        states = views.state_of_view
         intrinsics = tuple(views.intrinsics.T[..., None])
-        return self.model.outlines(fit.shared[:-6], values[shown], views.camera_from_world @ poses[shown], intrinsics)
+        return self.model.outlines(fit.shared[:-6], values[states], views.camera_from_world @ poses[states], intrinsics)
 
     def _distances(self, fit: StatesFit, cell: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
         """Middles [N, 2] px of so many rows and columns of cells, and their signed distances [V, C, N] px to the cones'
@@ -168,13 +168,13 @@ class StatesProblem:
         bins = (images.astype(np.uint16) * OUTLINES.bins // 256).astype(np.int32)
         index = (bins[..., 0] * OUTLINES.bins + bins[..., 1]) * OUTLINES.bins + bins[..., 2]
         rows, columns = np.arange(height) // OUTLINES.grid_px, np.arange(width) // OUTLINES.grid_px
-        found = []
+        densities = []
         for label in range(3):
-            own = np.where(self.views.usable, member[..., label][:, rows[:, None], columns[None]], 0.0)
-            counted = np.bincount(index.ravel(), own.ravel(), OUTLINES.bins**3).reshape((OUTLINES.bins,) * 3)
+            weights = np.where(self.views.usable, member[..., label][:, rows[:, None], columns[None]], 0.0)
+            counted = np.bincount(index.ravel(), weights.ravel(), OUTLINES.bins**3).reshape((OUTLINES.bins,) * 3)
             density = gaussian_filter(counted, OUTLINES.smooth_bins) + 1e-9
-            found.append(density / density.sum())
-        tissue, instrument = found[0], (found[1] + found[2]) / 2
+            densities.append(density / density.sum())
+        tissue, instrument = densities[0], (densities[1] + densities[2]) / 2
         common = OUTLINES.common * (tissue + instrument) / 2
         ratio = np.log(((1 - OUTLINES.common) * instrument + common) / ((1 - OUTLINES.common) * tissue + common))
         return np.asarray(ratio.astype(np.float32).ravel()[index])
@@ -226,10 +226,10 @@ class StatesProblem:
     def turned_to_shaft(self, fit: StatesFit) -> StatesFit:
         """The same fit with tilts and roll counted about the shaft's axis as fitted, from now on."""
         basis = frame_about(self.model.shaft_axis(fit.shared))
-        own = fit.own.copy()
-        own[:, :3] = own[:, :3] @ (self.basis.T @ basis)
+        corrections = fit.own.copy()
+        corrections[:, :3] = corrections[:, :3] @ (self.basis.T @ basis)
         self.basis = basis
-        return StatesFit(fit.shared, own)
+        return StatesFit(fit.shared, corrections)
 
     def prior_cost(self, fit: StatesFit) -> float:
         """Half the sum of squares of all parameters, in standard deviations of their priors."""
@@ -239,8 +239,8 @@ class StatesProblem:
     def blocks_with_priors(self, fit: StatesFit, cells: Cells, shared: bool) -> Blocks:
         """`blocks`, with those of the priors."""
         b = self.blocks(fit, cells, shared)
-        own = b.own + np.eye(self.sds.shape[1]) / self.sds[..., None] ** 2
-        b = replace(b, own=own, own_gradient=b.own_gradient + fit.own / self.sds**2)
+        state_blocks = b.own + np.eye(self.sds.shape[1]) / self.sds[..., None] ** 2
+        b = replace(b, own=state_blocks, own_gradient=b.own_gradient + fit.own / self.sds**2)
         if not shared:
             return b
         gradient = b.shared_gradient + (fit.shared - self.shared_means) / self.shared_sds**2
@@ -248,8 +248,8 @@ class StatesProblem:
 
     def blocks(self, fit: StatesFit, cells: Cells, shared: bool = True) -> Blocks:
         """Gradient and information of the cells' likelihood, without priors; `shared`: of shared parameters, too."""
-        found = self.outlines(fit)
-        distances, places, ways = found.distances(cells.points)
+        outlines = self.outlines(fit)
+        distances, places, ways = outlines.distances(cells.points)
         nearest = distances.argmax(1)
         view, cell = np.indices(nearest.shape)
         place, way = places[view, nearest, cell], ways[view, nearest, cell]
@@ -258,12 +258,12 @@ class StatesProblem:
         posterior = odds / (odds + 1 - inside)
         spread = inside * (1 - inside)
         # information of labels less what colours leave open (Louis, JRSS B 1982)
-        known = np.clip(spread - posterior * (1 - posterior), 0, None) * cells.weights / cells.softness**2
+        label_information = np.clip(spread - posterior * (1 - posterior), 0, None) * cells.weights / cells.softness**2
         slope = (inside - posterior) * cells.weights / cells.softness
         share = np.stack([1 - place, place], -1)
         by = np.concatenate([(share[..., None] * way[..., None, :]).reshape(*nearest.shape, 4), share], -1)  # [V, N, 6]
-        by_own, by_shared = self._slopes(fit, found, shared)
-        shown, states = self.views.state_of_view, len(self.views.poses)
+        by_own, by_shared = self._slopes(fit, outlines, shared)
+        state_of_view, states = self.views.state_of_view, len(self.views.poses)
         d, p = by_own.shape[-1], by_shared.shape[-1]
         out = Blocks(
             own=np.zeros((states, d, d)),
@@ -275,38 +275,38 @@ class StatesProblem:
         )
         for cone in range(distances.shape[1]):
             mine = nearest == cone
-            information = (by * (known * mine)[..., None]).transpose(0, 2, 1) @ by
+            information = (by * (label_information * mine)[..., None]).transpose(0, 2, 1) @ by
             gradient = (by * (slope * mine)[..., None]).sum(1)
             rows = slice(6 * cone, 6 * cone + 6)
-            own, common = by_own[:, rows], by_shared[:, rows]
-            weighed = own.transpose(0, 2, 1) @ information
-            np.add.at(out.own, shown, weighed @ own)
-            np.add.at(out.cross, shown, weighed @ common)
-            np.add.at(out.own_gradient, shown, (own * gradient[..., None]).sum(1))
+            state_slopes, common = by_own[:, rows], by_shared[:, rows]
+            weighed = state_slopes.transpose(0, 2, 1) @ information
+            np.add.at(out.own, state_of_view, weighed @ state_slopes)
+            np.add.at(out.cross, state_of_view, weighed @ common)
+            np.add.at(out.own_gradient, state_of_view, (state_slopes * gradient[..., None]).sum(1))
             out.shared[:] += (common.transpose(0, 2, 1) @ information @ common).sum(0)
             out.shared_gradient[:] += (common * gradient[..., None]).sum((0, 1))
         return out
 
-    def _slopes(self, fit: StatesFit, found: Outlines, shared: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _slopes(self, fit: StatesFit, outlines: Outlines, shared: bool) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of the cones' images [V, 6 C] by each state's parameters [6 + R] and by shared ones [P + 6]."""
-        here = _flat(found)
+        here = _flat(outlines)
 
         def by(other: StatesFit, step: float) -> np.ndarray:
             return (_flat(self.outlines(other)) - here) / step
 
-        own = []
+        columns = []
         for index in range(fit.own.shape[1]):
             step = OUTLINES.steps[1] if 3 <= index < POSE else OUTLINES.steps[0]
             moved = fit.own.copy()
             moved[:, index] += step
-            own.append(by(StatesFit(fit.shared, moved), step))
+            columns.append(by(StatesFit(fit.shared, moved), step))
         common = []
         for index in range(len(fit.shared)) if shared else ():
             moved = fit.shared.copy()
             moved[index] += (step := OUTLINES.parameter_step * self.shared_sds[index])
             common.append(by(StatesFit(moved, fit.own), step))
         empty = np.zeros((*here.shape, 0))
-        return np.stack(own, -1), np.stack(common, -1) if shared else empty
+        return np.stack(columns, -1), np.stack(common, -1) if shared else empty
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,8 +329,8 @@ class _Arrow(Linearisation[StatesFit]):
 
     def step(self, damping: float) -> np.ndarray:
         b = self.blocks
-        own = b.own + damping * np.einsum("sii->si", b.own)[..., None] * np.eye(b.own.shape[1])
-        solved = np.linalg.solve(own, np.concatenate([b.cross, b.own_gradient[..., None]], 2))
+        damped = b.own + damping * np.einsum("sii->si", b.own)[..., None] * np.eye(b.own.shape[1])
+        solved = np.linalg.solve(damped, np.concatenate([b.cross, b.own_gradient[..., None]], 2))
         p = len(b.shared)
         if p:
             left = b.shared + damping * np.diag(np.diag(b.shared)) - np.einsum("sdp,sdq->pq", b.cross, solved[..., :p])
@@ -356,17 +356,17 @@ def adjust(problem: StatesProblem, fit: StatesFit, cells: Cells, max_steps: int,
     def move(fit: StatesFit, step: np.ndarray) -> StatesFit:
         count = len(fit.shared) if shared else 0
         limit = OUTLINES.max_step_sds * shared_sds[:count]
-        own = step[count:].reshape(fit.own.shape)
+        change = step[count:].reshape(fit.own.shape)
         new = fit.shared.copy()
         new[:count] += np.clip(step[:count], -limit, limit)
-        return StatesFit(new, fit.own + np.clip(own, -OUTLINES.max_step_sds * sds, OUTLINES.max_step_sds * sds))
+        return StatesFit(new, fit.own + np.clip(change, -OUTLINES.max_step_sds * sds, OUTLINES.max_step_sds * sds))
 
     return levenberg_marquardt(fit, linearise, move, max_steps=max_steps, damping=1e-2, tolerance=1e-4)
 
 
-def _flat(found: Outlines) -> np.ndarray:
+def _flat(outlines: Outlines) -> np.ndarray:
     """Numbers [V, 6 C] of the cones' images: both ends px, then half the widths there."""
-    both = np.concatenate([found.ends.reshape(*found.ends.shape[:2], 4), found.widths], -1)
+    both = np.concatenate([outlines.ends.reshape(*outlines.ends.shape[:2], 4), outlines.widths], -1)
     return both.reshape(len(both), -1)
 
 

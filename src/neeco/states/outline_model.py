@@ -23,33 +23,33 @@ from neeco.geometry.trocar import line_through_trocar
 class OutlineModelSettings:
     """Priors of an instrument's shape and of what is stated of its links."""
 
-    tube_mm: float = 150.0  # of the root link that is modelled
+    tube_mm: float = 150.0  # length of the root link that is modelled
     nearest_mm: float = 8.0  # depth at which cones are cut off
-    pivot_sd_mm: float = 1.2  # of stated pivots
-    axis_sd_rad: float = 0.06  # of stated axes
-    offset_sd_rad: float = 0.05  # of stated offsets of revolute joints, which include errors of shapes
-    # of an outermost link's direction from the tube's at rest: a curved jaw looks like an offset
+    pivot_sd_mm: float = 1.2  # standard deviation of stated pivots
+    axis_sd_rad: float = 0.06  # standard deviation of stated axes
+    offset_sd_rad: float = 0.05  # standard deviation of stated offsets of revolute joints, errors of shapes included
+    # standard deviation of an outermost link's direction from the tube's at rest: a curved jaw looks like an offset
     heading_sd_rad: float = 0.15
-    slide_sd_mm: float = 1.0  # of the offset of a prismatic joint
-    play_sd_rad: float = 0.012  # by which readings lag behind, or lead, with the sign of motion
+    slide_sd_mm: float = 1.0  # standard deviation of the offset of a prismatic joint
+    play_sd_rad: float = 0.012  # standard deviation of the play by which readings lag or lead with the sign of motion
     play_sd_mm: float = 0.3  # the same, of prismatic joints
-    motion_steps: int = 2  # moments before and after, between which the sign of motion is taken
-    tilt_sd_rad: float = 0.03  # of the tube's axis about its first guess
-    aside_sd_mm: float = 0.7  # of the tube's axis from the first pivot
-    log_radius_sd: float = 0.4  # of the tube's radius
-    ratio_sd: float = 0.3  # of the logarithm of the ratio of one link's radius to its parent's
-    flat_sd: float = 0.2  # of the relative change of a radius with the viewing direction
-    ears_mm: float = 6.0  # from the tube's end to the first pivot
-    ears_sd_mm: float = 3.0  # of that distance
-    length_mm: float = 13.0  # of outermost links
-    length_sd_mm: float = 5.0  # of that length
-    unequal_sd_mm: float = 1.5  # of the difference between the lengths of outermost links
-    tube_radius_mm: float = 3.8  # first guess
-    taper: float = 0.5  # first guess, of outermost links: ratio of their radii
-    min_radius_mm: float = 0.2  # of any cone
-    min_length_mm: float = 2.0  # of an outermost link
-    max_bend_mm: float = 1.5  # of a logged pose's line from the trocar, rms
-    min_pivot_mm: float = 5.0  # from the root's origin, for a direction
+    motion_steps: int = 2  # number of moments before and after, between which the sign of motion is taken
+    tilt_sd_rad: float = 0.03  # standard deviation of the tube's axis about its first guess
+    aside_sd_mm: float = 0.7  # standard deviation of the distance of the tube's axis from the first pivot
+    log_radius_sd: float = 0.4  # standard deviation of the logarithm of the tube's radius
+    ratio_sd: float = 0.3  # standard deviation of the log ratio of a link's radius to its parent's
+    flat_sd: float = 0.2  # standard deviation of the relative change of a radius with the viewing direction
+    ears_mm: float = 6.0  # distance from the tube's end to the first pivot
+    ears_sd_mm: float = 3.0  # standard deviation of that distance
+    length_mm: float = 13.0  # length of outermost links
+    length_sd_mm: float = 5.0  # standard deviation of that length
+    unequal_sd_mm: float = 1.5  # standard deviation of the difference between the lengths of outermost links
+    tube_radius_mm: float = 3.8  # first guess of the tube's radius
+    taper: float = 0.5  # first guess of the ratio of the radii of outermost links
+    min_radius_mm: float = 0.2  # minimum radius of a cone
+    min_length_mm: float = 2.0  # minimum length of an outermost link
+    max_bend_mm: float = 1.5  # maximum RMS distance of logged poses' axes from the trocar
+    min_pivot_mm: float = 5.0  # minimum distance of the first pivot from the root's origin, for a direction
     max_along: float = 0.9  # cosine between a joint's axis and the shaft, above which it turns the shaft about itself
     min_motion: float = 0.02  # standard deviation of a joint's value, rad, from which it bends
     min_slide_mm: float = 0.5  # standard deviation of a prismatic joint's value, from which it moves
@@ -192,11 +192,11 @@ class ArticulatedModel:
                 self.cones.append(Cone(index, None, radii, length, heading))
 
     def _chain(self, index: int) -> list[int]:
-        found = []
+        chain = []
         while index >= 0:
-            found.append(index)
+            chain.append(index)
             index = self.parents[index]
-        return found
+        return chain
 
     def link_poses(self, parameters: np.ndarray, values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """root_from_link rotations [F, 3, 3] and translations [F, 3] mm of all links; values [F, L] of joints, or
@@ -254,10 +254,10 @@ class ArticulatedModel:
             else:
                 far = shifts[cone.child]
             ends.append(np.stack([shift, far], 1))
-            own = parameters[cone.radii : cone.radii + 4]
-            near = max(tube * np.exp(own[0]), MODEL.min_radius_mm)
-            radii.append((near, max(near * np.exp(own[1]), MODEL.min_radius_mm)))
-            flat.append(np.clip(own[2:], -0.6, 0.6))
+            shape = parameters[cone.radii : cone.radii + 4]
+            near = max(tube * np.exp(shape[0]), MODEL.min_radius_mm)
+            radii.append((near, max(near * np.exp(shape[1]), MODEL.min_radius_mm)))
+            flat.append(np.clip(shape[2:], -0.6, 0.6))
             sideways.append(turn @ (rest @ basis[:, 0]))
         return np.stack(ends, 1), np.array(radii), np.array(flat), np.stack(sideways, 1)
 
@@ -309,13 +309,13 @@ class ArticulatedModel:
         )
         return Outlines(images, widths, valid)
 
-    def outline_points(self, found: Outlines) -> np.ndarray:
+    def outline_points(self, outlines: Outlines) -> np.ndarray:
         """Points [F, N, 2] px of all cones' outlines, of the cone `owner` [N] each."""
-        start, end = found.ends[:, self.owner, 0], found.ends[:, self.owner, 1]
+        start, end = outlines.ends[:, self.owner, 0], outlines.ends[:, self.owner, 1]
         ahead = end - start
         unit_ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-6)
         out = np.stack([-unit_ahead[..., 1], unit_ahead[..., 0]], -1)
-        near, far = found.widths[:, self.owner, 0], found.widths[:, self.owner, 1]
+        near, far = outlines.widths[:, self.owner, 0], outlines.widths[:, self.owner, 1]
         width = (near + self.places * (far - near))[..., None]
         way = np.cos(self.angles)[:, None] * unit_ahead + np.sin(self.angles)[:, None] * out
         return np.asarray(start + self.places[:, None] * ahead + width * way)
@@ -378,7 +378,7 @@ def mirrored(
     center = here[:3, :3] @ pivot + here[:3, 3]
     here[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ here[:3, :3] @ (np.eye(3) - 2 * np.outer(direction, direction))
     here[:3, 3] = center - here[:3, :3] @ pivot
-    values = _bent_back(readings, [link for link, own in across if abs(own @ direction) < 0.5])
+    values = _bent_back(readings, [link for link, joint_axis in across if abs(joint_axis @ direction) < 0.5])
     return np.linalg.inv(camera_from_world) @ here, values
 
 
@@ -403,12 +403,10 @@ def _first_joint_across(
     rest. Without one: the root's origin and any direction across."""
     points, axes = (part[::-1] for part in tree.axes_at_rest)
     joints = zip(tree.joints[::-1], points, axes, strict=True)
-    across = [
-        (link, point, own - (own @ axis) * axis) for link, point, own in joints if abs(own @ axis) < MODEL.max_along
-    ]
+    across = [(link, point, u - (u @ axis) * axis) for link, point, u in joints if abs(u @ axis) < MODEL.max_along]
     if not across:
         return np.zeros(3), np.linalg.svd(axis[None])[2][1], []
-    return across[0][1], unit(across[0][2]), [(link, unit(own)) for link, _, own in across]
+    return across[0][1], unit(across[0][2]), [(link, unit(direction)) for link, _, direction in across]
 
 
 def _bent_back(readings: Mapping[str, float], links: Sequence[Link]) -> dict[str, float]:

@@ -30,25 +30,25 @@ class OutlineStatesSettings:
     tried: tuple[float, ...] = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
     # of a state that is wrong altogether, about each of its starts
     wrong: tuple[float, ...] = (12 * DEG, 30 * DEG, 4.0, 8.0, 20 * DEG, 8.0)
-    # standard deviations of a refitted one, at most, for it to count
+    # maximum standard deviations of a refitted state that counts
     settled: tuple[float, ...] = (6 * DEG, 15 * DEG, 1.5, 4.0, 15 * DEG, 4.0)
-    # sizes that errors of the model alone may feign: no cone is a wrist
+    # sizes that errors of the model alone may cause: no cone is a wrist
     feigned: tuple[float, ...] = (0.35 * DEG, 2.3 * DEG, 0.3, 0.6, 3 * DEG, 1.0)
-    # of the errors tried, the least that is assumed of any parameter where those of another are large
+    # minimum share of the sizes tried that any parameter gets where those of another are large
     min_share: float = 0.5
-    min_factor: float = 2.0  # times these, from which a size counts
-    em_steps: int = 200  # of expectation maximisation
-    max_estimated: int = 30  # states from which sizes are estimated
+    min_factor: float = 2.0  # factor on the sizes above, from which an error counts as large
+    em_steps: int = 200  # steps of expectation maximisation
+    max_estimated: int = 30  # maximum number of states from which sizes are estimated
     bad_mads: float = 6.0  # median absolute deviations above the median, from which a misfit is bad
-    bad_misfit: float = 0.08  # above the median, from which a misfit is bad, at least
-    bad_weight: float = 0.02  # of bad states in the fit of what all states share
+    bad_misfit: float = 0.08  # minimum difference from the median, from which a misfit is bad
+    bad_weight: float = 0.02  # weight of bad states in the fit of what all states share
     large_sds: float = 1.8  # root mean square of a correction in standard deviations
-    max_usual_misfit: float = 0.25  # median, above which colours do not show the instrument
-    max_misfit: float = 0.4  # from which a state is wrong even where nothing explains it better
-    better: float = 0.75  # share of the misfit, below which another start is right
-    n_others: int = 4  # states of other moments that are tried
-    width_px: int = 320  # of the images compared
-    min_states: int = 8  # with fewer, nothing is said about them
+    max_usual_misfit: float = 0.25  # median misfit above which colours do not show the instrument
+    max_misfit: float = 0.4  # misfit from which a state is wrong even where nothing explains it better
+    better: float = 0.75  # ratio of another start's misfit to a state's, below which that start is right
+    n_others: int = 4  # number of states of other moments that are tried
+    width_px: int = 320  # width of the images compared
+    min_states: int = 8  # minimum number of states; with fewer, none is judged
 
 
 STATES = OutlineStatesSettings()
@@ -80,19 +80,19 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
     """
     tried = np.maximum(expected, sds_of(STATES.tried, slides))
     some = np.array(evenly_spaced(len(views.poses), STATES.max_estimated))
-    shown = np.flatnonzero(np.isin(views.state_of_view, some))
-    own = np.searchsorted(some, views.state_of_view[shown])
-    few = views.take(shown, own, views.poses[some], views.readings[some])
+    rows = np.flatnonzero(np.isin(views.state_of_view, some))
+    state_of_view = np.searchsorted(some, views.state_of_view[rows])
+    few = views.take(rows, state_of_view, views.poses[some], views.readings[some])
     first = _fit(few, tried)
     if np.median(first.misfits) > STATES.max_usual_misfit:
         return None
-    found = error_sizes(first, expected)
-    large = bool((found > STATES.min_factor * sds_of(STATES.feigned, slides)).any())
+    sizes = error_sizes(first, expected)
+    large = bool((sizes > STATES.min_factor * sds_of(STATES.feigned, slides)).any())
     if not large and not _bad(first).any():
         return None
     sds = expected
     if large:  # parameters that make up for each other must not hold each other
-        sds = np.maximum(np.maximum(found, STATES.min_share * sds_of(STATES.tried, slides)), expected)
+        sds = np.maximum(np.maximum(sizes, STATES.min_share * sds_of(STATES.tried, slides)), expected)
     states = _with_inconsistent(_fit(views, sds, first), sds, slides, large=large)
     return states if large or states.inconsistent.any() else None
 
@@ -113,7 +113,7 @@ def register_states(views: TrainingViews, refinement: Refinement, instrument: In
     scale = min(1.0, STATES.width_px / frames[0].camera.width)
     small = views if scale == 1.0 else views.scaled(scale)
     cameras = [frame.camera for frame in small.frames]
-    firsts = [frames[shown[0]].state.instruments[instrument.name] for shown in refinement.frames_of_instant]
+    firsts = [frames[indices[0]].state.instruments[instrument.name] for indices in refinement.frames_of_instant]
     images = np.stack([image.cpu().numpy() for image in small.images])
     usable = [np.ones(images.shape[1:3], bool) if mask is None else mask.cpu().numpy() for mask in small.masks]
     recorded = LinkViews(
@@ -130,19 +130,19 @@ def register_states(views: TrainingViews, refinement: Refinement, instrument: In
     usual = refinement.deviations(0).numpy()
     tilt, roll, across, depth = usual[:3].min(), usual[:3].max(), usual[3:6].min(), usual[3:6].max()
     expected = np.append([tilt, tilt, roll, across, across, depth], usual[6:])
-    found = find_states(recorded, expected, slides)
-    if found is None or not found.inconsistent.any():  # errors of all states are refined while training
+    states = find_states(recorded, expected, slides)
+    if states is None or not states.inconsistent.any():  # errors of all states are refined while training
         return False
     for row, (first, *_) in enumerate(refinement.frames_of_instant):
-        if found.inconsistent[row] and not found.refitted[row]:
+        if states.inconsistent[row] and not states.refitted[row]:
             refinement.judge(first, Verdict.EXCLUDED)
-        elif found.inconsistent[row]:
-            given = frames[first].state
-            own = given.instruments[instrument.name]
-            readings = dict(zip(tree.readings, found.readings[row].tolist(), strict=True))
-            state = InstrumentState(torch.from_numpy(found.poses[row]).to(own.pose), {**own.joints, **readings})
-            deviations = torch.from_numpy(np.sqrt(np.diagonal(found.covariances[row])).copy())
-            refinement.set_state(first, given, replace(given, instruments={instrument.name: state}), deviations)
+        elif states.inconsistent[row]:
+            logged = frames[first].state
+            before = logged.instruments[instrument.name]
+            readings = dict(zip(tree.readings, states.readings[row].tolist(), strict=True))
+            state = InstrumentState(torch.from_numpy(states.poses[row]).to(before.pose), {**before.joints, **readings})
+            deviations = torch.from_numpy(np.sqrt(np.diagonal(states.covariances[row])).copy())
+            refinement.set_state(first, logged, replace(logged, instruments={instrument.name: state}), deviations)
             refinement.judge(first, Verdict.REFITTED)
     return True
 
@@ -163,15 +163,15 @@ class _Fitted:
         return worst
 
 
-def _fit(views: LinkViews, sds: np.ndarray, known: _Fitted | None = None) -> _Fitted:
-    """Fit all states from those recorded; known: a fit of some of them, whose shape and base are where it begins."""
+def _fit(views: LinkViews, sds: np.ndarray, start: _Fitted | None = None) -> _Fitted:
+    """Fit all states from those recorded; start: a fit of some of them, whose shape and base are where it begins."""
     problem = StatesProblem(views, np.tile(sds, (len(views.poses), 1)))
     fit, softness, stages = problem.start(), OUTLINES.first_softness, OUTLINES.stages
-    if known is not None:
-        fit = problem.turned_to_shaft(replace(fit, shared=known.fit.shared))
+    if start is not None:
+        fit = problem.turned_to_shaft(replace(fit, shared=start.fit.shared))
         stages = OUTLINES.stages[1:]
-        if len(views.poses) == len(known.problem.views.poses):
-            fit, softness, stages = replace(fit, own=known.fit.own), OUTLINES.stages[-1][1], OUTLINES.stages[-1:]
+        if len(views.poses) == len(start.problem.views.poses):
+            fit, softness, stages = replace(fit, own=start.fit.own), OUTLINES.stages[-1][1], OUTLINES.stages[-1:]
     for cell, next_softness, steps in stages:
         ratios = problem.learn_colors(fit, softness)
         cells = problem.cells(fit, ratios, cell, next_softness)
@@ -184,17 +184,17 @@ def _fit(views: LinkViews, sds: np.ndarray, known: _Fitted | None = None) -> _Fi
     return _Fitted(problem, fit, ratios, cells, problem.misfits(fit, ratios))
 
 
-def error_sizes(found: _Fitted, sds: np.ndarray) -> np.ndarray:
+def error_sizes(fitted: _Fitted, sds: np.ndarray) -> np.ndarray:
     """Most likely standard deviations [6 + R] of the states' errors, from `sds` [6 + R] on (EM)."""
-    problem, fit = found.problem, found.fit
-    b = problem.blocks(fit, found.cells, shared=False)
-    use = ~_bad(found)
+    problem, fit = fitted.problem, fitted.fit
+    b = problem.blocks(fit, fitted.cells, shared=False)
+    use = ~_bad(fitted)
     information = b.own[use]
     linear = np.einsum("sij,sj->si", information, fit.own[use]) - b.own_gradient[use]
     # without a constant error, which the shape takes up
     constant = np.linalg.lstsq(information.sum(0), linear.sum(0), rcond=1e-3)[0]
     linear = linear - np.einsum("sij,j->si", information, constant)
-    groups = [np.array(own) for own in ((0, 1), (2,), (3, 4), (5,), *((k,) for k in range(POSE, len(sds))))]
+    groups = [np.array(rows) for rows in ((0, 1), (2,), (3, 4), (5,), *((k,) for k in range(POSE, len(sds))))]
 
     sds = sds.copy()
     for _ in range(STATES.em_steps):
@@ -206,9 +206,9 @@ def error_sizes(found: _Fitted, sds: np.ndarray) -> np.ndarray:
     return sds
 
 
-def _bad(found: _Fitted) -> np.ndarray:
+def _bad(fitted: _Fitted) -> np.ndarray:
     """bool [S]: states that a fit explains far worse than most, or that it moves far."""
-    return np.asarray((found.worst > _worst_usual(found.worst)) | _far(found))
+    return np.asarray((fitted.worst > _worst_usual(fitted.worst)) | _far(fitted))
 
 
 def _worst_usual(misfits: np.ndarray) -> float:
@@ -218,35 +218,35 @@ def _worst_usual(misfits: np.ndarray) -> float:
     return usual + max(STATES.bad_mads * deviation, STATES.bad_misfit)
 
 
-def _far(found: _Fitted) -> np.ndarray:
+def _far(fitted: _Fitted) -> np.ndarray:
     """bool [S]: states that a fit moves far, in standard deviations of their priors."""
-    size = np.sqrt(((found.fit.own / found.problem.sds) ** 2).mean(1))
+    size = np.sqrt(((fitted.fit.own / fitted.problem.sds) ** 2).mean(1))
     return np.asarray(size > STATES.large_sds * max(1.0, 1.5 * float(np.median(size))))
 
 
-def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray, *, large: bool) -> FoundStates:
+def _with_inconsistent(fitted: _Fitted, sds: np.ndarray, slides: np.ndarray, *, large: bool) -> FoundStates:
     """The states of a fit; those that are badly explained, from other starts."""
-    problem, fit = found.problem, found.fit
+    problem, fit = fitted.problem, fitted.fit
     poses, readings = problem.corrected(fit)
-    covariances = problem.to_root @ posterior(problem, fit, found.cells) @ problem.to_root.transpose(0, 2, 1)
-    far = _far(found)
-    inconsistent, refitted = _bad(found), np.zeros(len(poses), bool)
+    covariances = problem.to_root @ posterior(problem, fit, fitted.cells) @ problem.to_root.transpose(0, 2, 1)
+    far = _far(fitted)
+    inconsistent, refitted = _bad(fitted), np.zeros(len(poses), bool)
     good = np.flatnonzero(~inconsistent)
-    worst = found.worst
+    worst = fitted.worst
     limit = _worst_usual(worst[good])
     for state in np.flatnonzero(inconsistent).tolist():
-        trial = _from_starts(found, state, good, slides)
+        trial = _from_starts(fitted, state, good, slides)
         best = trial.misfits.argmin()
         if trial.misfits[best] > STATES.better * worst[state]:  # nothing explains it much better
             inconsistent[state] = worst[state] > STATES.max_misfit or far[state]
             continue
-        own, values = trial.problem.corrected(trial.fit)
-        poses[state], readings[state] = own[best], values[best]
+        trial_poses, values = trial.problem.corrected(trial.fit)
+        poses[state], readings[state] = trial_poses[best], values[best]
         covariance = posterior(trial.problem, trial.fit, trial.cells, shared=False)[best]
         to_root = trial.problem.to_root[best]
         covariances[state] = to_root @ covariance @ to_root.T
-        known = np.sqrt(np.diagonal(covariance)) < sds_of(STATES.settled, slides)
-        refitted[state] = trial.misfits[best] <= limit and bool(known.all())
+        settled = np.sqrt(np.diagonal(covariance)) < sds_of(STATES.settled, slides)
+        refitted[state] = trial.misfits[best] <= limit and bool(settled.all())
     return FoundStates(
         large=large,
         sds=sds,
@@ -258,37 +258,37 @@ def _with_inconsistent(found: _Fitted, sds: np.ndarray, slides: np.ndarray, *, l
     )
 
 
-def _from_starts(found: _Fitted, state: int, good: np.ndarray, slides: np.ndarray) -> _Fitted:
+def _from_starts(fits: _Fitted, state: int, good: np.ndarray, slides: np.ndarray) -> _Fitted:
     """Fits of one state from several starts, each as a state of its own, in its first view."""
-    problem, views = found.problem, found.problem.views
+    problem, views = fits.problem, fits.problem.views
     view = int(np.flatnonzero(views.state_of_view == state)[0])
-    given, readings = views.poses[state], views.readings[state]
-    axis = problem.model.shaft_axis(found.fit.shared)
-    starts = [(given, readings), (problem.corrected(found.fit)[0][state], problem.corrected(found.fit)[1][state])]
+    pose, readings = views.poses[state], views.readings[state]
+    axis = problem.model.shaft_axis(fits.fit.shared)
+    starts = [(pose, readings), (problem.corrected(fits.fit)[0][state], problem.corrected(fits.fit)[1][state])]
     quarters = Rotation.from_rotvec(np.outer((np.pi / 2, np.pi, -np.pi / 2), axis)).as_matrix()
-    starts += [(given @ rigid(turn, np.zeros(3)), readings) for turn in quarters]
+    starts += [(pose @ rigid(turn, np.zeros(3)), readings) for turn in quarters]
     names = views.tree.readings
     there, bent = mirrored(
-        views.tree, axis, views.camera_from_world[view], given, dict(zip(names, readings.tolist(), strict=True))
+        views.tree, axis, views.camera_from_world[view], pose, dict(zip(names, readings.tolist(), strict=True))
     )
     starts.append((there, np.array([bent[name] for name in names])))
-    own_poses, own_readings = problem.corrected(found.fit)
-    others = _subproblem(found, view, own_poses[good], own_readings[good], sds_of(STATES.wrong, slides))
-    ratios = np.broadcast_to(found.ratios[view], (len(good), *found.ratios.shape[1:]))
-    near = np.argsort(others.misfits(StatesFit(found.fit.shared, np.zeros_like(others.sds)), ratios))[: STATES.n_others]
+    own_poses, own_readings = problem.corrected(fits.fit)
+    others = _subproblem(fits, view, own_poses[good], own_readings[good], sds_of(STATES.wrong, slides))
+    ratios = np.broadcast_to(fits.ratios[view], (len(good), *fits.ratios.shape[1:]))
+    near = np.argsort(others.misfits(StatesFit(fits.fit.shared, np.zeros_like(others.sds)), ratios))[: STATES.n_others]
     starts += [(own_poses[good[k]], own_readings[good[k]]) for k in near]
     poses, values = (np.stack(part) for part in zip(*starts, strict=True))
-    trial = _subproblem(found, view, poses, values, sds_of(STATES.wrong, slides))
-    ratios = np.broadcast_to(found.ratios[view], (len(starts), *found.ratios.shape[1:]))
-    fit = StatesFit(found.fit.shared, np.zeros_like(trial.sds))
+    trial = _subproblem(fits, view, poses, values, sds_of(STATES.wrong, slides))
+    ratios = np.broadcast_to(fits.ratios[view], (len(starts), *fits.ratios.shape[1:]))
+    fit = StatesFit(fits.fit.shared, np.zeros_like(trial.sds))
     for cell, softness, steps in OUTLINES.stages[:2]:
         cells = trial.cells(fit, ratios, cell, softness)
         fit = adjust(trial, fit, cells, steps, shared=False)
     return _Fitted(trial, fit, ratios, cells, trial.misfits(fit, ratios))
 
 
-def _subproblem(found: _Fitted, view: int, poses: np.ndarray, readings: np.ndarray, sds: np.ndarray) -> StatesProblem:
+def _subproblem(fitted: _Fitted, view: int, poses: np.ndarray, readings: np.ndarray, sds: np.ndarray) -> StatesProblem:
     """The problem of one view at several states, with the shape as found."""
     count = len(poses)
-    repeated = found.problem.views.take(np.full(count, view), np.arange(count), poses, readings)
-    return StatesProblem(repeated, np.tile(sds, (count, 1)), like=found.problem)
+    repeated = fitted.problem.views.take(np.full(count, view), np.arange(count), poses, readings)
+    return StatesProblem(repeated, np.tile(sds, (count, 1)), like=fitted.problem)

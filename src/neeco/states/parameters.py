@@ -93,13 +93,13 @@ class StateParameters:
     @cached_property
     def rows(self) -> tuple[tuple[slice, slice], ...]:
         """Places in the vector of each instrument's pose and joints."""
-        found, joints_before = [], 0
+        places, joints_before = [], 0
         for index, item in enumerate(self.instruments):
             pose = 6 * index + (0 if self.joints_last else joints_before)
             joints = 6 * len(self.instruments) + joints_before if self.joints_last else pose + 6
-            found.append((slice(pose, pose + 6), slice(joints, joints + len(item.joints))))
+            places.append((slice(pose, pose + 6), slice(joints, joints + len(item.joints))))
             joints_before += len(item.joints)
-        return tuple(found)
+        return tuple(places)
 
     @cached_property
     def size(self) -> int:
@@ -130,12 +130,12 @@ class StateParameters:
         their bounds (None: joints stay); differentiable where these are tensors."""
         instruments = dict(state.instruments)
         for number, (item, increment) in enumerate(zip(self.instruments, poses, strict=True)):
-            given = instruments[item.name]
-            values = dict(given.joints)
+            before = instruments[item.name]
+            values = dict(before.joints)
             if joints is not None:
                 for index, (name, change) in enumerate(zip(item.joints, joints[number], strict=True)):
-                    values[name] = item.within_bounds(index, given.joints[name] + change)
-            instruments[item.name] = InstrumentState(moved_pose(given.pose, increment, item.pivot), values)
+                    values[name] = item.within_bounds(index, before.joints[name] + change)
+            instruments[item.name] = InstrumentState(moved_pose(before.pose, increment, item.pivot), values)
         return replace(state, instruments=instruments)
 
     def moved(self, state: State, parameters: Tensor) -> State:
@@ -147,7 +147,7 @@ class StateParameters:
 
     def increments_between(self, state: State, other: State) -> Tensor:
         """Return the parameters [P] with which `moved(state, …)` is `other`."""
-        found = torch.zeros(self.size, dtype=torch.float64)
+        delta = torch.zeros(self.size, dtype=torch.float64)
         for item, (pose, joints) in zip(self.instruments, self.rows, strict=True):
             a, b = state.instruments[item.name], other.instruments[item.name]
             one, two = (each.pose.detach().cpu().double().numpy() for each in (a, b))
@@ -157,9 +157,9 @@ class StateParameters:
                 pivot = item.pivot.cpu().numpy()
                 shift = shift - pivot + step[:3, :3] @ pivot
             vector = Rotation.from_matrix(step[:3, :3]).as_rotvec()
-            found[pose] = torch.from_numpy(np.concatenate([vector, shift]))
-            found[joints] = torch.tensor([b.joints[name] - a.joints[name] for name in item.joints], dtype=torch.float64)
-        return found
+            delta[pose] = torch.from_numpy(np.concatenate([vector, shift]))
+            delta[joints] = torch.tensor([b.joints[name] - a.joints[name] for name in item.joints], dtype=torch.float64)
+        return delta
 
     def step_sign(self, state: State, index: int, step: float) -> int:
         """Return 1, or -1 where parameter `index` is a joint that `step` upwards would move beyond its bounds."""

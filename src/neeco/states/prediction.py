@@ -53,15 +53,15 @@ def predict_corrections(
 
     Returns the verdict on each instrument's pose, under its name, and on its readings, under NAME.READING.
     """
-    shown: dict[int, int] = {}  # a frame of every instant
+    frame_of_instant: dict[int, int] = {}  # a frame of every instant
     for frame in (refinement.frame_steps > 0).nonzero()[:, 0].tolist():
-        shown.setdefault(refinement.instants[frame], frame)
-    order = sorted(shown, key=lambda instant: frames[shown[instant]].state.time)
-    found: dict[str, Prediction] = {}
+        frame_of_instant.setdefault(refinement.instants[frame], frame)
+    order = sorted(frame_of_instant, key=lambda instant: frames[frame_of_instant[instant]].state.time)
+    predictions: dict[str, Prediction] = {}
     if len(order) < PREDICTION.min_instants:
-        return found
+        return predictions
     for index, name in enumerate(corrections.names):
-        states = [frames[shown[instant]].state.instruments[name] for instant in order]
+        states = [frames[frame_of_instant[instant]].state.instruments[name] for instant in order]
         features = torch.stack([corrections.features(index, state) for state in states]).double().cpu()
         readings = corrections.readings[index]
         columns = [refinement.readings.index((name, reading)) for reading in readings]
@@ -74,8 +74,8 @@ def predict_corrections(
         for part, places in parts.items():
             total = float(usual[places].sum())
             explained = 1 - float(residuals[places].sum()) / total if total else 0.0
-            found[part] = Prediction(explained=explained, applied=explained >= PREDICTION.min_explained)
-            applied[places] = float(found[part].applied)
+            predictions[part] = Prediction(explained=explained, applied=explained >= PREDICTION.min_explained)
+            applied[places] = float(predictions[part].applied)
         learned, anchors = features[usual_rows], features[usual_rows]
         anchors = anchors[evenly_spaced(len(anchors), CORRECTIONS.max_anchors)]
         weights = _weights(learned, rows[usual_rows], anchors, length, noise) * applied
@@ -86,7 +86,7 @@ def predict_corrections(
             increments = corrections.increments(index, state)
             refinement.poses[instant, index] -= increments[:6]
             refinement.joints[instant, columns] -= increments[6 : 6 + len(columns)]
-    return found
+    return predictions
 
 
 def _consistent(rows: Tensor) -> Tensor:
@@ -117,7 +117,7 @@ def _best(features: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, float, float]
 
 def _weights(features: Tensor, rows: Tensor, anchors: Tensor, length: float, noise: float) -> Tensor:
     """Return the weights [A, K] of kernels at `anchors` [A, F] that explain `rows` [n, K] (subset of regressors)."""
-    own, across = kernel(anchors, anchors, length), kernel(anchors, features, length)
+    gram, across = kernel(anchors, anchors, length), kernel(anchors, features, length)
     return torch.linalg.solve(
-        across @ across.T + noise * own + PREDICTION.jitter * torch.eye(len(own)).to(own), across @ rows
+        across @ across.T + noise * gram + PREDICTION.jitter * torch.eye(len(gram)).to(gram), across @ rows
     )

@@ -40,13 +40,13 @@ ON_CPU = ("frame_steps", "fitted", "verdicts", "error_scale")  # read in every s
 class RefinementLimits:
     """Limits of corrections and of what is taken from neighbours in time."""
 
-    max_speedup: float = 10.0  # of the learning rates where a pose is less certain than usual
-    min_deviation: float = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
-    mean_decay: float = 0.4  # of the learning rates over a run: its mean
-    min_share: float = 0.05  # of a prior's standard deviations, that remain of a state's
-    uncorrected: float = 1.2  # times what was corrected: errors, as some remain that corrections do not explain
-    max_neighbour_s: float = 1.0  # s between instants whose unrecorded joints are similar
-    max_velocity_s: float = 0.5  # s between frames that velocities are taken from
+    max_speedup: float = 10.0  # maximum factor on the learning rates of poses that are less certain than usual
+    min_deviation: float = 1e-4  # rad, mm: minimum standard deviation; with 0 a pose would never move
+    mean_decay: float = 0.4  # mean decay of the learning rates over a run
+    min_share: float = 0.05  # minimum share of a prior's standard deviations that a state keeps
+    uncorrected: float = 1.2  # ratio of the remaining error to the RMS of the learned corrections
+    max_neighbour_s: float = 1.0  # maximum time between instants whose unrecorded joints are similar
+    max_velocity_s: float = 0.5  # maximum time between frames that velocities are taken from
     mm_per_rad: float = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
 
 
@@ -119,7 +119,7 @@ class Refinement:
         )
         self.instants, self.neighbours = _instants(frames, names)
         self.frames_of_instant = _members(self.instants)
-        first = tuple(frames[shown[0]] for shown in self.frames_of_instant)
+        first = tuple(frames[members[0]] for members in self.frames_of_instant)
         self.joints = torch.zeros(len(self.neighbours), len(self.readings), device=device)
         self.poses = torch.zeros(len(first), len(names), 6, device=device)
         self.cameras = torch.zeros(len(frames), 6, device=device)
@@ -153,8 +153,8 @@ class Refinement:
                 stated = frame.state.instruments[name].uncertainty
                 if stated is not None and reading in stated.joints_deg:
                     deviation = stated.joints_deg[reading]
-                    own = deviation if slide else math.radians(deviation)
-                    self.joint_sd[instant, column] = max(own, LIMITS.min_deviation)
+                    sd = deviation if slide else math.radians(deviation)
+                    self.joint_sd[instant, column] = max(sd, LIMITS.min_deviation)
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
             # multiplied where states are less certain than usual
@@ -197,28 +197,28 @@ class Refinement:
         return state, camera, reduce(add, penalties) if penalties else None
 
     @torch.no_grad()
-    def state(self, index: int, given: State) -> State:
-        """Return the recorded state `given` of frame `index` as corrected so far, at any iteration."""
+    def state(self, index: int, recorded: State) -> State:
+        """Return the recorded state `recorded` of frame `index` as corrected so far, at any iteration."""
         instant = self.instants[index]
         offset = self.poses[instant] + self.velocities[instant] * self.latency
         parts = self._of_instruments(self.joints[instant]) if self.readings else None
         joints = None if parts is None else [[float(change) for change in part] for part in parts]
-        moved = self.layout.moved_by_parts(given, list(offset), joints)
+        moved = self.layout.moved_by_parts(recorded, list(offset), joints)
         instruments = {
-            name: replace(own, pose=own.pose.to(given.instruments[name].pose))
-            for name, own in moved.instruments.items()
+            name: replace(item, pose=item.pose.to(recorded.instruments[name].pose))
+            for name, item in moved.instruments.items()
         }
         return replace(moved, instruments=instruments)
 
     @torch.no_grad()
-    def set_state(self, index: int, given: State, state: State, deviations: Tensor) -> None:
-        """Correct the recorded state `given` of frame `index`, and of all frames of its instant, to `state`, from
+    def set_state(self, index: int, recorded: State, state: State, deviations: Tensor) -> None:
+        """Correct the recorded state `recorded` of frame `index`, and of all frames of its instant, to `state`, from
         iteration 0 on.
 
         deviations [S] of `layout` (rad, mm): standard deviations of `state`, about which the prior is from now on.
         """
         instant = self.instants[index]
-        pose, joints = self._parts(self.layout.increments_between(given, state))
+        pose, joints = self._parts(self.layout.increments_between(recorded, state))
         self.poses[instant] = pose - self.velocities[instant] * self.latency
         self.pose_mean[instant] = self.poses[instant]
         if self.readings:
@@ -287,13 +287,13 @@ class Refinement:
 
     def deviations(self, index: int) -> Tensor:
         """Return the standard deviations [S] float64 of `layout` of the prior on the corrections of frame `index`."""
-        found = torch.empty(self.layout.size, dtype=torch.float64)
+        deviations = torch.empty(self.layout.size, dtype=torch.float64)
         instant = self.instants[index]
         joints = self.joint_sd[instant].split([len(item.joints) for item in self.layout.instruments])
         for number, (rows, joint_rows) in enumerate(self.layout.rows):
-            found[rows] = self.pose_sd[instant, number].cpu().double()
-            found[joint_rows] = joints[number].cpu().double()
-        return found
+            deviations[rows] = self.pose_sd[instant, number].cpu().double()
+            deviations[joint_rows] = joints[number].cpu().double()
+        return deviations
 
     def _parts(self, vector: Tensor) -> tuple[Tensor, Tensor]:
         """Return poses [I, 6] and joints [R] of a vector [S] of `layout`."""
@@ -321,11 +321,11 @@ class Refinement:
             return
         self.frame_steps[index] += 1
         decay = log_linear(1.0, 0.1, progress)
-        instant, own = self.instants[index], float(self.frame_steps[index])
+        instant, frame_steps = self.instants[index], float(self.frame_steps[index])
         rows: dict[str, tuple[Any, float]] = {
             "poses": (instant, float(self.frame_steps[self.frames_of_instant[instant]].sum())),
-            "joints": (instant, own),
-            "cameras": (index, own),
+            "joints": (instant, frame_steps),
+            "cameras": (index, frame_steps),
             "latency": (slice(None), float(self.frame_steps.sum())),  # shared by all frames
         }
         for name, leaf in self._leaves.items():
@@ -367,16 +367,16 @@ class Refinement:
         if not bool(self.unrecorded.any() | self.fitted.any()):
             return recorded
         states = [
-            self.state(index, given) if self.fitted[index] else given for index, given in enumerate(recorded.states)
+            self.state(index, state) if self.fitted[index] else state for index, state in enumerate(recorded.states)
         ]
         for item in instruments:
             for reading in item.unrecorded:
                 column = self.readings.index((item.name, reading))
                 low, high = item.joints[reading] or (-math.inf, math.inf)
                 for index, instant in enumerate(self.instants):
-                    given = states[index].instruments[item.name]
+                    before = states[index].instruments[item.name]
                     value = min(max(item.halfway(reading) + float(self.joints[instant, column]), low), high)
-                    changed = replace(given, joints={**given.joints, reading: value})
+                    changed = replace(before, joints={**before.joints, reading: value})
                     states[index] = replace(
                         states[index], instruments={**states[index].instruments, item.name: changed}
                     )
@@ -386,21 +386,21 @@ class Refinement:
         """Return the corrected state of every training frame, with its standard deviations as `uncertainty`, and
         whether it was fitted to the image (`fitted`; else the deviations are the prior's) or left out (`left_out`: it
         contradicts the others, and no deviations are stated)."""
-        found: dict[str, Any] = {}
-        for index, (name, given, camera) in enumerate(
+        entries: dict[str, Any] = {}
+        for index, (name, recorded_state, camera) in enumerate(
             zip(recorded.names, recorded.states, recorded.cameras, strict=True)
         ):
-            state, deviations = self.state(index, given), self.deviations(index)
+            state, deviations = self.state(index, recorded_state), self.deviations(index)
             instruments: dict[str, Any] = {}
             for item, (pose, joints) in zip(self.layout.instruments, self.layout.rows, strict=True):
-                own = state.instruments[item.name]
-                turn = camera.world_from_camera[:3, :3].cpu().double().T @ own.pose[:3, :3].cpu().double()
+                item_state = state.instruments[item.name]
+                turn = camera.world_from_camera[:3, :3].cpu().double().T @ item_state.pose[:3, :3].cpu().double()
                 shifts = (turn.square() @ deviations[pose][3:].square()).sqrt()  # along the camera's axes
                 units = [value if slides else math.degrees(value)
                          for value, slides in zip(deviations[joints].tolist(), item.slides, strict=True)]  # fmt: skip
                 instruments[item.name] = {
-                    "pose": own.pose.cpu().double().tolist(),
-                    "joints": {joint: float(value) for joint, value in own.joints.items()},
+                    "pose": item_state.pose.cpu().double().tolist(),
+                    "joints": {joint: float(value) for joint, value in item_state.joints.items()},
                 }
                 if self.counts(index):
                     instruments[item.name]["uncertainty"] = {
@@ -408,12 +408,12 @@ class Refinement:
                         "rotation_deg": deviations[pose][:3].rad2deg().tolist(),
                         "joints_deg": dict(zip(item.joints, units, strict=True)),
                     }
-            found[name] = {
+            entries[name] = {
                 "instruments": instruments,
                 "fitted": bool(self.fitted[index]),
                 "left_out": not self.counts(index),
             }
-        return found
+        return entries
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything that changes, for a checkpoint."""
@@ -442,16 +442,16 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
     within `max_neighbour_s`; without any it is its own.
     """
     numbers: dict[tuple[object, ...], int] = {}
-    shown: list[int] = []
+    instants: list[int] = []
     times: list[float] = []
     for frame in frames:
         poses = [frame.state.instruments[name].pose.double().numpy().tobytes() for name in instruments]
         number = numbers.setdefault((frame.state.time, *poses), len(numbers))
         times += [frame.state.time] if number == len(times) else []
-        shown.append(number)
+        instants.append(number)
     near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and abs(times[k] - t) < LIMITS.max_neighbour_s] or [i]
             for i, t in enumerate(times)]  # fmt: skip
-    return shown, near
+    return instants, near
 
 
 def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual_sd: Tensor) -> Tensor:

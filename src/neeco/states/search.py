@@ -31,18 +31,18 @@ class SearchSettings:
     across: float = 0.4  # mm
     depth: float = 1.5  # mm
     joint: float = 4.0  # degrees
-    largest: float = 1.5  # times them, of errors that are looked for
-    usual: float = 0.15  # times them: a tracker's errors
+    largest: float = 1.5  # factor on these, of the largest errors that are searched for
+    usual: float = 0.15  # factor on these, of a tracker's errors
     # classes of errors that tell: a tracker's across the view are as large as a robot's
     compared: tuple[int, int, int, int] = (0, 1, 3, 4)
     n_iterations: int = 40  # of expectation maximisation
-    kept_share: float = 0.85  # of squared corrections that count, without the largest
+    kept_share: float = 0.85  # share of squared corrections that count; the largest do not
     correlation_px: float = 100.0  # pixels that count as one observation, as the scene is still learned
-    beyond_limits: float = 0.5  # of the range of a joint's limits, by which readings may be off
+    beyond_limits: float = 0.5  # share of a joint's range by which readings may exceed its limits
     levels: tuple[float, float, float] = (0.25, 0.5, 1.0)  # sizes of the images compared, as shares of the view's
-    steps: tuple[int, int, int] = (4, 4, 4)  # of Levenberg-Marquardt, at each
-    n_sampled: int = 16  # frames by which errors are sized
-    large: float = 0.22  # times usual errors of a robot, from which on errors are larger than a tracker's
+    steps: tuple[int, int, int] = (4, 4, 4)  # Levenberg-Marquardt steps at each level
+    n_sampled: int = 16  # number of frames from which errors are sized
+    large: float = 0.22  # ratio to a robot's usual errors, from which errors are larger than a tracker's
     scale: float = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
 
 
@@ -80,9 +80,7 @@ class StateSearch:
     ) -> StateSearch:
         """Return the search against `scene` as it is now."""
         bounded = StateParameters(
-            tuple(
-                _bounded(own, item) for own, item in zip(refinement.layout.instruments, scene.instruments, strict=True)
-            )
+            tuple(_bounded(p, item) for p, item in zip(refinement.layout.instruments, scene.instruments, strict=True))
         )
         fitter = Fitter(InstrumentRenderer(scene), bounded, TissueRenderer(scene), SEARCH.correlation_px)
         return cls(scene, refinement, frames, fitter, shafts)
@@ -106,14 +104,14 @@ class StateSearch:
         """Return the state of frame `index` fitted from its present one (or another `start`), with a prior about that
         recorded (or `about` another) of errors `scale` times as large as usual ones of a robot, or as stated; None
         where the fit leads out of the image."""
-        given, precision = self.scene.recorded.states[index], self.precision(index, scale)
+        recorded, precision = self.scene.recorded.states[index], self.precision(index, scale)
         start = start or self.state(index)
         fit = self.fitter.fit(
-            self.view(index, start), about or given, precision, start, levels=SEARCH.levels, steps=SEARCH.steps
+            self.view(index, start), about or recorded, precision, start, levels=SEARCH.levels, steps=SEARCH.steps
         )
         if fit is None:
             return None
-        correction = self.refinement.layout.increments_between(about or given, fit.state)
+        correction = self.refinement.layout.increments_between(about or recorded, fit.state)
         return FittedState(index=index, fit=fit, precision=precision, correction=correction)
 
     def misfit(self, index: int, state: State) -> float:
@@ -134,25 +132,25 @@ class StateSearch:
     def _deviations(self, index: int, scale: float) -> Tensor:
         """Return standard deviations [P] (rad, mm) of errors along `_axes`: stated ones, else `scale` times usual ones;
         of an unrecorded joint a quarter of its limits."""
-        found: list[float] = []
+        deviations: list[float] = []
         layout = self.refinement.layout
-        for item, own, shaft in zip(self.scene.instruments, layout.instruments, self.shafts, strict=True):
+        for item, parameters, shaft in zip(self.scene.instruments, layout.instruments, self.shafts, strict=True):
             stated = self.frames[index].state.instruments[item.name].uncertainty
             turns = scale * DEG * torch.tensor([SEARCH.tilt, SEARCH.tilt, SEARCH.roll], dtype=torch.float64)
             shifts: Sequence[float] = (scale * SEARCH.across, scale * SEARCH.across, scale * SEARCH.depth)
             if stated is not None:
                 own_turns = torch.tensor(stated.rotation_deg, dtype=torch.float64).clamp(max=60).deg2rad()
                 turns, shifts = (_about(shaft).square() @ own_turns.square()).sqrt(), stated.translation_mm
-            found += [*turns.tolist(), *shifts]
-            for reading, slides in zip(own.joints, own.slides, strict=True):
+            deviations += [*turns.tolist(), *shifts]
+            for reading, slides in zip(parameters.joints, parameters.slides, strict=True):
                 limits = item.joints[reading] if reading in item.unrecorded else None
                 usual = scale * SEARCH.joint * DEG * (LIMITS.mm_per_rad if slides else 1.0)
                 if limits is not None and limits[0] != limits[1]:
                     usual = (limits[1] - limits[0]) / 4
                 elif stated is not None and reading in stated.joints_deg:
                     usual = stated.joints_deg[reading] * (1.0 if slides else DEG)
-                found.append(usual)
-        return torch.tensor(found, dtype=torch.float64).clamp(min=LIMITS.min_deviation)
+                deviations.append(usual)
+        return torch.tensor(deviations, dtype=torch.float64).clamp(min=LIMITS.min_deviation)
 
     def _axes(self, index: int) -> Tensor:
         """Return the rows [P, P] that take corrections to the axes of errors: tilt, tilt, roll, across, across, depth,
@@ -162,9 +160,9 @@ class StateSearch:
         rows = torch.eye(layout.size, dtype=torch.float64)
         for item, (pose, _), shaft in zip(layout.instruments, layout.rows, self.shafts, strict=True):
             rows[pose.start : pose.start + 3, pose.start : pose.start + 3] = _about(shaft)
-            own = state.instruments[item.name].pose[:3, :3].cpu().double()
+            rotation = state.instruments[item.name].pose[:3, :3].cpu().double()
             rows[pose.start + 3 : pose.stop, pose.start + 3 : pose.stop] = (
-                camera.world_from_camera[:3, :3].cpu().double().T @ own
+                camera.world_from_camera[:3, :3].cpu().double().T @ rotation
             )
         return rows
 
@@ -198,10 +196,10 @@ class StateSearch:
         kinds = self._kinds()
         kind = torch.tensor(kinds)
         observed = []  # information on corrections in units of usual errors, and it times the most likely ones
-        for found in fits:
-            back = torch.linalg.inv(self._axes(found.index)) * self._usual()
-            weighed = (found.fit.information + found.precision) @ found.correction
-            observed.append((back.T @ found.fit.information @ back, back.T @ weighed))
+        for fitted in fits:
+            back = torch.linalg.inv(self._axes(fitted.index)) * self._usual()
+            weighed = (fitted.fit.information + fitted.precision) @ fitted.correction
+            observed.append((back.T @ fitted.fit.information @ back, back.T @ weighed))
         variances = torch.full((6,), SEARCH.usual**2, dtype=torch.float64)
         for _ in range(SEARCH.n_iterations):
             prior = torch.diag(1 / variances[kind])
@@ -233,15 +231,15 @@ class StateSearch:
     def _kinds(self) -> list[int]:
         """Return the class of each correction: tilt 0, roll 1, across 2, depth 3, joints 4, unrecorded ones 5."""
         kinds: list[int] = []
-        for item, own in zip(self.scene.instruments, self.refinement.layout.instruments, strict=True):
-            kinds += [0, 0, 1, 2, 2, 3, *(5 if reading in item.unrecorded else 4 for reading in own.joints)]
+        for item, parameters in zip(self.scene.instruments, self.refinement.layout.instruments, strict=True):
+            kinds += [0, 0, 1, 2, 2, 3, *(5 if reading in item.unrecorded else 4 for reading in parameters.joints)]
         return kinds
 
     def _usual(self) -> Tensor:
         """Return usual errors [P] of a robot's states (rad, mm)."""
-        found: list[float] = []
-        for own in self.refinement.layout.instruments:
-            found += [
+        errors: list[float] = []
+        for parameters in self.refinement.layout.instruments:
+            errors += [
                 SEARCH.tilt * DEG,
                 SEARCH.tilt * DEG,
                 SEARCH.roll * DEG,
@@ -249,8 +247,8 @@ class StateSearch:
                 SEARCH.across,
                 SEARCH.depth,
             ]
-            found += [SEARCH.joint * DEG * (LIMITS.mm_per_rad if slides else 1.0) for slides in own.slides]
-        return torch.tensor(found, dtype=torch.float64)
+            errors += [SEARCH.joint * DEG * (LIMITS.mm_per_rad if slides else 1.0) for slides in parameters.slides]
+        return torch.tensor(errors, dtype=torch.float64)
 
 
 def _bounded(parameters: InstrumentParameters, instrument: Instrument) -> InstrumentParameters:

@@ -36,7 +36,7 @@ COSTS = (  # of a whole run
 )
 MEASURES = {column.key: column for column in (*SCORES, *MOMENTS, *COSTS)}
 LENGTHS = ("iterations", "minutes", "cpu_minutes")
-MAX_NAME_BYTES = 200  # of a configuration: its folder's name has more, and file systems take 255
+MAX_NAME_BYTES = 200  # limit on the bytes of a configuration's name: its folder's has more, and file systems take 255
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,7 @@ class SweepRequest:
     def check(self) -> None:
         """Raises NeecoError naming the option that cannot be used."""
         if self.seeds is not None and self.seeds < 1:
-            raise NeecoError(f"--seeds: {self.seeds} is none at all; give at least 1")
+            raise NeecoError(f"--seeds must be at least 1 (got {self.seeds})")
         if any(value is not None for value in self.lengths.values()):
             single_length(self.lengths, "--")
 
@@ -125,7 +125,7 @@ class Study:
     minutes: float | None = None  # by the clock on the wall
     cpu_minutes: float | None = None  # CPU time of all threads of a run
     settings: tuple[str, ...] = ()  # of all configurations; deformation.FIELD of those whose method has the field
-    even_db: float = 0.1  # smaller differences of PSNR from a reference have no direction
+    even_db: float = 0.1  # smallest difference of PSNR from a reference, dB, that has a direction
     tables: dict[str, Table] = field(default_factory=dict)  # none: one of all configurations
 
     def prepared(self, request: SweepRequest) -> Study:
@@ -152,11 +152,11 @@ class Study:
         for name in self.configurations:
             plain = name.isprintable() and name == name.strip() and not name.startswith(".")
             if not plain or not 0 < len(name.encode()) <= MAX_NAME_BYTES or {*name} & {"/", "\\"}:
-                problem = "names no folder; give a short name in one line without /, \\ and a dot at its start"
+                problem = "cannot name a folder; give a short name in one line without /, \\ and a dot at its start"
                 raise NeecoError(f"configurations: {name[:40]!r} {problem}")
             self.length_of(name)
         if self.seeds < 1:
-            raise NeecoError(f"seeds: {self.seeds} is none at all; give at least 1")
+            raise NeecoError(f"seeds must be at least 1 (got {self.seeds})")
         for name, table in self.tables.items():
             for row, entry in table.rows.items():
                 require_known(f"tables.{name}.rows", row, self.configurations)
@@ -188,9 +188,9 @@ class Study:
     def length_of(self, name: str) -> tuple[str, float]:
         """Return the length of a configuration's runs: one of LENGTHS, and how many. Raises NeecoError where there is
         none, or several."""
-        own = self.configurations[name].iterations
-        if own is not None:
-            return single_length({"iterations": own}, f"configurations.{name}.")
+        iterations = self.configurations[name].iterations
+        if iterations is not None:
+            return single_length({"iterations": iterations}, f"configurations.{name}.")
         return single_length({key: getattr(self, key) for key in LENGTHS}, "")
 
     def only(self, tables: Iterable[str]) -> Study:
@@ -208,7 +208,7 @@ def read_study(file: Path) -> Study:
     example = "write it as docs/studies.md shows"
     values = parse_yaml(file, read_text(file, "a study in YAML"), example)
     if not isinstance(values, dict):
-        raise NeecoError(f"{file}: is no group of fields such as configurations; {example}")
+        raise NeecoError(f"{file}: is not a mapping with fields such as configurations; {example}")
     try:
         return structure(Study, values)
     except NeecoError as error:
@@ -230,13 +230,13 @@ def single_length(lengths: Mapping[str, float | None], place: str) -> tuple[str,
     ((key, value),) = values.items()
     if not 0 < value < math.inf:
         field = key.replace("_", "-") if place == "--" else key
-        raise NeecoError(f"{place}{field}: {value} is no time to train; give more than 0")
+        raise NeecoError(f"{place}{field}: must be above 0 (got {value})")
     return key, value
 
 
-def require_known(place: str, name: str, known: Iterable[str]) -> None:
-    """Raise NeecoError naming `place` where `name` is none of `known`."""
-    if name not in known:
-        meant = nearest(name, known)
+def require_known(place: str, name: str, names: Iterable[str]) -> None:
+    """Raise NeecoError naming `place` where `name` is none of `names`."""
+    if name not in names:
+        meant = nearest(name, names)
         hint = "" if meant is None else f"; did you mean {meant}?"
-        raise NeecoError(f"{place}: {name!r} is unknown; choose of {', '.join(known)}{hint}")
+        raise NeecoError(f"{place}: {name!r} is unknown; choose of {', '.join(names)}{hint}")

@@ -31,7 +31,7 @@ from neeco.capture import Capture
 from neeco.raster.devices import device_of, readable_failures
 from neeco.raster.native import keep_freed_memory, set_threads, simd, threads
 
-CHECKPOINT_S = 60.0  # that interrupted jobs get to write their checkpoints
+CHECKPOINT_S = 60.0  # s that interrupted jobs get to write their checkpoints
 REMEDY = "give another --output"  # where a folder holds other work
 GO_ON = "run the same command again to go on, nothing finished is lost"
 
@@ -119,7 +119,7 @@ def run_jobs(
     """
     device = device_of(jobs[0].device if jobs else "cpu", drawing=False)
     check_workers(workers, device, light)
-    known = dict(finished)
+    results_so_far = dict(finished)
 
     def report(index: int, stage: str, share: float, text: str, result: Result | None = None) -> None:
         if progress:
@@ -129,10 +129,10 @@ def run_jobs(
             progress(event)
 
     def finish(index: int, result: Result) -> None:
-        known[index] = result
+        results_so_far[index] = result
         failure = result.get("error", "")
         if record:
-            record([known[index] for index in sorted(known)])
+            record([results_so_far[index] for index in sorted(results_so_far)])
         report(index, "failed" if failure else "done", 1.0, failure, result)
 
     for job in jobs:
@@ -173,7 +173,7 @@ def check_workers(workers: int, device: torch.device, share_gpus: bool = False) 
     check_reachable(workers)
     if workers > 1 and device.type == "cuda" and not address():
         if device.index is not None:
-            raise NeecoError(f"--device: {device}: of several --workers each has a GPU of its own; give --device cuda")
+            raise NeecoError(f"--device: {device}: with several --workers, each uses its own GPU; give --device cuda")
         if not share_gpus:
             check_gpus(workers, torch.cuda.device_count())
 
@@ -181,11 +181,11 @@ def check_workers(workers: int, device: torch.device, share_gpus: bool = False) 
 def spread(values: Iterable[float | None]) -> dict[str, Any]:
     """{"mean", "std", "n"} of the values that are known: their mean, sample standard deviation (None for fewer than
     two values) and count."""
-    known = [float(value) for value in values if value is not None and math.isfinite(value)]
+    valid = [float(value) for value in values if value is not None and math.isfinite(value)]
     return {
-        "mean": statistics.fmean(known) if known else None,
-        "std": statistics.stdev(known) if len(known) > 1 else None,
-        "n": len(known),
+        "mean": statistics.fmean(valid) if valid else None,
+        "std": statistics.stdev(valid) if len(valid) > 1 else None,
+        "n": len(valid),
     }
 
 

@@ -187,8 +187,8 @@ def config_of(request: SweepRequest, study: Study, name: str, place: str, method
 
 def _has(method: str, field: str) -> bool:
     """Return whether a method has a field of its training config; `deformation.FIELD` is a method's own."""
-    group, _, own = field.partition(".")
-    return group != "deformation" or own in {item.name for item in dataclasses.fields(method_class(method).Settings)}
+    group, _, name = field.partition(".")
+    return group != "deformation" or name in {item.name for item in dataclasses.fields(method_class(method).Settings)}
 
 
 def tables_of(plan: SweepPlan, rows: Rows) -> list[tuple[str, str, ResultTable]]:
@@ -207,7 +207,7 @@ def tables_of(plan: SweepPlan, rows: Rows) -> list[tuple[str, str, ResultTable]]
         }
         for split in splits
     }
-    found = []
+    tables = []
     for name, table in study.tables.items():
         primary = PRIMARY if PRIMARY in splits else splits[0]
         for split in [primary] if any(row.published for row in table.rows.values()) else splits:
@@ -218,9 +218,9 @@ def tables_of(plan: SweepPlan, rows: Rows) -> list[tuple[str, str, ResultTable]]
                 made = summary_table(title, "configuration", columns, rows_of)
             else:
                 made = _differences(title, table, numbers[split], reasons, study.even_db)
-            found.append((name, split, made))
+            tables.append((name, split, made))
     costs = [(name, numbers[splits[0]][name], reasons.get(name)) for name in study.configurations]
-    return [*found, ("", "", summary_table("Training and rendering", "configuration", COSTS, costs))]
+    return [*tables, ("", "", summary_table("Training and rendering", "configuration", COSTS, costs))]
 
 
 def direction(ours: float | None, published: float, even: float) -> str:

@@ -75,11 +75,11 @@ def summary_table(
     The best mean of a column is judged as it is written, so that equal entries are all best; of one entry there is no
     best.
     """
-    shown, best = [], {}
+    used, best = [], {}
     for column in columns:
         means = [numbers[column.key]["mean"] for _, numbers, _ in rows if _has(numbers, column)]
         if means:
-            shown.append(column)
+            used.append(column)
         if column.better is not None and len(means) > 1:
             best[column.key] = column.written(max(means) if column.better == "high" else min(means))
 
@@ -90,8 +90,8 @@ def summary_table(
         text = column.written(mean)
         return Cell(text, "" if std is None else column.written(std), text == best.get(column.key))
 
-    made = (Row((name,), tuple(cell(numbers, column) for column in shown), reason) for name, numbers, reason in rows)
-    return ResultTable(title, (key,), tuple(shown), tuple(made))
+    made = (Row((name,), tuple(cell(numbers, column) for column in used), reason) for name, numbers, reason in rows)
+    return ResultTable(title, (key,), tuple(used), tuple(made))
 
 
 def _has(numbers: Mapping[str, Any], column: Column) -> bool:

@@ -51,9 +51,9 @@ CURVE_ROW = {"iteration": int, "seconds": float, "progress": float, "split": str
 class CurveSettings:
     """Held-out PSNR over a training."""
 
-    shares: tuple[float, ...] = tuple(step / 10 for step in range(1, 11))  # of the run, at which frames are rendered
-    frames: int = 4  # of each split, evenly spaced: the whole split is scored at the end
-    late: float = 0.75  # share of phase 1 after which its training PSNR counts
+    shares: tuple[float, ...] = tuple(step / 10 for step in range(1, 11))  # shares of the run that have a point
+    frames: int = 4  # number of evenly spaced frames of each split: the whole split is scored at the end
+    late: float = 0.75  # share of phase 1 from which its training PSNR counts
 
 
 CURVE = CurveSettings()
@@ -137,13 +137,13 @@ class TrainingJob:
                 progress=lambda what, done, total: report("evaluating", done / max(total, 1), what),
             )
             iterations = run.scene.diagnostics.get("iterations", 0)
-        given, curve = evaluation["given"], read_rows(self.folder / CURVE_FILE, CURVE_ROW)
+        measured, curve = evaluation["given"], read_rows(self.folder / CURVE_FILE, CURVE_ROW)
         result = {"schema": JOB_SCHEMA} | self.identity() | {"iterations": iterations}
         result |= {"seconds": curve[-1]["seconds"] if curve else None}
-        result |= {key: given[splits[0]][key] for key in ("num_gaussians", "fps")}
+        result |= {key: measured[splits[0]][key] for key in ("num_gaussians", "fps")}
         result |= {"lpips_networks": sorted(networks), "phase_1_psnr": phase_1_psnr(self.folder), "splits": {}}
         for split in splits:
-            scores = {key: given[split][key] for key in SPLIT_SCORES}
+            scores = {key: measured[split][key] for key in SPLIT_SCORES}
             result["splits"][split] = scores | {key: psnr_at(curve, split, at) for key, at in CHECKPOINTS.items()}
         write_json(file, result)
         return result
@@ -235,7 +235,7 @@ class Curve:
     def score(self, scene: DrawableScene, split: str) -> float | None:
         """Mean PSNR of a split, dB; None when it is no number. Random states are left as they were."""
         with torch.random.fork_rng(devices=[]):
-            shown = self.frames[split]
-            values = [psnr(draw(scene, frame.state, frame.camera).image, image, mask) for frame, image, mask in shown]
+            frames = self.frames[split]
+            values = [psnr(draw(scene, frame.state, frame.camera).image, image, mask) for frame, image, mask in frames]
         mean = sum(values) / len(values)
         return round(mean, 4) if math.isfinite(mean) else None

@@ -86,8 +86,8 @@ def annotate_capture(
     scene = run.scene
     labeller = CompositedLabels(scene)
     trained_on = run.capture()
-    given = scene.recorded.completed(capture, scene.instruments) if capture else scene.recorded.as_fitted(trained_on)
-    capture = trained_on if capture is None else given
+    source = scene.recorded.completed(capture, scene.instruments) if capture else scene.recorded.as_fitted(trained_on)
+    capture = trained_on if capture is None else source
     _check_instruments(scene, capture)
     settings = {"annotates": os.path.abspath(capture.root), "frames": len(capture.frames), "min_trust": min_trust}
     settings["captures_sha256"] = [fingerprint(recorded) for recorded in (capture, trained_on)]
@@ -126,7 +126,7 @@ def annotate_capture(
         in_time = sorted(range(len(capture.frames)), key=lambda k: capture.frames[k].state.time)
         for done, index in enumerate(in_time, 1):
             if index not in records:
-                records[index] = annotator.annotate(index, given.frames[index], capture.frames[index].state, start)
+                records[index] = annotator.annotate(index, source.frames[index], capture.frames[index].state, start)
             start = torch.tensor(records[index]["increments"], dtype=torch.float64)
             on_progress(done, len(in_time))
         if not with_image(records.values()):
@@ -157,7 +157,7 @@ class _Annotator:
         fit, drawing, trust = self._fitted(frame, image, start)
         if start is not None and trust.value < self.min_trust:  # the neighbour's start may have misled the fit
             again = self._fitted(frame, image, None)
-            fit, drawing, trust = max((again, (fit, drawing, trust)), key=lambda found: found[2].value)
+            fit, drawing, trust = max((again, (fit, drawing, trust)), key=lambda attempt: attempt[2].value)
         facts: dict[str, Any] = {
             "frame": frame.name,
             "recorded_split": frame.split,
@@ -190,13 +190,13 @@ class _Annotator:
             return replace(drawing, image=torch.from_numpy(pixels).clamp(0, 1)), None
         fine = of_rendered_size(drawing.camera)
         field = field_pinhole(fine)
-        shown = resampled(torch.ones(field.height, field.width, 1), field, fine, wanted)[..., 0]
-        known = torch.cat([image, torch.ones_like(image[..., :1])], -1)
-        found = resampled(known, recorded, fine, wanted)
-        missing = found[..., 3] < shown - MAX_UNRECORDED_SHARE
+        in_field = resampled(torch.ones(field.height, field.width, 1), field, fine, wanted)[..., 0]
+        rgba = torch.cat([image, torch.ones_like(image[..., :1])], -1)
+        warped = resampled(rgba, recorded, fine, wanted)
+        missing = warped[..., 3] < in_field - MAX_UNRECORDED_SHARE
         drawing = replace(
             drawing,
-            image=found[..., :3],
+            image=warped[..., :3],
             parts=drawing.parts.masked_fill(missing, 0),
             share=drawing.share.masked_fill(missing, 0.0),
             unobserved=drawing.unobserved.masked_fill(missing, 1.0),
@@ -247,12 +247,12 @@ def typical_errors(scene: GaussianScene, labeller: CompositedLabels, trained_on:
 
 def _check_instruments(scene: GaussianScene, capture: Capture) -> None:
     """Raises NeecoError unless every frame states the poses and joints of the scene's instruments."""
-    known = {item.name: set(item.joints) for item in capture.instruments}
+    joints = {item.name: set(item.joints) for item in capture.instruments}
     for instrument in scene.instruments:
-        if instrument.name not in known:
-            names = ", ".join(known) or "none"
+        if instrument.name not in joints:
+            names = ", ".join(joints) or "none"
             raise NeecoError(f"{capture.root}: instruments: the scene learned {instrument.name!r}, here are: {names}")
-        missing = set(instrument.joints) - known[instrument.name]
+        missing = set(instrument.joints) - joints[instrument.name]
         if missing:
             raise NeecoError(
                 f"{capture.root}: instruments: {instrument.name}: no joint {min(missing)!r}, which the scene learned"

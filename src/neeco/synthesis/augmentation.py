@@ -86,13 +86,13 @@ def moved(outlines: Sequence[Outline], given_from_made: np.ndarray) -> tuple[Out
     """Outlines (class, [n, 2] places in [0, 1]) in an augmented image, by its [2, 3]; what leaves it is left out."""
     linear = np.linalg.inv(given_from_made[:, :2])
     shift = (1 - linear @ (1 + given_from_made[:, 2])) / 2
-    found = []
+    visible = []
     for number, points in outlines:
         placed = points @ linear.T + shift
         inside = placed[((placed >= 0) & (placed <= 1)).all(1)]
         if len(inside):
-            found.append((number, inside))
-    return tuple(found)
+            visible.append((number, inside))
+    return tuple(visible)
 
 
 @dataclass(frozen=True)

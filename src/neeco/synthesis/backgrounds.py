@@ -107,16 +107,16 @@ class Colors:
     @classmethod
     def of(cls, image: np.ndarray) -> Colors:
         """Those of an image [H, W, 3] in [0, 1]."""
-        shown = image[image.max(2) > IMAGES.border]
-        if not len(shown):
-            shown = image.reshape(-1, 3)
-        return cls(shown.mean(0), shown.std(0))
+        lit = image[image.max(2) > IMAGES.border]
+        if not len(lit):
+            lit = image.reshape(-1, 3)
+        return cls(lit.mean(0), lit.std(0))
 
     def given_to(self, image: np.ndarray) -> np.ndarray:
         """An image [H, W, 3] with these colours (Reinhard et al., "Color transfer between images", 2001, in RGB)."""
-        own = Colors.of(image)
-        gains = np.clip(self.deviation / np.maximum(own.deviation, IMAGES.dark), *IMAGES.adaptation_range)
-        return np.clip((image - own.mean) * gains + self.mean, 0, 1).astype(np.float32)
+        colors = Colors.of(image)
+        gains = np.clip(self.deviation / np.maximum(colors.deviation, IMAGES.dark), *IMAGES.adaptation_range)
+        return np.clip((image - colors.mean) * gains + self.mean, 0, 1).astype(np.float32)
 
 
 @lru_cache(maxsize=4096)
@@ -146,8 +146,9 @@ class Appearance:
         assert self.background is not None
         share = layers.share.clamp(min=IMAGES.min_share)[..., None].numpy()
         alone = np.clip(layers.instruments.numpy() / share, 0, 1)
-        here, own = (srgb_to_linear(x.numpy()).mean((0, 1)) + IMAGES.dark for x in (self.background, layers.tissue))
-        gains = np.clip((here / own) ** self.adaptation, *IMAGES.adaptation_range)
+        images = (self.background, layers.tissue)
+        background, tissue = (srgb_to_linear(image.numpy()).mean((0, 1)) + IMAGES.dark for image in images)
+        gains = np.clip((background / tissue) ** self.adaptation, *IMAGES.adaptation_range)
         alone = linear_to_srgb(srgb_to_linear(alone) * gains)
         return replace(layers, instruments=torch.from_numpy((alone * share).astype(np.float32))).over(self.background)
 
@@ -174,15 +175,15 @@ class Appearances:
     def draw(self, rng: Generator, width: int, height: int) -> Appearance:
         """Sample the appearance of an image. Raises NeecoError where a background cannot be read."""
         replaced, adaptation, place, matched, frame = rng.random(5)
-        found = Appearance()
+        appearance = Appearance()
         if self.frames is not None and matched < IMAGES.replaced:
-            found = replace(found, colors=self.frames.colors(int(frame * len(self.frames.files))))
+            appearance = replace(appearance, colors=self.frames.colors(int(frame * len(self.frames.files))))
         if self.backgrounds is None or replaced >= IMAGES.replaced:
-            return found
+            return appearance
         number = int(place * len(self.backgrounds.files))
         background = torch.from_numpy(self.backgrounds.crop(number, rng, width, height))
         source = self.backgrounds.files[number].name
-        return replace(found, source=source, background=background, adaptation=adaptation)
+        return replace(appearance, source=source, background=background, adaptation=adaptation)
 
 
 ALL_AS_RECORDED = Appearances()

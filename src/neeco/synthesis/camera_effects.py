@@ -105,9 +105,9 @@ class CameraEffects:
         values = {}
         for name in EFFECTS:
             applies, place = rng.random(), rng.random()
-            given = self.ranges.get(name)
-            if given is not None and applies < given.share:
-                values[name] = round(given.low + (given.high - given.low) * place, 5)
+            effect_range = self.ranges.get(name)
+            if effect_range is not None and applies < effect_range.share:
+                values[name] = round(effect_range.low + (effect_range.high - effect_range.low) * place, 5)
         return values
 
     def to_json(self) -> dict[str, Any]:
@@ -120,16 +120,16 @@ def read_effects(path: Path) -> CameraEffects:
     """Read an effects file: YAML, a line per effect, each a number, [LOW, HIGH], or {range: [LOW, HIGH], share: S}.
     Raises NeecoError naming file and field."""
     text = read_text(path, "a YAML file of camera effects; docs/synthesis.md shows one")
-    given = parse_yaml(path, text, "repair it")
-    if not isinstance(given, dict) or not given:
+    lines = parse_yaml(path, text, "repair it")
+    if not isinstance(lines, dict) or not lines:
         raise NeecoError(f"{path}: names no effect; give some of {', '.join(EFFECTS)}")
-    soft = given.pop(SOFT_MASKS, "mid")
+    soft = lines.pop(SOFT_MASKS, "mid")
     if soft not in ("mid", "mean"):
         raise NeecoError(f"{path}: {SOFT_MASKS}: {soft!r} is neither mid nor mean")
-    unknown = sorted(set(map(str, given)) - set(EFFECTS))
+    unknown = sorted(set(map(str, lines)) - set(EFFECTS))
     if unknown:
         raise NeecoError(f"{path}: {unknown[0]}: no such effect; there are {', '.join([*EFFECTS, SOFT_MASKS])}")
-    return CameraEffects({name: _range(value, EFFECTS[name], f"{path}: {name}") for name, value in given.items()}, soft)
+    return CameraEffects({name: _range(value, EFFECTS[name], f"{path}: {name}") for name, value in lines.items()}, soft)
 
 
 def _range(value: Any, effect: Effect, where: str) -> Range:
@@ -245,10 +245,10 @@ class Motion:
         """State and camera `seconds` later (or earlier), at these speeds."""
         moved = {
             name: InstrumentState(
-                torch.from_numpy(to_numpy(given.pose) @ _moved(self.instruments[name], seconds)).to(given.pose),
-                {joint: value + seconds * self.joints[name][joint] for joint, value in given.joints.items()},
+                torch.from_numpy(to_numpy(item.pose) @ _moved(self.instruments[name], seconds)).to(item.pose),
+                {joint: value + seconds * self.joints[name][joint] for joint, value in item.joints.items()},
             )
-            for name, given in state.instruments.items()
+            for name, item in state.instruments.items()
         }
         pose = to_numpy(camera.world_from_camera) @ _moved(self.camera, seconds)
         return replace(state, instruments=moved, time=state.time + seconds), moved_camera(camera, pose)
@@ -327,12 +327,12 @@ def motion_between(a: State, camera_a: Camera, b: State, camera_b: Camera) -> Mo
     """The constant speeds that lead from one recorded frame to a later one."""
     seconds = b.time - a.time
     twists = {
-        name: _twist(to_numpy(given.pose), to_numpy(b.instruments[name].pose), seconds)
-        for name, given in a.instruments.items()
+        name: _twist(to_numpy(item.pose), to_numpy(b.instruments[name].pose), seconds)
+        for name, item in a.instruments.items()
     }
     joints = {
-        name: {joint: (b.instruments[name].joints[joint] - value) / seconds for joint, value in given.joints.items()}
-        for name, given in a.instruments.items()
+        name: {joint: (b.instruments[name].joints[joint] - value) / seconds for joint, value in item.joints.items()}
+        for name, item in a.instruments.items()
     }
     camera = _twist(to_numpy(camera_a.world_from_camera), to_numpy(camera_b.world_from_camera), seconds)
     return Motion(twists, joints, camera)

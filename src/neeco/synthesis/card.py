@@ -140,10 +140,10 @@ def _command(info: Mapping[str, Any]) -> str:
         words = ["synthesize", "--tissue", info["scene"], "--instruments", *info["instruments"]]
     else:
         words = ["synthesize", info["scene"]]
-    given = {"count": info["images"] + len(info["skipped"])} | settings
-    given |= {"image_format": "png" if given.get("quality") is None else "jpg"}
+    values = {"count": info["images"] + len(info["skipped"])} | settings
+    values |= {"image_format": "png" if values.get("quality") is None else "jpg"}
     for field in fields(Settings if "seed" in settings else ImageSettings):
-        value, flag = given.get(field.name), f"--{field.name.replace('_', '-')}"
+        value, flag = values.get(field.name), f"--{field.name.replace('_', '-')}"
         value = field.default if value is None else value
         if isinstance(field.default, bool):
             words += [] if value == field.default else [flag if value else f"--no-{flag[2:]}"]

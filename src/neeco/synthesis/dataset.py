@@ -103,7 +103,7 @@ def synthesize(
     check_workers(workers)
     output = Path(output)
     runs = (run, *instrument_runs)
-    scene, *instrument_scenes = (given.scene for given in runs)
+    scene, *instrument_scenes = (each.scene for each in runs)
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
     folders = {
         name: None if folder is None else ImageFolder.of(folder, name).digest()
@@ -142,10 +142,10 @@ def synthesize(
         if records:
             on_progress(len(records))
         missing = [k for k in range(settings.count) if k not in records]
-        scene_file, *others = (Path(given.path) / SCENE_FILE for given in runs)
+        scene_file, *others = (Path(each.path) / SCENE_FILE for each in runs)
         # workers need not find the tolerance again
-        known = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
-        spec = GeneratorSpec(scene_file, known, str(scene.center.device), tuple(others))
+        resolved = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
+        spec = GeneratorSpec(scene_file, resolved, str(scene.center.device), tuple(others))
         made = 0
         processes = min(workers, len(missing))
         if missing and (processes > 1 or address()):
@@ -185,8 +185,8 @@ def description(
         "scene": str(run.path),
     }
     if instrument_runs:
-        info["settings"] = settings | {"instruments_sha256": [scene_digest(given.path) for given in instrument_runs]}
-        info["instruments"] = [str(given.path) for given in instrument_runs]
+        info["settings"] = settings | {"instruments_sha256": [scene_digest(each.path) for each in instrument_runs]}
+        info["instruments"] = [str(each.path) for each in instrument_runs]
     return info
 
 
@@ -314,7 +314,7 @@ def check_formats(formats: Sequence[str], settings: ImageSettings) -> None:
     """Raises NeecoError for a format that is unknown, or that cannot describe the images."""
     for name in formats:
         if settings.lens and not writer(name).accepts_distortion:
-            raise NeecoError(f"--formats: {name} knows no distortion; leave out {name}, or --lens")
+            raise NeecoError(f"--formats: {name} cannot store distorted images; remove {name} or --lens")
         writer(name)
 
 

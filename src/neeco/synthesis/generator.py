@@ -157,7 +157,7 @@ class SampleGenerator:
         if instrument_scenes:
             mixture = Mixture.of(scene, instrument_scenes)
             scene, sampler, gains = mixture.scene, mixture.sampler(settings), mixture.gains
-            groups = tuple(frozenset(item.name for item in given.instruments) for given in instrument_scenes)
+            groups = tuple(frozenset(item.name for item in each.instruments) for each in instrument_scenes)
         else:
             sampler = make_sampler(scene, settings.states, settings.margin, settings.views, settings.count)
         labeller: Labeller
@@ -357,9 +357,9 @@ def buried_depth(drawing: LayeredDrawing) -> float:
     keypoints = working_ends_of(drawing.keypoints)
     surface = drawing.tissue_depth
     for name, layer in drawing.layers.items():
-        shown = layer.mask & (layer.depth > 0)
-        behind = surface[shown]
-        below = np.where(behind > 0, layer.depth[shown] - behind, 0.0)
+        visible = layer.mask & (layer.depth > 0)
+        behind = surface[visible]
+        below = np.where(behind > 0, layer.depth[visible] - behind, 0.0)
         if len(below):
             deepest = max(deepest, float(np.quantile(below, 1 - ACCEPTED.buried_share)))
         for point in keypoints.get(name, []):
@@ -392,11 +392,11 @@ def _motion(
     """Return the motion while a shutter is open. Raises NeecoError where the recordings have none."""
     motion: RecordedMotion | MixedMotion = RecordedMotion(scene.recorded)
     if instrument_scenes:
-        motion = MixedMotion(scene.recorded, [given.recorded for given in instrument_scenes])
+        motion = MixedMotion(scene.recorded, [each.recorded for each in instrument_scenes])
     if not motion.known:
         raise NeecoError(
-            f"{settings.camera_effects}: shutter_s: no two recorded frames are close enough in time to tell how "
-            "anything moved; leave it out"
+            f"{settings.camera_effects}: shutter_s: no two recorded frames are close enough in time to "
+            "estimate motion; remove it"
         )
     return motion
 
@@ -404,7 +404,7 @@ def _motion(
 def _within_circle(drawing: LayeredDrawing, radius: float) -> LayeredDrawing:
     """Remove the labels outside the camera's image circle."""
     height, width = drawing.depth.shape
-    shown = torch.from_numpy(image_circle(height, width, radius) > 0.5)
+    inside = torch.from_numpy(image_circle(height, width, radius) > 0.5)
     return replace(
-        drawing, parts=torch.where(shown, drawing.parts, 0).to(drawing.parts.dtype), share=drawing.share * shown
+        drawing, parts=torch.where(inside, drawing.parts, 0).to(drawing.parts.dtype), share=drawing.share * inside
     )

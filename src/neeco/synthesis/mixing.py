@@ -128,8 +128,8 @@ class Mixture:
             shift[:3, 3] = (depth / end[2] - 1) * end
         carry = to_numpy(camera.world_from_camera) @ shift @ camera_from_world
         return {
-            name: InstrumentState(torch.from_numpy(carry @ to_numpy(given.pose)), given.joints)
-            for name, given in registered.instruments.items()
+            name: InstrumentState(torch.from_numpy(carry @ to_numpy(item.pose)), item.joints)
+            for name, item in registered.instruments.items()
         }
 
     def _recorded(self) -> Recorded:
@@ -141,9 +141,9 @@ class Mixture:
             camera = cameras[round(k * (len(cameras) - 1) / max(1, count - 1))]
             placed: dict[str, InstrumentState] = {}
             for scene in self.instrument_scenes:
-                own = scene.recorded
-                frame = round(k * (len(own.states) - 1) / max(1, count - 1))
-                placed |= self.place(scene, own.states[frame], own.cameras[frame], camera)
+                recorded = scene.recorded
+                frame = round(k * (len(recorded.states) - 1) / max(1, count - 1))
+                placed |= self.place(scene, recorded.states[frame], recorded.cameras[frame], camera)
             chosen.append(camera)
             states.append(State(placed, 0.0))
         names, still = tuple(f"{k:06d}" for k in range(count)), self.tissue.recorded.still
@@ -242,8 +242,8 @@ def _body(scene: GaussianScene, index: int, deformation: Deformation) -> Canonic
     canonical, rows = scene.canonical, scene.canonical.body(index)
     seen = scene.visibility()[rows]
     alone = dataclasses.replace(canonical, extras={}).map(lambda tensor: tensor[rows], (len(seen),))
-    own = {name: tensor[rows] for name, tensor in canonical.extras.items()}
-    extras = deformation.fit_extras(deformation.initial_extras(alone) | own)
+    stored = {name: tensor[rows] for name, tensor in canonical.extras.items()}
+    extras = deformation.fit_extras(deformation.initial_extras(alone) | stored)
     return alone.with_extras(**extras, **{VISIBILITY: seen})
 
 

@@ -47,8 +47,8 @@ class PackedSpec:
             paths["effects.yaml"] = Path(spec.settings.camera_effects)
         if spec.settings.states not in SAMPLERS:
             paths["states.jsonl"] = states_file(spec.settings.states)
-        for name, given in spec.settings.image_folders().items():
-            for file in () if given is None else ImageFolder.of(given, name).files:
+        for name, images in spec.settings.image_folders().items():
+            for file in () if images is None else ImageFolder.of(images, name).files:
                 paths[f"{name}/{file.name}"] = file
         files = {name: read_bytes(path, "a scene or settings file") for name, path in paths.items()}
         content = b"".join(hashlib.sha256(files[name]).digest() for name in sorted(files))
@@ -69,8 +69,8 @@ class PackedSpec:
         settings = self.spec.settings
         if "effects.yaml" in self.files:
             settings = replace(settings, camera_effects=str(folder / "effects.yaml"))
-        given = [name for name, images in settings.image_folders().items() if images is not None]
-        moved: dict[str, Any] = {name: str(folder / name) for name in given}
+        names = [name for name, images in settings.image_folders().items() if images is not None]
+        moved: dict[str, Any] = {name: str(folder / name) for name in names}
         settings = replace(settings, **moved)
         if "states.jsonl" in self.files:
             prefix = PATH_PREFIX if settings.states.startswith(PATH_PREFIX) else ""
@@ -82,7 +82,7 @@ class PackedSpec:
 def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], workers: int) -> Iterator[Record]:
     """Yield the records of these images as they are rendered, in any order; the images are written to `output`.
 
-    Raises NeecoError with what a worker met, and where workers keep dying.
+    Raises NeecoError with what a worker met, and where workers are killed repeatedly.
     """
     shared: tuple[GeneratorSpec | PackedSpec, Path | None] = (spec, output)
     size, each = 1, max(1, threads() // workers)
@@ -96,11 +96,11 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
                     raise NeecoError(event.value)
                 if event.stage == "abandoned":
                     raise NeecoError(
-                        f"--workers: workers keep dying over image {tasks[event.index][0]} ({event.value}); is there "
-                        "memory enough? use fewer workers (and --resume)"
+                        f"--workers: workers were killed repeatedly at image {tasks[event.index][0]} ({event.value}); "
+                        "if memory ran out, use fewer workers (and --resume)"
                     )
-                for found in event.value if event.stage == "done" else ():
-                    yield found.write(output) if isinstance(found, Encoded) else found
+                for result in event.value if event.stage == "done" else ():
+                    yield result.write(output) if isinstance(result, Encoded) else result
     finally:
         sweep_unfinished(output)  # what a worker had half written
 

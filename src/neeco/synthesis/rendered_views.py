@@ -63,8 +63,8 @@ def split_views(run: TrainedRun, split: str, capture_path: Path | None = None) -
         capture = run.scene.recorded.completed(read_capture(capture_path), run.scene.instruments)
     frames = capture.split(split)
     if not frames:
-        known = ", ".join(capture.splits) or "none"
-        raise NeecoError(f"{capture.root}: split {split!r} has no frames; the capture has {known}")
+        splits = ", ".join(capture.splits) or "none"
+        raise NeecoError(f"{capture.root}: split {split!r} has no frames; the capture has {splits}")
     counts = Counter(frame.name for frame in frames)
     views = []
     for frame in frames:

@@ -163,9 +163,9 @@ class Sampler:
         has the instrument in the image, SAMPLING.max_view_attempts times at most.
         """
         state = self.states(index, rng)
-        given = self.cameras[index % len(self.cameras)]
-        if given is not None:
-            return state, given
+        prescribed = self.cameras[index % len(self.cameras)]
+        if prescribed is not None:
+            return state, prescribed
         points = working_ends_or_origins(self.scene, state)
         camera = self.views(state, rng)
         for _ in range(SAMPLING.max_view_attempts):
@@ -293,13 +293,13 @@ class DrawnCameras:
         images.check()
         if images.lens and recorded.lens is None:
             raise NeecoError(
-                "--lens: the scene's capture does not tell of its lens; ingest the recording again and train on it, or "
-                "leave --lens out"
+                "--lens: the scene's capture states no lens; ingest the recording again and train on it, or "
+                "remove --lens"
             )
-        found = cls(images, recorded.lens if images.lens else None)
+        drawn_cameras = cls(images, recorded.lens if images.lens else None)
         for camera in cameras:
-            found(camera)
-        return found
+            drawn_cameras(camera)
+        return drawn_cameras
 
     def __call__(self, camera: Camera) -> Camera:
         """The camera in the place of `camera`, a pinhole."""

@@ -49,15 +49,15 @@ class SizeSettings:
         if self.size is not None and not SIZE.fullmatch(self.size):
             raise NeecoError(f"--size: {self.size!r} is not WIDTHxHEIGHT; give both in px, such as 640x512")
         if self.scale is not None and not (0 < self.scale < math.inf):
-            raise NeecoError(f"--scale: {self.scale} enlarges nothing; give a number above 0, such as 2")
+            raise NeecoError(f"--scale: must be a number above 0, such as 2 (got {self.scale})")
 
     def of(self, width: int, height: int) -> tuple[int, int]:
         """Width and height, px, of images that were recorded `width` x `height` px large. Raises NeecoError where these
         have another shape than the requested size, or no image can be so large."""
-        found = width, height
+        size = width, height
         if self.scale is not None:
             scale = min(self.scale, MAX_PIXELS)
-            found = max(1, round(width * scale)), max(1, round(height * scale))
+            size = max(1, round(width * scale)), max(1, round(height * scale))
         elif self.size is not None:
             wide, high = (int(side) for side in self.size.lower().split("x"))
             fitting = (wide, max(1, round(wide * height / width))), (max(1, round(high * width / height)), high)
@@ -66,11 +66,11 @@ class SizeSettings:
                 raise NeecoError(
                     f"--size: {self.size} is another shape than the recorded {width}x{height}; give {others}"
                 )
-            found = wide, high
-        if found[0] * found[1] > MAX_PIXELS:
+            size = wide, high
+        if size[0] * size[1] > MAX_PIXELS:
             option = "--size" if self.scale is None else "--scale"
-            raise NeecoError(f"{option}: {found[0]}x{found[1]} is more than {MAX_PIXELS:,} pixels; give less")
-        return found
+            raise NeecoError(f"{option}: {size[0]}x{size[1]} is more than {MAX_PIXELS:,} pixels; give less")
+        return size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,9 +88,9 @@ class ImageSettings(SizeSettings):
         """Raises NeecoError naming the option that makes no sense."""
         super().check()
         if not 1 <= self.quality <= 100:
-            raise NeecoError(f"--quality: {self.quality} is none of JPEG; give 1 to 100")
+            raise NeecoError(f"--quality: must be 1 to 100 (got {self.quality})")
         if self.image_format == "png" and self.quality != JPEG_QUALITY:
-            raise NeecoError("--quality: is of JPEG images, and PNG would be written; give --image-format jpg, too")
+            raise NeecoError("--quality: applies to JPEG only, and images would be PNG; add --image-format jpg")
 
     @property
     def jpeg_quality(self) -> int | None:
@@ -114,8 +114,8 @@ def parse_class_names(words: Sequence[str], instruments: Sequence[str]) -> dict[
     for word in words:
         instrument, _, name = word.partition("=")
         if not (name and name.isprintable()) or instrument not in instruments or instrument in names:
-            known = ", ".join(instruments)
-            raise NeecoError(f"--class-names: {word!r}: expected INSTRUMENT=CLASS, once for each of {known}")
+            expected = ", ".join(instruments)
+            raise NeecoError(f"--class-names: {word!r}: expected INSTRUMENT=CLASS, once for each of {expected}")
         names[instrument] = name
     return names
 
@@ -192,12 +192,12 @@ class Settings(ImageSettings):
     def from_values(cls, owner: str, **values: Any) -> Settings:
         """The settings with `values`, by the fields' names; `owner` has them, in messages. Raises NeecoError naming the
         one that is unknown or does not fit."""
-        given = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in values.items()}
+        plain = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in values.items()}
         try:
-            settings = structure(cls, given, owner=owner)
+            settings = structure(cls, plain, owner=owner)
         except NeecoError as error:
             name, _, fault = str(error).partition(": ")
-            raise NeecoError(f"--{name.replace('_', '-')}: {fault}" if name in given else str(error)) from None
+            raise NeecoError(f"--{name.replace('_', '-')}: {fault}" if name in plain else str(error)) from None
         settings.check()
         return settings
 
@@ -208,7 +208,7 @@ class Settings(ImageSettings):
             if not math.isfinite(number) or number != int(number):
                 raise NeecoError(f"--{option}: {number} is not a whole number; give one")
         if self.views not in get_args(Views):
-            raise NeecoError(f"--views: {self.views!r} is none; give one of {', '.join(get_args(Views))}")
+            raise NeecoError(f"--views: {self.views!r} is unknown; give one of {', '.join(get_args(Views))}")
         for name, (low, high) in RANGES.items():
             value = getattr(self, name)
             if value is not None and not (low <= value <= high and math.isfinite(value)):

@@ -98,8 +98,8 @@ def joint_ranges(states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
 
 
 def _with_instruments(states: Sequence[State]) -> list[State]:
-    if found := [state for state in states if state.instruments]:
-        return found
+    if usable := [state for state in states if state.instruments]:
+        return usable
     raise NeecoError("states: the scene was trained without instrument states; train on a capture that records them")
 
 
@@ -139,7 +139,7 @@ class InterpolatedStates:
         return with_joints(state, lambda name, joint: self.ranges[name, joint].at(rng.random()))
 
     def _jittered(self, state: State, rng: Generator) -> State:
-        centre = np.mean([to_numpy(given.pose)[:3, 3] for given in state.instruments.values()], axis=0)
+        centre = np.mean([to_numpy(item.pose)[:3, 3] for item in state.instruments.values()], axis=0)
         turn = Rotation.from_rotvec(self.jitter_rad * rng.standard_normal(3)).as_matrix()
         shift = self.jitter_mm * rng.standard_normal(3)
         return with_poses(
@@ -249,8 +249,8 @@ StateSampler = InterpolatedStates | GridStates | PathStates | ListedStates
 def with_poses(state: State, moved: Callable[[str, np.ndarray], np.ndarray]) -> State:
     """The same state with every pose [4, 4] replaced by `moved(instrument, pose)`."""
     instruments = {
-        name: InstrumentState(torch.from_numpy(moved(name, to_numpy(given.pose))), given.joints)
-        for name, given in state.instruments.items()
+        name: InstrumentState(torch.from_numpy(moved(name, to_numpy(item.pose))), item.joints)
+        for name, item in state.instruments.items()
     }
     return replace(state, instruments=instruments)
 

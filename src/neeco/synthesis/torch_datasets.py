@@ -133,11 +133,11 @@ class LabelledImages(Dataset[Sample]):
         transform: Transform | None = None,
         **settings: Any,
     ) -> None:
-        given = settings | {"states": states, "views": views, "labels": labels, "camera_effects": camera_effects}
+        options = settings | {"states": states, "views": views, "labels": labels, "camera_effects": camera_effects}
         self.count, self.transform = count, transform
-        self._settings = Settings.from_values(ASKED_BY, count=count, seed=seed, **given)
+        self._settings = Settings.from_values(ASKED_BY, count=count, seed=seed, **options)
         self._opened = [_opened(one) for one in (scene, *instruments)]
-        first, *others = (found for found, _ in self._opened)
+        first, *others = (opened for opened, _ in self._opened)
         with torch_threads(1):
             generator = SampleGenerator.of(first, self._settings, others)
         self.part_names = generator.labeller.names  # (instrument, part) of part id 1, 2, ...
@@ -169,8 +169,8 @@ class LabelledImages(Dataset[Sample]):
             sample = self._generator.draw(index)
             drawing = sample.drawing
             labelled = LabelledImage.from_drawing(drawing, sample.labels, self.part_names, self.keypoint_names)
-            found = {"state": drawing.state, "camera": drawing.camera, "index": index} | labelled.targets()
-        return found if self.transform is None else self.transform(found)
+            entry = {"state": drawing.state, "camera": drawing.camera, "index": index} | labelled.targets()
+        return entry if self.transform is None else self.transform(entry)
 
     @staticmethod
     def collate(samples: Sequence[Sample]) -> dict[str, Any]:
@@ -182,19 +182,19 @@ class LabelledImages(Dataset[Sample]):
         return {key: default_collate(values) if key in STACKED else values for key, values in batch.items()}
 
 
-def _opened(given: SceneLike) -> tuple[GaussianScene, Path | None]:
+def _opened(source: SceneLike) -> tuple[GaussianScene, Path | None]:
     """The scene, and the file that holds it where there is one. Raises NeecoError."""
-    run: Any = given
-    if isinstance(given, str | os.PathLike):
-        path = Path(given)
+    run: Any = source
+    if isinstance(source, str | os.PathLike):
+        path = Path(source)
         if not path.is_dir():
             return load_gaussians(path, ASKED_BY), path
         run = load_run(path)
     run = getattr(run, "trained", run)
     scene = getattr(run, "scene", run)
     folder = getattr(run, "path", None)  # a run has one
-    found = require_gaussians(getattr(scene, "learned", scene), ASKED_BY)
-    return found, None if folder is None else Path(folder) / SCENE_FILE
+    gaussians = require_gaussians(getattr(scene, "learned", scene), ASKED_BY)
+    return gaussians, None if folder is None else Path(folder) / SCENE_FILE
 
 
 def _spec(opened: Sequence[tuple[GaussianScene, Path | None]], settings: Settings) -> GeneratorSpec | PackedSpec:

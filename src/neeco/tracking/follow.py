@@ -24,16 +24,16 @@ from neeco.tracking.trust import NO_TRUST, TRUST, Judge, Reference, TrackTrust
 class FollowSettings:
     """Settings of following states from frame to frame."""
 
-    unusual: float = 1.3  # times the usual misfit, above which another state is searched for
-    better: float = 0.85  # of such a fit's misfit, that the other must be below
-    n_recent: int = 10  # frames whose median misfit is usual
-    min_overlap: float = 0.5  # of the label; below, the instruments are lost
+    unusual: float = 1.3  # ratio to the usual misfit, above which another state is searched for
+    better: float = 0.85  # ratio of another state's misfit to the fit's, below which it replaces the fit
+    n_recent: int = 10  # number of frames whose median misfit is the usual one
+    min_overlap: float = 0.5  # minimum overlap of the label; below it, the instruments are lost
     search_rolls_every: int = 6  # frames between searches for other rolls, since drifting states may have small misfits
     # deg, mm, deg of joints: standard deviations of a given state
     given_prior: tuple[float, float, float] = (4.0, 4.0, 8.0)
-    search_every_s: float = 0.2  # between searches anywhere
-    low_trust: float = 0.5  # trust below which a followed state is searched anywhere; between these
-    low_trust_search_every_s: float = 0.4
+    search_every_s: float = 0.2  # time between searches anywhere
+    low_trust: float = 0.5  # trust below which a followed state is searched anywhere
+    low_trust_search_every_s: float = 0.4  # time between these searches
 
 
 FOLLOW = FollowSettings()
@@ -104,15 +104,15 @@ class Follower:
         search = Search.of(fitter)
         return cls(frames, fitter, search.motion, search, Judge(fitter, search, reference, allowance))
 
-    def begin(self, frame: int, given: State) -> Step:
+    def begin(self, frame: int, state: State) -> Step:
         """Return the first step from a state that is approximately known."""
         prior = loose_prior(self.fitter.parameters, *FOLLOW.given_prior)
         fit = self.fitter.fit(
-            self._view(frame, given), given, prior, levels=(0.125, 0.25, 0.5, 1.0), steps=(3, 3, 3, 4)
+            self._view(frame, state), state, prior, levels=(0.125, 0.25, 0.5, 1.0), steps=(3, 3, 3, 4)
         )
         if fit is None:
             time = self.frames[frame].state.time
-            return Step(frame=frame, how="lost", motion=self.motion.begin(given), found_at=time, searched_at=time)
+            return Step(frame=frame, how="lost", motion=self.motion.begin(state), found_at=time, searched_at=time)
         return self._begun(frame, "begun", fit)
 
     def find(self, frame: int) -> Step:

@@ -24,14 +24,14 @@ from neeco.tracking.parameters import TrackedParameters
 class MotionSettings:
     """Settings of the motion prior."""
 
-    min_differences: int = 8  # second differences from which accelerations are estimated
+    min_differences: int = 8  # minimum number of second differences from which accelerations are estimated
     # deg, mm, deg and mm of joints: least second difference between frames
     min_difference: tuple[float, float, float, float] = (0.05, 0.03, 0.1, 0.05)
     # the same: standard deviations of a state just found
     initial_sd: tuple[float, float, float, float] = (2.0, 2.0, 3.0, 1.0)
     # the same: of a state that no image determines
     unknown_sd: tuple[float, float, float, float] = (60.0, 30.0, 40.0, 10.0)
-    max_gap_s: float = 0.4  # for which a state is predicted; after a longer one it is searched for
+    max_gap_s: float = 0.4  # maximum gap over which a state is predicted; after a longer one it is searched for
 
 
 MOTION = MotionSettings()
@@ -69,10 +69,10 @@ class MotionModel:
         for before, after in pairwise(ordered):
             consecutive = abs(after.time - before.time - interval) < interval / 2
             steps.append(parameters.increments_between(before, after) if consecutive else None)
-        known = [step for step in steps if step is not None]
+        first_differences = [step for step in steps if step is not None]
         differences = [b - a for a, b in pairwise(steps) if a is not None and b is not None]
         if len(differences) < MOTION.min_differences:
-            differences = known
+            differences = first_differences
         deviation, place = (
             parameters.vector_from_degrees(*MOTION.min_difference),
             parameters.vector_from_degrees(*MOTION.initial_sd),
@@ -80,8 +80,8 @@ class MotionModel:
         if differences:
             deviation = torch.maximum(deviation, MAD_TO_SD * torch.stack(differences).abs().median(0).values)
         velocities = torch.diag((deviation if differences else place) / interval) ** 2
-        if known:
-            paces = torch.stack(known) / interval
+        if first_differences:
+            paces = torch.stack(first_differences) / interval
             velocities = velocities + paces.T @ paces / len(paces)
         return cls(parameters, deviation**2 / interval**3, velocities, interval)
 
@@ -120,10 +120,10 @@ class MotionModel:
         """Return the estimate after a frame to which the predicted state was fitted."""
         size = self.parameters.size
         moved = self.parameters.increments_between(predicted.state, fit.state)
-        own, cross = predicted.covariance[:size, :size], predicted.covariance[size:, :size]
-        velocity = predicted.velocity + cross @ torch.linalg.solve(own, moved)
+        place, cross = predicted.covariance[:size, :size], predicted.covariance[size:, :size]
+        velocity = predicted.velocity + cross @ torch.linalg.solve(place, moved)
         measured = torch.linalg.inv(fit.information + 1e-9 * torch.eye(size, dtype=torch.float64))
-        gain = torch.linalg.solve((own + measured).T, predicted.covariance[:, :size].T).T
+        gain = torch.linalg.solve((place + measured).T, predicted.covariance[:, :size].T).T
         covariance = predicted.covariance - gain @ predicted.covariance[:size]
         return MotionState(fit.state, velocity, (covariance + covariance.T) / 2)
 
@@ -140,8 +140,8 @@ class MotionModel:
             joints = variance[rows].clamp_min(0)
             between = ((item.high - item.low) ** 2 / 12).clamp_min(1e-12)  # variance of an even distribution
             deviation = torch.cat([rotation, 1 / (1 / joints.clamp_min(1e-12) + 1 / between)]).sqrt()
-            own = torch.cat([limits[pose][:1], limits[rows]])
-            probability *= float(torch.erf(own / (math.sqrt(2) * deviation.clamp_min(1e-9))).prod())
+            tolerance = torch.cat([limits[pose][:1], limits[rows]])
+            probability *= float(torch.erf(tolerance / (math.sqrt(2) * deviation.clamp_min(1e-9))).prod())
         return probability
 
     def released(self, predicted: MotionState) -> MotionState:

@@ -49,15 +49,15 @@ class TrackedParameters(StateParameters):
             raise NeecoError("track: the run has no instrument; train on a capture that records one")
         if not scene.recorded.states:
             raise NeecoError("track: the run remembers no recorded frame; train it again with this version")
-        found = []
+        instruments = []
         for instrument, articulation in zip(scene.instruments, deformation.articulations, strict=True):
             shaft = articulation.shaft()
             if articulation.jointed:
                 pivot = articulation.axes(shaft)[0][-1]
             else:
                 pivot = articulation.keypoints({})["shaft_near"]
-            found.append(_tracked(instrument, scene.recorded.states, pivot, shaft[1]))
-        return cls(tuple(found))
+            instruments.append(_tracked(instrument, scene.recorded.states, pivot, shaft[1]))
+        return cls(tuple(instruments))
 
     def along(self, instrument: int, millimetres: float = 0.0, roll: float = 0.0) -> Tensor:
         """Return the parameters [P] that shift one instrument along its shaft and roll it (rad) about it."""
@@ -69,9 +69,9 @@ class TrackedParameters(StateParameters):
     def with_joints(self, state: State, instrument: int, values: Sequence[float]) -> State:
         """Return `state` with one instrument's joints at `values` [J]."""
         item = self.instruments[instrument]
-        given = state.instruments[item.name]
+        previous = state.instruments[item.name]
         joints = dict(zip(item.joints, map(float, values), strict=True))
-        return replace(state, instruments={**state.instruments, item.name: replace(given, joints=joints)})
+        return replace(state, instruments={**state.instruments, item.name: replace(previous, joints=joints)})
 
 
 TrackingFitter = Fitter[TrackedParameters]

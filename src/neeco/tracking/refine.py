@@ -63,14 +63,14 @@ def refine_run(
     if (begun := read_begun(output, BEGUN, resume, "a refinement")) is not None:
         require_same(str(output / BEGUN), ((key, begun.get(key), value) for key, value in info.items()))
     if not (folder / "transforms.json").exists():
-        scene, own = run.scene, run.capture()
-        own, frames = without_twice(own, [frame for path in tracked for frame in _tracked_frames(path, scene)])
+        scene, capture = run.scene, run.capture()
+        capture, frames = without_twice(capture, [frame for path in tracked for frame in _tracked_frames(path, scene)])
         if not frames:
             raise NeecoError(f"{tracked[0]}: every frame is one that the run was trained on; track other footage")
         with own_folder(output):
             write_json(output / BEGUN, info)
-            recorded = fitted(scene, own, on_progress)
-            merged = replace(own, frames=(*recorded, *_named_apart(frames, output / STAGING)))
+            recorded = fitted(scene, capture, on_progress)
+            merged = replace(capture, frames=(*recorded, *_named_apart(frames, output / STAGING)))
             write_capture(merged, folder)
             shutil.rmtree(output / STAGING)
     # the latency of a tracker is gone from the states
@@ -86,10 +86,10 @@ def _tracked_frames(path: Path, scene: GaussianScene) -> list[Frame]:
     info = read_json(path / INFO) if (path / INFO).exists() else {}
     if isinstance(info, dict) and info.get("tissue", "run") != "run":
         raise NeecoError(f"{path / INFO}: tissue: another run's, in a world of its own; train on {path} by itself")
-    known = {item.name: set(item.joints) for item in scene.instruments}
+    required = {item.name: set(item.joints) for item in scene.instruments}
     for frame in capture.frames:
-        given = {name: set(state.joints) for name, state in frame.state.instruments.items()}
-        if missing := [name for name, joints in known.items() if not joints <= given.get(name, {None})]:
+        stated = {name: set(state.joints) for name, state in frame.state.instruments.items()}
+        if missing := [name for name, joints in required.items() if not joints <= stated.get(name, {None})]:
             raise NeecoError(
                 f"{path}: {frame.name}: instruments: does not state {missing[0]!r} with all its joints; give a "
                 "capture that `neeco track` made with this run"
@@ -97,20 +97,20 @@ def _tracked_frames(path: Path, scene: GaussianScene) -> list[Frame]:
     return [replace(frame, split="train") for frame in capture.frames]
 
 
-def without_twice(own: Capture, tracked: Sequence[Frame]) -> tuple[Capture, list[Frame]]:
+def without_twice(capture: Capture, tracked: Sequence[Frame]) -> tuple[Capture, list[Frame]]:
     """Return both without images that both have, and each image of the tracked ones once.
 
     Training frames stay as recorded. Withheld frames that were tracked are trained on as tracked, and are no longer
     test frames. Raises NeecoError when an image cannot be read.
     """
-    images = {_digest(frame): frame for frame in own.frames}
+    images = {_digest(frame): frame for frame in capture.frames}
     new: dict[bytes, Frame] = {}
     for frame in tracked:
         digest = _digest(frame)
         if digest not in images or images[digest].split != "train":
             new.setdefault(digest, frame)
     withheld = {images[digest].image_path for digest in new.keys() & images.keys()}
-    return replace(own, frames=tuple(f for f in own.frames if f.image_path not in withheld)), list(new.values())
+    return replace(capture, frames=tuple(f for f in capture.frames if f.image_path not in withheld)), list(new.values())
 
 
 def _digest(frame: Frame) -> bytes:

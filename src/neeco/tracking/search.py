@@ -25,15 +25,15 @@ class TrackSearchSettings:
     # along the shaft: its teeth, rings and end hold a fit where it was
     shifts_mm: tuple[float, ...] = (-5.0, -2.5, 0.0, 2.5, 5.0)
     rolls_deg: tuple[float, float, float] = (-8.0, 0.0, 8.0)  # tried about a prediction
-    n_samples: int = 48  # of the prediction
-    prior_scale: float = 3.0  # by which the prediction's standard deviations are widened
-    n_fitted_near: int = 3  # starts near the prediction that are fitted
+    n_samples: int = 48  # number of samples of the prediction
+    prior_scale: float = 3.0  # factor on the prediction's standard deviations
+    n_fitted_near: int = 3  # number of starts near the prediction that are fitted
     anywhere_prior: tuple[float, float, float] = (30.0, 30.0, 40.0)  # deg, mm, deg of joints
-    n_recorded: int = 96  # recorded states tried
-    n_starts: int = 6  # of them fitted
-    n_turned: int = 3  # of the best one with other rolls and joints
-    n_finalists: int = 2  # fitted at full size
-    apart_mm: float = 8.0  # closer states lead to the same fit
+    n_recorded: int = 96  # number of recorded states tried
+    n_starts: int = 6  # number of these that are fitted
+    n_turned: int = 3  # number of variants of the best state, with other rolls and joints, that are fitted
+    n_finalists: int = 2  # number of fits that are refined at full size
+    apart_mm: float = 8.0  # minimum distance between starts: closer states lead to the same fit
     apart_deg: float = 15.0  # the same, of turns
     apart_joint_deg: float = 15.0  # the same, of joints
     # of states that look alike
@@ -99,13 +99,13 @@ class Search:
         fitter, prior = self.fitter, loose_prior(self.fitter.parameters, *STARTS.anywhere_prior)
         starts = self._different(fitter.ranked(view, self.recorded_states(view.camera), 0.125), STARTS.n_starts)
         fits = [fitter.fit(view, state, prior, levels=(0.125, 0.25), steps=(6, 4)) for state in starts]
-        found = _by_gain(fits)
-        if found:
-            others = self._different(fitter.ranked(view, self.turned(found[0].state), 0.25), STARTS.n_turned)
+        fitted = _by_gain(fits)
+        if fitted:
+            others = self._different(fitter.ranked(view, self.turned(fitted[0].state), 0.25), STARTS.n_turned)
             fits = [fitter.fit(view, state, prior, levels=(0.25,), steps=(6,)) for state in others]
-            found = _by_gain([*found, *fits])
+            fitted = _by_gain([*fitted, *fits])
         last = [
-            fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4)) for fit in found[: STARTS.n_finalists]
+            fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4)) for fit in fitted[: STARTS.n_finalists]
         ]
         best = _by_gain(last)
         return best[0] if best and best[0].gain > 0 else None
@@ -117,27 +117,27 @@ class Search:
         for k in evenly_spaced(len(recorded.states), STARTS.n_recorded):
             carry = world @ torch.linalg.inv(recorded.cameras[k].world_from_camera.double().cpu())
             instruments = {
-                name: InstrumentState(carry @ given.pose.double().cpu(), given.joints)
-                for name, given in recorded.states[k].instruments.items()
+                name: InstrumentState(carry @ item.pose.double().cpu(), item.joints)
+                for name, item in recorded.states[k].instruments.items()
             }
             states.append(State(instruments, 0.0))
         return states
 
     def turned(self, state: State) -> list[State]:
         """Return variants of a state: each instrument in turn at other rolls, with its joints as they are and moved."""
-        parameters, found = self.fitter.parameters, []
+        parameters, variants = self.fitter.parameters, []
         for k, item in enumerate(parameters.instruments):
-            given = state.instruments[item.name].joints
-            values = [given[name] for name in item.joints]
+            joints = state.instruments[item.name].joints
+            values = [joints[name] for name in item.joints]
             for roll in (0.0, *STARTS.other_rolls_deg):
                 rolled = parameters.moved(state, parameters.along(k, roll=roll * DEG))
-                found += [rolled] if roll else []
+                variants += [rolled] if roll else []
                 for j, slides in enumerate(item.slides):
                     for change in STARTS.other_joints_deg:
                         moved = [*values]
                         moved[j] += change * (STARTS.mm_per_deg if slides else DEG)
-                        found.append(parameters.with_joints(rolled, k, moved))
-        return found
+                        variants.append(parameters.with_joints(rolled, k, moved))
+        return variants
 
     def _different(self, states: Sequence[State], count: int) -> list[State]:
         """Return the first `count` states that lead to different fits."""

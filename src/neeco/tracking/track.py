@@ -87,19 +87,19 @@ class Tracked:
         """One sentence on the trust in the states; the verdict DOUBTFUL is in capitals."""
         count, missing = len(self.records), sum(record["how"] == "lost" for record in self.records)
         typical = median(record["trust"]["value"] for record in self.records)
-        found = f"trust is {typical:.2f} in the median"
-        found += f", and in {missing} of {count} frames nothing was found" if missing else ""
+        summary = f"trust is {typical:.2f} in the median"
+        summary += f", and in {missing} of {count} frames nothing was found" if missing else ""
         if self.written < TRACK.min_trusted_share * count:
-            return f"DOUBTFUL: {found}; is it the run's instrument, over its tissue?"
-        return f"{'good' if self.written == count else 'usable'}: {found}"
+            return f"DOUBTFUL: {summary}; check that it shows the run's instrument over its tissue"
+        return f"{'good' if self.written == count else 'usable'}: {summary}"
 
     def require_trusted(self) -> None:
         """Raises NeecoError where no frame is trusted."""
         if not self.written:
             best = max(record["trust"]["value"] for record in self.records)
             raise NeecoError(
-                f"{self.footage.root}: no frame has a trust of {self.min_trust:g}, the highest is {best:.2f}; is it "
-                f"the run's instrument, over its tissue (if not: {LEARN_TISSUE})? {self.output} shows what was found"
+                f"{self.footage.root}: no frame has a trust of {self.min_trust:g}, the highest is {best:.2f}; check "
+                f"that it shows the run's instrument over its tissue (if not: {LEARN_TISSUE}); results: {self.output}"
             )
 
 
@@ -130,7 +130,7 @@ def track_footage(
     parameters = TrackedParameters.of(run.scene)
     scene = run.scene if tissue is None else over_tissue(run.scene, tissue.scene)
     frames = sorted(footage.frames, key=lambda frame: frame.state.time)
-    given = _first_state(footage, frames[0], scene) if start == "first" else None
+    first_state = _first_state(footage, frames[0], scene) if start == "first" else None
     trained_on = run.capture()
     info: dict[str, Any] = {
         "schema": SCHEMA,
@@ -156,7 +156,7 @@ def track_footage(
             if tissue is not None:
                 fitter, allowance = fitter_of(scene), TRACK.other_tissue_misfit
             follower = Follower.of(frames, fitter, reference, allowance)
-            steps = StepFiles(output / STEPS, follower, on_progress).all_steps(given)
+            steps = StepFiles(output / STEPS, follower, on_progress).all_steps(first_state)
             records = [_record(frames[k], step, parameters) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
         else:
@@ -213,13 +213,13 @@ class StepFiles:
     on_progress: Callable[[int, int], None]
     done: int = 0
 
-    def all_steps(self, given: State | None) -> list[Step]:
+    def all_steps(self, first_state: State | None) -> list[Step]:
         """Return the best step of every frame, in order of time."""
         count = len(self.follower.frames)
-        if given is None:
+        if first_state is None:
             first = self._beginning()
         else:
-            first = self._step("begin-0", lambda: self.follower.begin(0, given))
+            first = self._step("begin-0", lambda: self.follower.begin(0, first_state))
         steps: dict[int, Step] = {first.frame: first}
         self._count(count)
         for way, end in ((1, count), (-1, -1)):
@@ -232,13 +232,13 @@ class StepFiles:
 
     def _beginning(self) -> Step:
         """Return the first step: the most trusted of a few frames spread over the footage."""
-        count, found = len(self.follower.frames), []
+        count, steps = len(self.follower.frames), []
         spread = [k * count // TRACK.n_beginnings for k in range(TRACK.n_beginnings)]
         for frame in dict.fromkeys(spread):
-            found.append(self._step(f"find-{frame}", partial(self.follower.find, frame)))
-            if found[-1].trust.value >= TRACK.certain:
+            steps.append(self._step(f"find-{frame}", partial(self.follower.find, frame)))
+            if steps[-1].trust.value >= TRACK.certain:
                 break
-        return max(found, key=lambda step: step.trust.value)
+        return max(steps, key=lambda step: step.trust.value)
 
     def _again(self, steps: dict[int, Step]) -> None:
         """Follow backwards through every stretch of low trust that a trusted frame follows.
@@ -279,8 +279,8 @@ def _record(frame: Frame, step: Step, parameters: TrackedParameters) -> dict[str
     instruments = {}
     variance = step.motion.covariance.diagonal()
     for item, (pose, rows) in zip(parameters.instruments, parameters.rows, strict=True):
-        state, own = step.motion.state.instruments[item.name], variance[pose].clamp_min(0)
-        deviation = {"rotation": float(own[:3].sum().sqrt()), "place": float(own[3:].sum().sqrt())}
+        state, pose_variance = step.motion.state.instruments[item.name], variance[pose].clamp_min(0)
+        deviation = {"rotation": float(pose_variance[:3].sum().sqrt()), "place": float(pose_variance[3:].sum().sqrt())}
         most = (item.high - item.low) / math.sqrt(12)  # of a joint that may be anywhere between its bounds
         joints = torch.minimum(variance[rows].clamp_min(0).sqrt(), most).tolist()
         deviation |= {f"joint.{name}": value for name, value in zip(item.joints, joints, strict=True)}
@@ -304,8 +304,8 @@ def state_of(record: dict[str, Any]) -> State:
     """Return the state in a record of track.json."""
     trust = record["trust"]["value"]
     instruments = {
-        name: InstrumentState(torch.tensor(given["pose"], dtype=torch.float64), given["joints"], trust)
-        for name, given in record["instruments"].items()
+        name: InstrumentState(torch.tensor(entry["pose"], dtype=torch.float64), entry["joints"], trust)
+        for name, entry in record["instruments"].items()
     }
     return State(instruments, record["time"])
 
@@ -333,13 +333,13 @@ def _first_state(footage: Capture, frame: Frame, scene: GaussianScene) -> State:
     """Return the stated state of the first frame. Raises NeecoError where it lacks an instrument or joint."""
     states = {}
     for item in scene.instruments:
-        given = frame.state.instruments.get(item.name)
-        missing = [name for name in item.joints if given is not None and name not in given.joints]
-        if given is None or missing:
-            what = f"instrument {item.name!r}" if given is None else f"joint {missing[0]!r} of {item.name!r}"
+        stated = frame.state.instruments.get(item.name)
+        missing = [name for name in item.joints if stated is not None and name not in stated.joints]
+        if stated is None or missing:
+            what = f"instrument {item.name!r}" if stated is None else f"joint {missing[0]!r} of {item.name!r}"
             raise NeecoError(
                 f"{footage.root}: {frame.name}: instruments: the first frame does not state {what}; state it there, "
                 "or use --start none"
             )
-        states[item.name] = InstrumentState(given.pose.double(), {name: given.joints[name] for name in item.joints})
+        states[item.name] = InstrumentState(stated.pose.double(), {name: stated.joints[name] for name in item.joints})
     return State(states, frame.state.time)

@@ -42,26 +42,26 @@ from neeco.tracking.search import Search, differ
 class TrackTrustSettings:
     """Settings of the trust in tracked states."""
 
-    n_reference_frames: int = 16  # training frames that tell usual misfits
-    usual_quantile: float = 0.9  # of their misfits
-    min_misfit: float = 0.08  # smaller ones count as much: about 4 of 255 grey levels
-    min_error: float = 0.012  # the same, of a pixel's colour in [0, 1]
-    half_trust_misfit: float = 4.0  # times the usual one, where `explained` is 1/2
-    steepness: float = 4.0  # of the fall of `explained` about there
-    # from the nearest recorded direction: the misfit must be half as large, since the scene is a guess
+    n_reference_frames: int = 16  # number of training frames from which usual misfits are estimated
+    usual_quantile: float = 0.9  # quantile of these misfits that counts as usual
+    min_misfit: float = 0.08  # minimum usual misfit: about 4 of 255 grey levels
+    min_error: float = 0.012  # minimum usual error of a pixel's colour in [0, 1]
+    half_trust_misfit: float = 4.0  # ratio to the usual misfit, at which `explained` is 1/2
+    steepness: float = 4.0  # exponent of the fall of `explained`
+    # angle from the nearest recorded direction, at which the misfit must be half as large, since the scene is a guess
     halving_deg: float = 8.0
-    min_observed: float = 0.9  # of the share in the worst reference frame, that counts as fully observed
+    min_observed: float = 0.9  # ratio to the share in the worst reference frame, that counts as fully observed
     confident: float = 0.9  # product of the other factors below which another state is searched for
-    n_others_fitted: int = 2  # of the states that are searched for
+    n_others_fitted: int = 2  # number of these states that are fitted
     # deg, mm, deg of joints: standard deviations of the other state
     other_prior: tuple[float, float, float] = (20.0, 5.0, 20.0)
     # sizes of the images compared, and steps at each
     other_levels: tuple[tuple[float, int], tuple[float, int]] = ((0.25, 4), (0.5, 2))
-    max_other_misfit: float = 2.0  # times that of the fit: of states that are not fitted further
-    other_deg: float = 10.0  # closer states are the same
+    max_other_misfit: float = 2.0  # maximum ratio of another state's misfit to the fit's, for it to be fitted further
+    other_deg: float = 10.0  # minimum rotation between two different states
     other_joint_deg: float = 8.0  # the same, of joints
-    misfit_ratios: tuple[float, float] = (1.3, 1.0)  # of another state: where `single` is 1, and where it is lowest
-    ambiguous: float = 0.6  # by which it is lowered there
+    misfit_ratios: tuple[float, float] = (1.3, 1.0)  # of another state's misfit: where `single` is 1, and lowest
+    ambiguous: float = 0.6  # reduction of `single` at the second
     wrong_deg: float = 10.0  # error of rotation or a joint with which a state is wrong
 
 
@@ -247,17 +247,17 @@ class Judge:
         parameters, best, view = self.fitter.parameters, None, fit.view
         prior = loose_prior(parameters, *TRUST.other_prior)
         for state in self.fitter.ranked(view, self.search.turned(fit.state), 0.25)[: TRUST.n_others_fitted]:
-            found: StateFit | None = None
+            trial: StateFit | None = None
             for level, steps in TRUST.other_levels:
-                start = state if found is None else found.state
-                found = self.fitter.fit(view, state, prior, start, levels=(level,), steps=(steps,))
+                start = state if trial is None else trial.state
+                trial = self.fitter.fit(view, state, prior, start, levels=(level,), steps=(steps,))
                 if (
-                    found is None
-                    or found.misfit > TRUST.max_other_misfit * fit.misfit
-                    or not differ(parameters, found.state, fit.state, TRUST.other_deg, TRUST.other_joint_deg)
+                    trial is None
+                    or trial.misfit > TRUST.max_other_misfit * fit.misfit
+                    or not differ(parameters, trial.state, fit.state, TRUST.other_deg, TRUST.other_joint_deg)
                 ):
-                    found = None
+                    trial = None
                     break
-            if found is not None and (best is None or found.gain > best.gain):
-                best = found
+            if trial is not None and (best is None or trial.gain > best.gain):
+                best = trial
         return best

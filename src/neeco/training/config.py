@@ -142,9 +142,9 @@ def config_to_dict(config: TrainConfig) -> dict[str, Any]:
 def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
     """Return the TrainConfig that `config_to_dict` wrote. Raises NeecoError naming a field that does not fit."""
     method = values.get("method", DEFAULT)
-    if not isinstance(own := values.get("deformation") or {}, Mapping):
-        raise NeecoError(f"deformation: {own!r} is not a group of fields")
-    settings = method_settings(method, own)
+    if not isinstance(group := values.get("deformation") or {}, Mapping):
+        raise NeecoError(f"deformation: {group!r} is not a group of fields")
+    settings = method_settings(method, group)
     others = {name: value for name, value in values.items() if name not in ("deformation", *REMOVED_GROUPS)}
     config = structure(TrainConfig, others, owner="the training config")
     return with_fields(config, {"deformation": settings})
@@ -271,9 +271,9 @@ def check_ranges(config: TrainConfig) -> None:
         )
     for number, event in enumerate(schedule.events):
         if event.action not in (actions := method_class(config.method).actions):
-            known = f"it knows {', '.join(actions)}" if actions else "it has none"
+            choice = f"it knows {', '.join(actions)}" if actions else "it has none"
             raise NeecoError(
-                f"--set schedule.events: {number}: {event.action!r} is no action of method {config.method}; {known}"
+                f"--set schedule.events: {number}: {event.action!r} is no action of method {config.method}; {choice}"
             )
         if not event.at > 0:
             raise NeecoError(f"--set schedule.events: {number}: at: {event.at} is not above 0, the run's start")

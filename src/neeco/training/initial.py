@@ -163,7 +163,7 @@ def _explained(design: np.ndarray, values: np.ndarray, stretches: int) -> float:
     """Return the share of the variance of values [N] that a linear fit to design [N, P] explains, of each of several
     stretches by the fit to the others: dozens of smooth frames fit a dozen numbers of a pose by chance."""
     left = np.zeros(len(values))
-    for held in np.array_split(np.arange(len(values)), stretches):
-        use = np.setdiff1d(np.arange(len(values)), held) if stretches > 1 else held
-        left[held] = values[held] - design[held] @ np.linalg.lstsq(design[use], values[use], rcond=1e-6)[0]
+    for test in np.array_split(np.arange(len(values)), stretches):
+        use = np.setdiff1d(np.arange(len(values)), test) if stretches > 1 else test
+        left[test] = values[test] - design[test] @ np.linalg.lstsq(design[use], values[use], rcond=1e-6)[0]
     return 1 - float(np.square(left).mean() / values.var())

@@ -64,7 +64,7 @@ class TrainedRun:
         root = Path(self.config["capture"])
         if not root.exists():
             config = self.path / CONFIG_FILE
-            raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write there where it is")
+            raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write its new path there")
         capture = read_capture(root, self.config["transforms"])
         if not self.force:
             remedy = "put its files back as they were, train again, or use it as it is now with --force"
@@ -105,8 +105,8 @@ def doubts_of(diagnostics: Mapping[str, Any], method: str, frames: int) -> tuple
     usual = replace(method_defaults(method), iterations=None).for_frames(frames).length
     if usual.is_short(done := diagnostics.get("iterations", usual.iterations)):
         return (f"training ended after {done:,} iterations, usual are {usual.iterations:,}",)
-    known = diagnostics.get(LABEL_QUALITY)
-    doubt = None if known is None else LabelQuality(known["recall"], known["precision"]).doubt
+    quality = diagnostics.get(LABEL_QUALITY)
+    doubt = None if quality is None else LabelQuality(quality["recall"], quality["precision"]).doubt
     joints = diagnostics.get("joints", {}).items()
     unfound = (f"joint {name}: {joint['verdict']}" for name, joint in joints if joint.get("found") is False)
     return (*([doubt] if doubt else []), *unfound)
@@ -116,9 +116,9 @@ def verdict_on(diagnostics: Mapping[str, Any], method: str, frames: int) -> str:
     """Return in words what training measured of the labels (see `doubts_of`)."""
     if doubts := doubts_of(diagnostics, method, frames):
         return f"DOUBTFUL: {'; '.join(doubts)}"
-    if (known := diagnostics.get(LABEL_QUALITY)) is None:
+    if (quality := diagnostics.get(LABEL_QUALITY)) is None:
         return "none: the images do not show how good the labels are; score some masks"
-    return f"usable: labels agree with what the images show (estimated IoU {known['iou']:.2f})"
+    return f"usable: labels agree with what the images show (estimated IoU {quality['iou']:.2f})"
 
 
 def scene_digest(path: Path) -> str:
@@ -176,8 +176,8 @@ def read_config(path: Path) -> dict[str, Any]:
         raise NeecoError(f"{path}: {'; '.join(misplaced(path, 'a run folder', 'config.yaml, by `neeco train`'))}")
     config = parse_yaml(file, read_text(file, "the settings of a run as YAML"), "train again")
     if not isinstance(config, dict) or config.get("schema") != SCHEMA:
-        found = config.get("schema") if isinstance(config, dict) else None
-        raise NeecoError(f"{file}: schema is {found!r}, this version reads {SCHEMA!r}; train again")
+        schema = config.get("schema") if isinstance(config, dict) else None
+        raise NeecoError(f"{file}: schema is {schema!r}, this version reads {SCHEMA!r}; train again")
     require_like(config, {"capture": str, "transforms": str, "method": str, "seed": int}, str(file), "train again")
     return config | {"method": current_name(config["method"])}
 
@@ -210,11 +210,11 @@ def begun_config(path: Path) -> TrainConfig | None:
 def stored_config(path: Path, stored: Mapping[str, Any]) -> TrainConfig:
     """Return the settings in `stored`, which `read_config` read from run folder `path`. Raises NeecoError for a field
     that is unknown or does not fit, or a number out of range."""
-    known = {key: value for key, value in stored.items() if key not in ("schema", "version", "capture", CAPTURE_DIGEST)}
-    if isinstance(own := known.get("deformation"), Mapping):
-        known["deformation"] = without_removed(own)
+    fields = {key: item for key, item in stored.items() if key not in ("schema", "version", "capture", CAPTURE_DIGEST)}
+    if isinstance(group := fields.get("deformation"), Mapping):
+        fields["deformation"] = without_removed(group)
     try:
-        config = config_from_dict(known)
+        config = config_from_dict(fields)
         check_ranges(config)
     except NeecoError as error:
         raise NeecoError(f"{path / CONFIG_FILE}: {error}; train again") from None

@@ -337,11 +337,11 @@ class GaussianSession(Session):
 
     def _predict_states(self) -> None:
         """Correct new states by what the training frames' corrections depend on, and report that."""
-        found = predict_corrections(self.scene.state_corrections, self.refinement, self.views.frames)
+        parts = predict_corrections(self.scene.state_corrections, self.refinement, self.views.frames)
         self.scene.diagnostics["state_errors"] = {
-            part: {"explained": round(item.explained, 4), "corrected": item.applied} for part, item in found.items()
+            part: {"explained": round(item.explained, 4), "corrected": item.applied} for part, item in parts.items()
         }
-        for part, item in found.items():
+        for part, item in parts.items():
             if item.applied:
                 self.report(
                     f"{part}: similar recorded states have similar errors ({item.explained:.0%} of their variance is "
@@ -357,8 +357,8 @@ class GaussianSession(Session):
         scene.diagnostics["iterations"] = self.iteration
         if scene.recorded.still:
             places = {tuple(camera.world_from_camera.flatten().tolist()) for camera in scene.recorded.cameras}
-            known = "measured with a second camera" if len(places) > 1 else "not measured: no view shows it"
-            scene.diagnostics["still_scope"] = f"the tissue's depth is {known}; render views near the recorded ones"
+            depth = "measured with a second camera" if len(places) > 1 else "not measured: no view shows it"
+            scene.diagnostics["still_scope"] = f"the tissue's depth is {depth}; render views near the recorded ones"
         scene.diagnostics["phase_2_began"] = self.schedule.phase_started
         scene.diagnostics["phase_2_forced"] = self.schedule.forced
         shares = self.refinement.prior_shares()  # before what states predict is taken out of the corrections
@@ -414,4 +414,4 @@ def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.nd
 
 def trust_of(state: State) -> float:
     """Return the weight of a frame in the loss: the least trust of its states, 1 for recorded ones."""
-    return min((1.0 if given.trust is None else given.trust for given in state.instruments.values()), default=1.0)
+    return min((1.0 if item.trust is None else item.trust for item in state.instruments.values()), default=1.0)

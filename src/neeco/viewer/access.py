@@ -27,8 +27,8 @@ from neeco.base.errors import NeecoError
 
 HOST, PORT = "127.0.0.1", 8080
 TOKEN_BYTES = 24
-MAX_MESSAGE = 2**20  # bytes; a browser's messages have some hundred
-MAX_PORTS = 100  # tried, one after another
+MAX_MESSAGE = 2**20  # limit on the bytes of a message; a browser's messages have some hundred
+MAX_PORTS = 100  # limit on the ports tried, one after another
 INLINE_SCRIPT = re.compile(rb"<script[^>]*>(.*?)</script>", re.DOTALL)
 REFUSED = "neeco view: refused: open the whole address that neeco view printed\n"
 
@@ -103,7 +103,7 @@ def controlled_sockets(access: Access, changed: Callable[[bytes], bytes]) -> Ite
     opened: list[bool] = []
     serve = websocket_server.serve
 
-    def serve_controlled(*given: Any, process_request: Respond, **named: Any) -> Any:
+    def serve_controlled(*args: Any, process_request: Respond, **named: Any) -> Any:
         opened.append(True)
         # a message that asks for what cannot be fails in a task of its own
         asyncio.get_running_loop().set_exception_handler(
@@ -122,7 +122,7 @@ def controlled_sockets(access: Access, changed: Callable[[bytes], bytes]) -> Ite
             return response
 
         ours = {"process_request": access.controlled(respond), "max_size": MAX_MESSAGE, "logger": quiet}
-        return serve(*given, **named | ours)
+        return serve(*args, **named | ours)
 
     websocket_server.serve = serve_controlled
     try:
@@ -152,7 +152,7 @@ def _page_headers(page: bytes, host: str) -> dict[str, str]:
 def _free_port(host: str, port: int) -> int:
     """`port`, or the next one that is free on `host`. Raises NeecoError for a host or port that cannot be."""
     if not 0 < port < 65536:
-        raise NeecoError(f"--port: {port} is no port; give 1 to 65535")
+        raise NeecoError(f"--port: must be 1 to 65535 (got {port})")
     last: Exception = OSError()
     for candidate in range(port, min(port + MAX_PORTS, 65536)):
         try:

@@ -22,8 +22,8 @@ from neeco.synthesis.states import JointRange, interpolate_pose, joint_ranges, t
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene
 
-MARGIN = 0.2  # of the recorded range, by which a slider goes further where the capture states no limits
-STILL = math.radians(1.0)  # half of the range of a joint that never moved
+MARGIN = 0.2  # extension of a slider, as a share of the recorded range, where the capture states no limits
+STILL = math.radians(1.0)  # half of the range, in rad, of the slider of a joint that never moved
 
 
 @dataclass(frozen=True)
@@ -98,9 +98,9 @@ def shafts_of(scene: DrawableScene) -> dict[str, Shaft]:
     if not is_gaussian(scene) or not scene.recorded.states:
         return {item.name: Shaft(np.zeros(3), np.array([0.0, 0.0, 1.0]), False) for item in scene.instruments}
     with torch.no_grad():
-        known = scene.keypoints(scene.recorded.states[0])
+        keypoints = scene.keypoints(scene.recorded.states[0])
     return {
-        name: Shaft(end, along, {"shaft_far", "shaft_near"} <= set(known.get(name, ())))
+        name: Shaft(end, along, {"shaft_far", "shaft_near"} <= set(keypoints.get(name, ())))
         for name, (end, along) in instrument_axes(scene).items()
     }
 
@@ -108,17 +108,17 @@ def shafts_of(scene: DrawableScene) -> dict[str, Shaft]:
 def slider_ranges(instruments: Sequence[Instrument], states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
     """Range of the slider of each (instrument, joint), in rad: the capture's limits, or a little beyond what was
     recorded where it states none."""
-    found = {}
+    ranges = {}
     for (name, joint), recorded in joint_ranges(states).items():
         limits = next((item.joints.get(joint) for item in instruments if item.name == name), None)
         if limits is not None and all(map(math.isfinite, limits)) and limits[0] < limits[1]:
-            found[name, joint] = JointRange(*limits)
+            ranges[name, joint] = JointRange(*limits)
             continue
         if recorded.upper - recorded.lower < 2 * STILL:
             middle = (recorded.upper + recorded.lower) / 2
             recorded = JointRange(middle - STILL, middle + STILL)
-        found[name, joint] = recorded.widened(MARGIN, None)
-    return found
+        ranges[name, joint] = recorded.widened(MARGIN, None)
+    return ranges
 
 
 def _moved(recorded: InstrumentState, shaft: Shaft, controls: InstrumentControls) -> InstrumentState:

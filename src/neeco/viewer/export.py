@@ -47,11 +47,11 @@ MAX_DEGREE = 3
 class ExportSettings:
     """Limits of what an exported page holds."""
 
-    embedded_degree: int = 1  # in a report: half the size, and for a first look
-    max_instruments: int = 8  # that the page's rasteriser has room for
-    max_axes: int = 8  # of one instrument
-    max_labels: int = 32  # that the page's rasteriser has room for
-    thinnest_mm: float = 0.01  # thinner than any pixel
+    embedded_degree: int = 1  # degree of the harmonics in a report: half the size, and for a first look
+    max_instruments: int = 8  # limit on the instruments: the page's rasteriser has room for these
+    max_axes: int = 8  # limit on the axes of one instrument
+    max_labels: int = 32  # limit on the labels: the page's rasteriser has room for these
+    thinnest_mm: float = 0.01  # least thickness of a Gaussian in mm, below any pixel
     position_steps: int = 2**20 - 1  # of a body's box: 2**16 change the order in depth of neighbours, which costs 5 dB
 
 
@@ -68,7 +68,7 @@ def export_page(run: Path, output: Path, sh_degree: int, device: torch.device) -
     method asks a network for every state, and where the file cannot be written.
     """
     if not 0 <= sh_degree <= MAX_DEGREE:
-        raise NeecoError(f"--sh: {sh_degree} is no degree of harmonics; give 0 to {MAX_DEGREE}")
+        raise NeecoError(f"--sh: must be 0 to {MAX_DEGREE} (got {sh_degree})")
     trained = load_run(run, device)
     page = page_of_run(trained, sh_degree)
     write_text(Path(output), page)
@@ -153,13 +153,13 @@ def why_not(scene: DrawableScene) -> str | None:
             "look at it with `neeco view RUN`, or export a run of method kinematic or 3dgs"
         )
     most_axes = max((len(axes) for axes in motion.axes), default=0)
-    for name, found, most in (
+    for name, count, most in (
         ("instruments", len(scene.instruments), EXPORT.max_instruments),
         ("axes of an instrument", most_axes, EXPORT.max_axes),
         ("labels", len(scene.label_names), EXPORT.max_labels),
     ):
-        if found > most:
-            return f"{found} {name}: a page has room for {most}; look at it with `neeco view RUN`"
+        if count > most:
+            return f"{count} {name}: a page has room for {most}; look at it with `neeco view RUN`"
     return None
 
 
@@ -263,7 +263,7 @@ def _instruments(scene: GaussianScene, motion: ArticulatedMotion) -> list[dict[s
     if not motion.axes:
         return []
     shafts, ranges = shafts_of(scene), slider_ranges(scene.instruments, scene.recorded.states)
-    found = []
+    instruments = []
     for instrument, axes in zip(scene.instruments, motion.axes, strict=False):
         names, joints = list(instrument.joints), []
         for name in names:
@@ -273,7 +273,7 @@ def _instruments(scene: GaussianScene, motion: ArticulatedMotion) -> list[dict[s
         shaft = shafts[instrument.name]
         side, up, _ = frame_about(shaft.along).T
         vectors = {"end": shaft.end, "along": shaft.along, "side": side, "up": up}
-        found.append(
+        instruments.append(
             {
                 "name": instrument.name,
                 "shaft": {name: vector.tolist() for name, vector in vectors.items()},
@@ -289,7 +289,7 @@ def _instruments(scene: GaussianScene, motion: ArticulatedMotion) -> list[dict[s
                 ],
             }
         )
-    return found
+    return instruments
 
 
 def _recorded(scene: GaussianScene, motion: ArticulatedMotion) -> dict[str, Any]:

@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 class PanelSettings:
     """Settings of the panel's sliders and plots."""
 
-    slide_mm: float = 30.0  # of the sliders of position, to either side
-    yaw_deg: float = 45.0  # of the sliders of yaw and pitch, to either side
-    plots_every_s: float = 0.5  # while more becomes known
-    plot_height: int = 140  # px
-    line: int = 80  # characters of a name or message that are shown
+    slide_mm: float = 30.0  # range in mm of the sliders of position, to either side
+    yaw_deg: float = 45.0  # range in degrees of the sliders of yaw and pitch, to either side
+    plots_every_s: float = 0.5  # s between two plots, while more becomes known
+    plot_height: int = 140  # height of the plot in px
+    line: int = 80  # limit on the characters of a name or message
 
 
 PANEL = PanelSettings()
@@ -88,11 +88,11 @@ class Panel:
             return
         self._plotted, self._plotted_at = so_far, now
         names, splits = self._loaded.recorded.names, self._loaded.recorded.splits
-        known, psnr = timeline.known, timeline.psnr
+        scored, psnr = timeline.known, timeline.psnr
         # the names differ where the run has changed, and this panel not yet
-        if timeline.loaded.recorded.names != names or len(known) < 2:
+        if timeline.loaded.recorded.names != names or len(scored) < 2:
             return
-        self._draw_plot((known.astype(np.float64), psnr[known]))
+        self._draw_plot((scored.astype(np.float64), psnr[scored]))
         if self.worst.value == NONE_CHOSEN:
             self._worst = timeline.worst()
             options = [f"{frame}: {psnr[frame]:.1f} dB, {splits[frame]}, {names[frame]}" for frame in self._worst]
@@ -260,9 +260,9 @@ class InstrumentPanel:
         if self._joints_as_recorded:
             for joint, slider in self._joints.items():
                 on_step = round(state.joints[joint] * self._per_unit[joint] / slider.step) * slider.step
-                shown = min(max(round(on_step, 6), slider.min), slider.max)
-                if shown != slider.value:
-                    slider.value = shown
+                value = min(max(round(on_step, 6), slider.min), slider.max)
+                if value != slider.value:
+                    slider.value = value
 
     def straighten(self) -> None:
         """Reset slide and turns to zero: the instrument's present pose becomes their starting point."""
@@ -270,7 +270,7 @@ class InstrumentPanel:
             slider.value = 0.0
 
     def reset(self) -> None:
-        """Be as recorded again."""
+        """Reset all sliders to the recorded state."""
         self.straighten()
         self._joints_as_recorded = True
         if self.gizmo.value:
@@ -306,27 +306,27 @@ def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: flo
     )
 
 
-def status_html(shown: RunPicture, seconds: float, note: str) -> str:
+def status_html(rendered: RunPicture, seconds: float, note: str) -> str:
     """HTML of the status: what is shown, how well, how fast. seconds: of the rendering; note: what else is to be
     known."""
-    loaded, scene = shown.loaded, shown.loaded.scene
-    frame = min(max(round(shown.frame), 0), len(loaded.recorded.names) - 1)
+    loaded, scene = rendered.loaded, rendered.loaded.scene
+    frame = min(max(round(rendered.frame), 0), len(loaded.recorded.names) - 1)
     count = "no Gaussians" if scene.num_gaussians is None else f"{scene.num_gaussians:,} Gaussians"
     training = [] if loaded.iteration is None else [f"iteration {loaded.iteration:,}, still training"]
-    place = f"{shown.frame:g} ({_text(loaded.recorded.names[frame])}, {_text(loaded.recorded.splits[frame])})"
+    place = f"{rendered.frame:g} ({_text(loaded.recorded.names[frame])}, {_text(loaded.recorded.splits[frame])})"
     lines = [
         f"<b>{_text(loaded.name)}</b>",
         " · ".join([_text(scene.method), count, *training]),
-        f"frame {place}" + ("" if shown.exact else ", steered or between frames"),
+        f"frame {place}" + ("" if rendered.exact else ", steered or between frames"),
     ]
-    if shown.score is not None:
-        overlap = "" if shown.score.iou is None else f" · IoU {shown.score.iou:.3f}"
-        lines.append(f"PSNR {shown.score.psnr:.2f} dB{overlap}")
+    if rendered.score is not None:
+        overlap = "" if rendered.score.iou is None else f" · IoU {rendered.score.iou:.3f}"
+        lines.append(f"PSNR {rendered.score.psnr:.2f} dB{overlap}")
     if loaded.recorded.still:
         lines.append("still scope: views far from the recorded one show what no frame saw")
-    if shown.trouble:
-        lines.append(_text(shown.trouble, 3 * PANEL.line))
-    height, width = shown.picture.depth.shape
+    if rendered.trouble:
+        lines.append(_text(rendered.trouble, 3 * PANEL.line))
+    height, width = rendered.picture.depth.shape
     lines.append(f"{seconds * 1e3:.0f} ms at {width} × {height}")
     return _block([*lines, _text(note, 3 * PANEL.line)] if note else lines)
 

@@ -52,12 +52,12 @@ QUESTIONS: dict[str, dict[str, Any]] = {"overview": {}, "frame": {"index": int},
 class PictureSettings:
     """Pictures of a frame along the shaft."""
 
-    before: float = 0.6  # of the working length, shown before the shaft's end
-    beyond: float = 1.4  # and beyond it
-    aside: float = 0.65  # and to either side
-    width: int = 1000  # px
-    thumbnail_width: int = 160  # px
-    ghost_width: int = 500  # px
+    before: float = 0.6  # length before the shaft's end, as a share of the working length
+    beyond: float = 1.4  # length beyond the shaft's end, as that share
+    aside: float = 0.65  # width to either side, as that share
+    width: int = 1000  # width of a picture in px
+    thumbnail_width: int = 160  # width of a thumbnail in px
+    ghost_width: int = 500  # width of a ghost in px
     jpeg_quality: int = 90
     joint_range_deg: tuple[float, float] = (0.0, 120.0)  # of a slider, where the capture states no limits
 
@@ -140,8 +140,8 @@ class PosingServer:
             if not ask:
                 body, kind = page(), "text/html; charset=utf-8"
             elif ask in IMAGES:
-                given = json.loads(unquote(fields))
-                asked = given | {"ask": ask} if isinstance(given, dict) else given
+                message = json.loads(unquote(fields))
+                asked = message | {"ask": ask} if isinstance(message, dict) else message
                 body, kind = self._image(*self._question(asked, IMAGES))
             else:
                 status, body = HTTPStatus.NOT_FOUND, b"neeco view: no such page\n"
@@ -154,13 +154,13 @@ class PosingServer:
             response.headers[name] = value
         return response
 
-    def _question(self, message: Any, known: Mapping[str, dict[str, Any]]) -> tuple[str, str, dict[str, Any]]:
-        """Return what of the `known` is asked, of which instrument, and its fields. Raises NeecoError."""
+    def _question(self, message: Any, questions: Mapping[str, dict[str, Any]]) -> tuple[str, str, dict[str, Any]]:
+        """Return what of the `questions` is asked, of which instrument, and its fields. Raises NeecoError."""
         remedy = "reload the page"
         ask = require_like(message, {"ask": str}, "page", remedy)["ask"]
-        if ask not in known:
+        if ask not in questions:
             raise NeecoError(f"page: ask: {ask!r} is unknown; {remedy}")
-        question = require_like(message, {"ask": str, "instrument": str, **known[ask]}, "page", remedy)
+        question = require_like(message, {"ask": str, "instrument": str, **questions[ask]}, "page", remedy)
         instrument = question["instrument"] or next(iter(self._posings))
         self._posing(instrument, question.get("index", 0))
         return ask, instrument, question
@@ -208,10 +208,10 @@ class PosingServer:
         """Take the last answer for an instrument out again; the overview, and under `frame` what it was of."""
         with self._lock, self._own_capture():
             answers = read_answers(self.posed.root)
-            own = [position for position, answer in enumerate(answers) if answer.instrument == instrument]
-            if not own:
+            positions = [position for position, answer in enumerate(answers) if answer.instrument == instrument]
+            if not positions:
                 return self._overview(instrument) | {"frame": None}
-            removed = answers.pop(own[-1])
+            removed = answers.pop(positions[-1])
             self._keep(answers)
             return self._overview(instrument) | {"frame": self.posed.frames.index(removed.frame)}
 

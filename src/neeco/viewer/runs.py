@@ -39,12 +39,12 @@ SCENE_FILE = "scene.safetensors"
 class RunViewSettings:
     """Settings of the view of a run."""
 
-    assumed_mm: float = 100.0  # from a camera to what it looks at, where no camera looks at the scene's centre
-    distance_units: float = 10.0  # viser's units of length, from a recorded camera to what it looks at
-    watch_s: float = 2.0  # between two checks of the run folder
-    timeline_width: int = 320  # px at most of the images that a timeline compares
-    field_width: int = 48  # px, of a radiance field's, which take a hundred times as long
-    worst: int = 8  # frames that a timeline lists
+    assumed_mm: float = 100.0  # distance in mm from a camera to what it sees, where none looks at the scene's centre
+    distance_units: float = 10.0  # distance from a recorded camera to what it looks at, in viser's units of length
+    watch_s: float = 2.0  # s between two checks of the run folder
+    timeline_width: int = 320  # limit on the width in px of the images that a timeline compares
+    field_width: int = 48  # the same limit for a radiance field, which takes a hundred times as long
+    worst: int = 8  # number of frames that a timeline lists
 
 
 VIEW = RunViewSettings()
@@ -156,15 +156,14 @@ class ViewedRun:
         read_config(self.path)
         for file in (self.path / SCENE_FILE, checkpoint_path(self.path)):
             try:
-                found = file.stat()
+                status = file.stat()
             except FileNotFoundError:
                 continue
             except OSError as error:
                 raise NeecoError(f"{file}: cannot read: {error.strerror or error}") from error
-            return str(file), found.st_ino, found.st_mtime_ns, found.st_size
+            return str(file), status.st_ino, status.st_mtime_ns, status.st_size
         raise NeecoError(
-            f"{self.path}: nothing to look at yet: neither a finished scene nor a checkpoint; "
-            "wait until `neeco train` has written one"
+            f"{self.path}: has neither a finished scene nor a checkpoint yet; wait until `neeco train` has written one"
         )
 
     def _load(self) -> LoadedRun:
@@ -181,12 +180,12 @@ class ViewedRun:
         if capture is not None:
             capture = scene.recorded.completed(capture, scene.instruments)
         if not scene.recorded.states and capture is None:
-            raise NeecoError(f"{self.path}: the scene remembers no frames, and its capture is gone; train again")
+            raise NeecoError(f"{self.path}: the scene holds no frames, and its capture is missing; train again")
         frames = () if capture is None else capture.frames
-        known = scene.recorded if capture is None else Recorded.of(frames, scene.instruments)
-        order = np.argsort([state.time for state in known.states], kind="stable")
+        source = scene.recorded if capture is None else Recorded.of(frames, scene.instruments)
+        order = np.argsort([state.time for state in source.states], kind="stable")
         names, splits, states, cameras = (
-            tuple(column[k] for k in order) for column in (known.names, known.splits, known.states, known.cameras)
+            tuple(column[k] for k in order) for column in (source.names, source.splits, source.states, source.cameras)
         )
         return LoadedRun(
             name=self.path.resolve().name,
@@ -260,9 +259,9 @@ class Timeline:
 
     def worst(self) -> list[int]:
         """The worst known frames, worst first; of similar neighbours only the worst."""
-        known, apart = self.known, max(1, len(self.psnr) // (4 * VIEW.worst))
+        frames, apart = self.known, max(1, len(self.psnr) // (4 * VIEW.worst))
         chosen: list[int] = []
-        for frame in known[np.argsort(self.psnr[known], kind="stable")].tolist():
+        for frame in frames[np.argsort(self.psnr[frames], kind="stable")].tolist():
             if all(abs(frame - other) >= apart for other in chosen):
                 chosen.append(frame)
         return chosen[: VIEW.worst]

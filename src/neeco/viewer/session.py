@@ -32,18 +32,18 @@ if TYPE_CHECKING:
 class ViewerSettings:
     """Settings of what a viewer renders, and when."""
 
-    settled_s: float = 0.15  # without a request: what is shown stands still and is rendered sharp
-    idle_s: float = 0.5  # at most, between two looks for something to render
-    moving_px: int = 256  # high, at most
-    sharp_px: int = 720  # high, at most, of a sharp rendering
-    min_px: int = 32  # high, at least
-    moving_s: float = 0.15  # that rendering may take while something moves
-    sharp_s: float = 0.4  # that a sharp rendering may take
-    remembered: int = 3  # renderings; a single one that had to compute something first does not count
-    jpeg_moving: int = 80  # quality while something moves
-    jpeg_sharp: int = 92  # quality of a sharp rendering
-    played_per_s: float = 10.0  # frames of `play`
-    status_every_s: float = 0.25  # while things move
+    settled_s: float = 0.15  # s without a request after which the picture stands still and is rendered sharp
+    idle_s: float = 0.5  # limit on the s between two looks for something to render
+    moving_px: int = 256  # limit on the height in px while something moves
+    sharp_px: int = 720  # limit on the height in px of a sharp rendering
+    min_px: int = 32  # least height in px
+    moving_s: float = 0.15  # limit on the s of a rendering while something moves
+    sharp_s: float = 0.4  # limit on the s of a sharp rendering
+    remembered: int = 3  # number of timed renderings; a single one that computed something first does not count
+    jpeg_moving: int = 80  # JPEG quality while something moves
+    jpeg_sharp: int = 92  # JPEG quality of a sharp rendering
+    played_per_s: float = 10.0  # frames a second of `play`
+    status_every_s: float = 0.25  # s between two updates of the status while things move
 
 
 VIEWER = ViewerSettings()
@@ -236,15 +236,15 @@ class ClientSession:
         height = self._resolution.height(sharp, window.image_height, aspect_of(window))
         camera = browser_camera(window, self._run.unit, height)
         try:
-            shown = render_run(self._run, controls, camera, self._panel.view.value)
+            rendered = render_run(self._run, controls, camera, self._panel.view.value)
         except NeecoError as error:
             self._panel.status.content = message_html(str(error))
             return
         seconds = time.perf_counter() - began
-        self._resolution.record(seconds, shown.picture.depth.size)
+        self._resolution.record(seconds, rendered.picture.depth.size)
         if self._connected():
-            self._send(shown.picture, sharp)
-            self._show_status(shown, seconds, sharp)
+            self._send(rendered.picture, sharp)
+            self._show_status(rendered, seconds, sharp)
 
     def tick(self, now: float) -> float | None:
         """Let the recording play on, and show what is newly known of its frames. now: of time.perf_counter(); returns
@@ -368,15 +368,15 @@ class ClientSession:
         self._client.scene.set_background_image(picture.pixels, format="jpeg", jpeg_quality=quality, depth=depth)
         self._client.flush()
 
-    def _show_status(self, shown: RunPicture, seconds: float, sharp: bool) -> None:
+    def _show_status(self, rendered: RunPicture, seconds: float, sharp: bool) -> None:
         now = time.perf_counter()
         if not sharp and now - self.status_at < VIEWER.status_every_s:
             return
         self.status_at = now
-        notes = [shown.note] if shown.note else []
+        notes = [rendered.note] if rendered.note else []
         if sharp:  # else things move on before the numbers are read
             try:
-                shown = scored(shown)
+                rendered = scored(rendered)
             except NeecoError as error:
                 notes.append(str(error))
-        self._panel.status.content = status_html(shown, seconds, "; ".join(notes))
+        self._panel.status.content = status_html(rendered, seconds, "; ".join(notes))

@@ -32,8 +32,8 @@ LABELLED = (OVERLAY, PARTS)
 ONLY_RECORDED = "difference: only of a recorded state from its camera; press “go to this frame's camera”"
 
 UNOBSERVED_COLOR = np.array([255.0, 0.0, 255.0])  # nothing inside a body has it
-DEPTH_PERCENTILES = 2, 98  # that are white and black
-DIMMED = 0.35  # of its light is left of what cannot be compared
+DEPTH_PERCENTILES = 2, 98  # percentiles of the depth that are white and black
+DIMMED = 0.35  # share of the light left to what cannot be compared
 
 
 @dataclass(frozen=True)
@@ -109,9 +109,9 @@ def difference(scene: DrawableScene, state: State, recorded_by: Camera, image: n
     return Picture(pixels, np.where(inside, surface_depth(rendering)[rows, columns], 0.0))
 
 
-def dimmed(shown: Picture) -> Picture:
+def dimmed(original: Picture) -> Picture:
     """Darken a picture that is not the requested one."""
-    return replace(shown, pixels=to_uint8(shown.pixels * DIMMED))
+    return replace(original, pixels=to_uint8(original.pixels * DIMMED))
 
 
 def render_run(run: ViewedRun, controls: Controls, camera: Camera, view: str) -> RunPicture:
@@ -124,29 +124,29 @@ def render_run(run: ViewedRun, controls: Controls, camera: Camera, view: str) ->
     with scene.torch_threads(), readable_failures():
         if view == DIFFERENCE and frame is not None and as_recorded and loaded.frames:
             image = loaded.frames[frame].load_image().numpy()
-            shown = difference(scene, state, loaded.recorded.cameras[frame], image, camera)
+            rendered = difference(scene, state, loaded.recorded.cameras[frame], image, camera)
         elif view in views_of(scene, False):
-            shown = picture(scene, state, camera, view, loaded.labels)
+            rendered = picture(scene, state, camera, view, loaded.labels)
         else:
-            shown = dimmed(picture(scene, state, camera, IMAGE))
+            rendered = dimmed(picture(scene, state, camera, IMAGE))
             note = ONLY_RECORDED if view == DIFFERENCE else f"{view}: a scene of method {scene.method} has none"
     return RunPicture(
         loaded=loaded,
-        picture=shown,
+        picture=rendered,
         frame=controls.frame,
         exact=frame is not None,
         seen_as_recorded=as_recorded,
-        note=note or shown.note,
+        note=note or rendered.note,
         trouble=run.trouble or loaded.trouble,
     )
 
 
-def scored(shown: RunPicture) -> RunPicture:
+def scored(rendered: RunPicture) -> RunPicture:
     """Add the score where the frame is rendered as recorded and its capture is at hand. Raises NeecoError."""
-    if not shown.seen_as_recorded or not shown.loaded.frames:
-        return shown
-    with shown.loaded.scene.torch_threads():
-        return replace(shown, score=score_frame(shown.loaded, int(shown.frame)))
+    if not rendered.seen_as_recorded or not rendered.loaded.frames:
+        return rendered
+    with rendered.loaded.scene.torch_threads():
+        return replace(rendered, score=score_frame(rendered.loaded, int(rendered.frame)))
 
 
 def _rendering(scene: DrawableScene, state: State, camera: Camera, view: str, labels: Tensor | None) -> Rendering:

@@ -378,12 +378,12 @@ def test_what_cannot_be_done_is_refused(spec: DownstreamSettings, change, told: 
 @pytest.mark.parametrize("name", ["real", "paste", "a+b", "", "../up"])
 def test_names_that_mean_something_or_stand_twice_are_refused(name, spec, capture):
     data = replace(spec.sets[0], name=name)
-    with refused(f"--sets {name}: conditions and folders go by this name"):
+    with refused(f"--sets {name}: reserved, not usable in file names, or given twice"):
         plan_downstream(replace(replace(spec, conditions=None), sets=(data,)))
-    with refused("--sets kin: ", "give each set one of its own"):
+    with refused("--sets kin: ", "choose another name"):
         plan_downstream(replace(spec, sets=spec.sets * 2))
     for test in ("test", "a/b", ""):
-        with refused(f"--test {test}: ", "results go by this name", "name it"):
+        with refused(f"--test {test}: ", "is a split's name or no file name", "choose another"):
             plan_downstream(replace(spec, tests={test: capture}))
 
 
@@ -423,7 +423,7 @@ def test_labels_of_ones_own_are_taught_and_the_truth_is_tested(spec, tmp_path, r
 def test_a_model_that_lacks_something_or_sees_too_little_is_refused(spec, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Pixels, "is_too_small", classmethod(lambda cls, size: size[0] < 48))
     plan_downstream(spec)
-    with refused("--models pixels: it would see images of 24x16 px, too small for it; give a larger --size"):
+    with refused("--models pixels: its input of 24x16 px is too small; give a larger --size"):
         plan_downstream(replace(spec, size=24))
     monkeypatch.setattr(Pixels, "missing_requirement", classmethod(lambda cls: "needs patience; pip install patience"))
     with refused("--models pixels: needs patience; pip install patience"):

@@ -149,7 +149,7 @@ def test_an_image_of_another_size_is_refused_wherever_it_stands(drawn: Path) -> 
 def test_a_set_is_read_from_its_own_folder_alone(linked: str, drawn: Path, tmp_path: Path) -> None:
     (drawn / linked).rename(tmp_path / "elsewhere")
     (drawn / linked).symlink_to(tmp_path / "elsewhere")
-    with refused(linked, "a link leads out of"):
+    with refused(linked, "a symbolic link leads out of"):
         loaded(drawn)
 
 

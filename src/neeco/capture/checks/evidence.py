@@ -67,10 +67,10 @@ class CameraArrays:
     def of(cls, cameras: Sequence[Camera], sizes: Sequence[tuple[int, int]] | None = None) -> CameraArrays:
         """Arrays of cameras; sizes: of their images where these are resized, (width, height)."""
         stored = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
-        found = stored if sizes is None else np.array(sizes, dtype=np.float64)
+        image_sizes = stored if sizes is None else np.array(sizes, dtype=np.float64)
         intrinsics = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras])
         poses = np.stack([camera.world_from_camera.double().numpy() for camera in cameras])
-        return cls(poses, intrinsics * np.tile(found / stored, 2), found)
+        return cls(poses, intrinsics * np.tile(image_sizes / stored, 2), image_sizes)
 
     @property
     def centers(self) -> np.ndarray:
@@ -152,16 +152,16 @@ class ColorEvidence:
             cameras = replace(cameras, poses=poses)
         u, v, inside = cameras[np.arange(len(self.rows))[few]].project(self.points, pixels)
         observed = np.stack([_sample(gray, *place) for gray, *place in zip(self.grays[few], u, v, inside, strict=True)])
-        observed, own = (
+        observed, color = (
             self._relative(values, inside, coarse) for values in (observed, np.tile(self.brightness, (len(u), 1)))
         )
         near = inside[:, self.neighbours[:, : SETTINGS.neighbours]].sum(-1)
         counted = inside & (near >= SETTINGS.neighbours // 2)
         count = counted.sum(1)
         weights = counted / np.maximum(count, 1)[:, None]
-        observed, own = (values - (values * weights).sum(1, keepdims=True) for values in (observed, own))
+        observed, color = (values - (values * weights).sum(1, keepdims=True) for values in (observed, color))
         covariance, observed_variance, own_variance = (
-            (one * other * weights).sum(1) for one, other in ((observed, own), (observed, observed), (own, own))
+            (one * other * weights).sum(1) for one, other in ((observed, color), (observed, observed), (color, color))
         )
         correlation = covariance / np.sqrt((observed_variance * own_variance).clip(1e-9))
         correlation[count < SETTINGS.min_points] = 0.0
@@ -217,12 +217,12 @@ class MotionEvidence:
         size = self.width, self.height
         cameras = CameraArrays.of([parsed.frames[row].camera for row in rows], [size] * len(rows))
         depths = in_threads(partial(self._tissue_depth, cameras, points), range(len(rows)))
-        known = np.array([index for index, depth in enumerate(depths) if depth is not None], int)
-        self.rows, self.cameras = rows[known], cameras[known]  # [F]
+        valid = np.array([index for index, depth in enumerate(depths) if depth is not None], int)
+        self.rows, self.cameras = rows[valid], cameras[valid]  # [F]
         self.ray_views = np.zeros(0, int)  # [R] index of each ray's frame
-        if len(known) < SETTINGS.min_frames:
+        if len(valid) < SETTINGS.min_frames:
             return
-        self.depths = np.array([depths[index] for index in known])  # [F, h, w] mm
+        self.depths = np.array([depths[index] for index in valid])  # [F, h, w] mm
         images, masks = [], []
         for row in self.rows:
             image, mask = pictures[row].image, pictures[row].mask
@@ -231,18 +231,18 @@ class MotionEvidence:
             masks.append(np.ones(size[::-1], np.float32) if mask is None else resized(mask, size))
         find = partial(self._difference, np.stack(images).astype(np.float32), np.stack(masks))
         low, high = SETTINGS.difference
-        differences = in_threads(find, range(len(known)))
+        differences = in_threads(find, range(len(valid)))
         # [F, h, w] confidence in [0, 1] that a pixel moves
         moving = np.stack([cv2.blur(((pixels - low) / (high - low)).clip(0, 1), (3, 3)) for pixels in differences])
         self._choose_rays(moving)
         # what moves everywhere or always is no evidence; nor is what lies outside, in a border of one pixel
         evidence = np.pad((moving - moving.mean(0)).astype(np.float32), ((0, 0), (1, 1), (1, 1)))
-        self._evidence, self._first = evidence.ravel(), np.arange(len(known), dtype=np.int32) * evidence[0].size
+        self._evidence, self._first = evidence.ravel(), np.arange(len(valid), dtype=np.int32) * evidence[0].size
 
     def _tissue_depth(self, cameras: CameraArrays, points: np.ndarray, index: int) -> np.ndarray | None:
         """Depth [h, w] mm interpolated between the points [P, 3] in a camera's view; None where these are too few."""
         camera = cameras[np.array([index])]
-        u, v, inside = (found[0] for found in camera.project(points[None]))
+        u, v, inside = (values[0] for values in camera.project(points[None]))
         if inside.sum() < SETTINGS.depth_points:
             return None
         depth = ((points[inside] - camera.centers) @ camera.poses[0, :3, 2]).astype(np.float64)
@@ -253,7 +253,7 @@ class MotionEvidence:
         coarse = weights.sum(-1) / (weights / depth[near]).sum(-1)
         return np.asarray(cv2.resize(coarse.astype(np.float32), (self.width, self.height)))
 
-    def _difference(self, images: np.ndarray, shown: np.ndarray, index: int) -> np.ndarray:
+    def _difference(self, images: np.ndarray, masks: np.ndarray, index: int) -> np.ndarray:
         """Difference [h, w] of 255 of one of images [F, h, w, 3] from what others predict of the still scene, less
         what a shift by one pixel explains; 0 where too few observe the place, or masks [F, h, w] hide it."""
         image, pose, depth = images[index], self.cameras.poses[index], self.depths[index]
@@ -267,16 +267,16 @@ class MotionEvidence:
             fx, fy, cx, cy = self.cameras.intrinsics[other]
             x, y = (place.astype(np.float32) - 0.5 for place in project(local, fx, fy, cx, cy, MIN_DEPTH))
             warped = cv2.remap(images[other], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            visible = cv2.remap(shown[other], x, y, cv2.INTER_LINEAR, borderValue=0) > 0.9
+            visible = cv2.remap(masks[other], x, y, cv2.INTER_LINEAR, borderValue=0) > 0.9
             predictions.append(np.where(visible[..., None], warped, image))
             observed += visible
         predicted = np.median(predictions, axis=0)
-        known = (observed >= 3) & (shown[index] > 0.9)
-        if known.any():  # the camera's exposure and white balance may have changed
-            predicted = predicted * np.median(image[known] / predicted[known].clip(1), axis=0)
+        valid = (observed >= 3) & (masks[index] > 0.9)
+        if valid.any():  # the camera's exposure and white balance may have changed
+            predicted = predicted * np.median(image[valid] / predicted[valid].clip(1), axis=0)
         below = cv2.erode(predicted, np.ones((3, 3))) - image
         above = image - cv2.dilate(predicted, np.ones((3, 3)))
-        return np.where(known, np.maximum(below, above).clip(0).max(-1), 0.0)
+        return np.where(valid, np.maximum(below, above).clip(0).max(-1), 0.0)
 
     def _neighbours(self, index: int) -> list[int]:
         """Frames whose cameras are near that of `index`, spread over the time that they span."""
@@ -311,9 +311,9 @@ class MotionEvidence:
 
     def with_recorded(self, poses: np.ndarray) -> MotionEvidence:
         """The same for an instrument whose recorded poses are these, [F, 4, 4]."""
-        own = self._subset(slice(None))
-        own.recorded, own.thinned = own.evidence(poses), own._subset(slice(None, None, 4), slice(None, None, 2))
-        return own
+        rays = self._subset(slice(None))
+        rays.recorded, rays.thinned = rays.evidence(poses), rays._subset(slice(None, None, 4), slice(None, None, 2))
+        return rays
 
     def without(self, others: list[np.ndarray], poses: np.ndarray) -> MotionEvidence | None:
         """The rays but those that poses of other instruments, each [F, 4, 4], explain, and better than `poses` do:
@@ -321,8 +321,8 @@ class MotionEvidence:
         if not others:
             return self
         everywhere = np.ones(len(poses), dtype=bool)
-        own, *theirs = (self.explained(self.evidence(one), everywhere) for one in (poses, *others))
-        rest = np.max(theirs, axis=0) <= np.maximum(own, SETTINGS.min_ray_evidence)
+        explained, *theirs = (self.explained(self.evidence(one), everywhere) for one in (poses, *others))
+        rest = np.max(theirs, axis=0) <= np.maximum(explained, SETTINGS.min_ray_evidence)
         return self._subset(rest) if self.enough(self.ray_views[rest]) else None
 
     def _subset(self, rays: np.ndarray | slice, depths: slice = slice(None)) -> MotionEvidence:
@@ -351,9 +351,9 @@ class MotionEvidence:
     def explained(self, evidence: np.ndarray, counts: np.ndarray) -> np.ndarray:
         """[R] mean evidence at each ray's best depth, over the other frames that count [F]."""
         weights = counts.astype(np.float32)
-        own = weights[self.ray_views][:, None]  # a ray is no evidence in its own frame
-        sums = evidence @ weights - own * evidence[np.arange(len(evidence)), :, self.ray_views]
-        return np.asarray((sums / (weights.sum() - own).clip(1)).max(1))
+        excluded = weights[self.ray_views][:, None]  # a ray is no evidence in its own frame
+        sums = evidence @ weights - excluded * evidence[np.arange(len(evidence)), :, self.ray_views]
+        return np.asarray((sums / (weights.sum() - excluded).clip(1)).max(1))
 
     def mean(self, poses: np.ndarray, available: np.ndarray | None = None) -> float:
         """Mean evidence of poses [F, 4, 4], over the rays that they explain best and the frames they are of [F]."""
@@ -367,11 +367,11 @@ class MotionEvidence:
     def by_chance(self, poses: np.ndarray, available: np.ndarray | None = None) -> float:
         """Mean evidence of poses [F, 4, 4] in random order: the instrument where it usually is, at other times."""
         rows = np.arange(len(poses)) if available is None else np.flatnonzero(available)
-        generator, shuffled, found = np.random.default_rng(0), poses.copy(), []
+        generator, shuffled, means = np.random.default_rng(0), poses.copy(), []
         for _ in range(SETTINGS.shuffles):
             shuffled[rows] = poses[generator.permutation(rows)]
-            found.append(self.mean(shuffled, available))
-        return float(np.mean(found))
+            means.append(self.mean(shuffled, available))
+        return float(np.mean(means))
 
     def travel(self, poses: np.ndarray) -> float:
         """Median over the rays of the standard deviation, of the image's width, by which their points move over all
@@ -396,14 +396,14 @@ class MotionEvidence:
         counts = available[self.ray_views]
         if not self.enough(self.ray_views[counts]) or available.sum() < candidate.margin.min_frames:
             return 0.0, 0.0, 0.0
-        other, own = (self.explained(one, available)[counts] for one in (self.evidence(poses), self.recorded))
-        best, change = np.maximum(other, own), np.abs(other - own)
+        other, recorded = (self.explained(one, available)[counts] for one in (self.evidence(poses), self.recorded))
+        best, change = np.maximum(other, recorded), np.abs(other - recorded)
         compared = best >= np.quantile(best, 1 - SETTINGS.compared_rays)
         agreement, above = float(other[compared].mean()), best > SETTINGS.min_ray_evidence
         if candidate.kind == "rotation" and above.any():
             compared = above & (change >= np.median(change[above]))
         if agreement < SETTINGS.named_by_chance * self.thinned.by_chance(poses, available):
             return 0.0, 0.0, 0.0
-        other, own, frames = other[compared], own[compared], self.ray_views[counts][compared]
-        gains = np.array([(other - own)[frames == frame].mean() for frame in np.unique(frames)])
-        return float(other.mean() / max(own.mean(), 1e-9)), gain_certainty(gains), agreement
+        other, recorded, frames = other[compared], recorded[compared], self.ray_views[counts][compared]
+        gains = np.array([(other - recorded)[frames == frame].mean() for frame in np.unique(frames)])
+        return float(other.mean() / max(recorded.mean(), 1e-9)), gain_certainty(gains), agreement

@@ -24,8 +24,8 @@ def check_frames(parsed: Parsed) -> None:
     frames = parsed.header("frames")
     counts = Counter(frame.split for frame in parsed.frames)
     if not counts["train"]:
-        found = ", ".join(f"{printable(name)} ({count})" for name, count in counts.items())
-        frames.error(f"split 'train' is empty; found {found}", "give most frames the split 'train'")
+        splits = ", ".join(f"{printable(name)} ({count})" for name, count in counts.items())
+        frames.error(f"split 'train' is empty; found {splits}", "give most frames the split 'train'")
     elif counts["train"] < SETTINGS.min_train_frames:
         message = f"too few frames: {counts['train']} to train on, at least {SETTINGS.min_train_frames} are needed"
         frames.error(message, "record more")
@@ -43,7 +43,7 @@ def check_frames(parsed: Parsed) -> None:
             parsed.header("camera_motion").error(message, "write 'moving', or correct transform_matrix")
     times = {frame.state.time for frame in parsed.frames}
     if not parsed.timed:
-        frames.warning("not every frame has a time; the order stands in", "add `time` in seconds")
+        frames.warning("not every frame has a time; their order is used instead", "add `time` in seconds")
     elif len(times) == 1 and not all(_is_same(parsed.frames[0], frame) for frame in parsed.frames):
         message = f"every frame has the time {times.pop():g}, though states differ"
         frames.warning(message, "write seconds, or leave `time` out")
@@ -152,29 +152,29 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
         place.error(message, "name the recorded readings under `value`")
         return
     if unknown := [joint for joint in instrument.unrecorded if joint not in tree.readings]:
-        place.error(f"{name}: nothing says what joint {printable(unknown[0])} moves", "name it in its kinematics")
+        place.error(f"{name}: no link uses joint {printable(unknown[0])}", "name it in its kinematics")
     if tree.pose_of is not None and (needed := tree.readings_of(tree.pose_of) & set(instrument.unrecorded)):
         message = f"the pose of {printable(tree.pose_of)} depends on {printable(min(needed))}, which nobody recorded"
         place.error(f"kinematics of {name}: {message}", "record the pose of a link before that joint")
-    known = sorted(set(tree.readings) - set(instrument.unrecorded))
-    states = [state for _, state in parsed.states_of(instrument.name) if set(known) <= set(state.joints)]
+    logged = sorted(set(tree.readings) - set(instrument.unrecorded))
+    states = [state for _, state in parsed.states_of(instrument.name) if set(logged) <= set(state.joints)]
     for link in tree.links:
-        values = [link.joint_value(state.joints) for state in states if set(link.value) <= set(known)]
+        values = [link.joint_value(state.joints) for state in states if set(link.value) <= set(logged)]
         if beyond := [value for value in values if exceeds_limits(value, link.limits)]:
             message = f"joint of link {printable(link.name)} of {name}: {beyond[0]:g} in {len(beyond)} of {len(values)}"
             place.warning(f"{message} frames, outside its limits", "check its gains, offset and limits")
     if len(states) < SETTINGS.min_states:
         return
-    readings = np.array([[state.joints[joint] for joint in known] for state in states])  # [S, R]
+    readings = np.array([[state.joints[joint] for joint in logged] for state in states])  # [S, R]
     readings = readings - readings.mean(0)
-    for index, joint in enumerate(known):
-        own, others = readings[:, index], np.delete(readings, index, 1)
-        if own.std() < MIN_DEVIATION or not others.shape[1]:
+    for index, joint in enumerate(logged):
+        reading, others = readings[:, index], np.delete(readings, index, 1)
+        if reading.std() < MIN_DEVIATION or not others.shape[1]:
             continue
-        explained = 1 - (own - others @ np.linalg.lstsq(others, own, rcond=1e-6)[0]).var() / own.var()
+        explained = 1 - (reading - others @ np.linalg.lstsq(others, reading, rcond=1e-6)[0]).var() / reading.var()
         if explained > SETTINGS.max_explained:
             message = f"joint {printable(joint)} of {name} follows from the others ({explained:.1%} of its variance)"
-            place.warning(message, "move joints one by one, too, or their axes mix")
+            place.warning(message, "also move joints one at a time, to separate their axes")
 
 
 def _check_rolls(parsed: Parsed) -> None:
@@ -196,7 +196,7 @@ def _check_changes(parsed: Parsed) -> None:
             continue
         travels = float(np.ptp(np.stack([state.pose.numpy() for state in states]), axis=0).max()) > MIN_DEVIATION
         values = {joint: [one.joints[joint] for one in states if joint in one.joints] for joint in instrument.joints}
-        moves = {joint: max(found) - min(found) > MIN_DEVIATION for joint, found in values.items() if found}
+        moves = {joint: max(series) - min(series) > MIN_DEVIATION for joint, series in values.items() if series}
         moving = moving or travels or any(moves.values())
         if travels:
             for joint in (joint for joint, moved in moves.items() if not moved):

@@ -43,7 +43,7 @@ def _usable_points(parsed: Parsed) -> np.ndarray | None:
     assert place is not None  # there are frames
     if parsed.points is None or not parsed.points.measured:
         if not place.reported:
-            place.warning("no sparse points", "training starts from random ones, and gets less")
+            place.warning("no sparse points", "training starts from random ones, with a poorer result")
         return None
     points = parsed.points.positions.astype(np.float64)
     if len(points) == 0:

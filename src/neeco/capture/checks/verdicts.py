@@ -82,9 +82,9 @@ class ImageVerdicts:
             )
             remedy = "images, cameras, intrinsics and points must be of one recording, in one order, and nothing turned"
             return Verdict("contradicted", "frames", message, remedy)
-        given, swapped = (colors.color_difference(order) for order in ((0, 1, 2), (2, 1, 0)))
-        if swapped < SETTINGS.max_swapped * given:
-            message = f"(they differ by {given:.0f} of 255, swapped by {swapped:.0f})"
+        direct, swapped = (colors.color_difference(order) for order in ((0, 1, 2), (2, 1, 0)))
+        if swapped < SETTINGS.max_swapped * direct:
+            message = f"(they differ by {direct:.0f} of 255, swapped by {swapped:.0f})"
             message = f"red and blue of the images are swapped against the sparse points' {message}"
             return Verdict("contradicted", "frames", message, "write both as RGB (OpenCV reads and writes BGR)")
         return Verdict("supported")
@@ -102,10 +102,10 @@ class ImageVerdicts:
 
     def _find(self, instrument: Instrument) -> Verdict:
         poses = dict(self._poses)
-        found = poses.pop(instrument.name)
-        if found is None or self._motion is None:
+        recorded_poses = poses.pop(instrument.name)
+        if recorded_poses is None or self._motion is None:
             return Verdict("undecided")
-        rows, (recorded, root_from_recorded) = self._motion.rows, found
+        rows, (recorded, root_from_recorded) = self._motion.rows, recorded_poses
         roots = recorded @ root_from_recorded
         others = [(other[0] @ other[1])[rows] for other in poses.values() if other is not None]
         motion = self._motion.without(others, roots[rows])
@@ -233,10 +233,10 @@ def instrument_candidates(poses: np.ndarray, world_from_camera: np.ndarray, name
     in_camera = np.linalg.inv(world_from_camera) @ poses
     for axes in (OPENCV, OPENGL, DVRK_ECM):
         remedy = f"turn them into the world (`frame: {axes.name}` in recording.yaml)"
-        for words, given in (("are in the camera's frame", poses), ("were turned into the world", in_camera)):
-            moved = world_from_camera @ axes.poses_to_opencv(given)
+        for words, original in (("are in the camera's frame", poses), ("were turned into the world", in_camera)):
+            moved = world_from_camera @ axes.poses_to_opencv(original)
             message = f"poses of {name} {words} with the axes of {axes.producer} ({axes.words})"
-            if axes is not OPENCV or given is poses:
+            if axes is not OPENCV or original is poses:
                 yield Candidate("pose", message, remedy, SETTINGS.pose, poses=moved)
 
 

@@ -108,16 +108,16 @@ def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -
     """The state with poses of any other link of an instrument made those of its root, by its kinematics as stated."""
     moved = dict(state.instruments)
     for item in instruments:
-        tree, given = item.kinematics, state.instruments.get(item.name)
-        if tree is None or tree.pose_of is None or given is None:
+        tree, recorded = item.kinematics, state.instruments.get(item.name)
+        if tree is None or tree.pose_of is None or recorded is None:
             continue
-        if missing := [name for name in sorted(tree.readings_of(tree.pose_of)) if name not in given.joints]:
+        if missing := [name for name in sorted(tree.readings_of(tree.pose_of)) if name not in recorded.joints]:
             raise NeecoError(
                 f"{parsed.root}: kinematics of {item.name}: reading {missing[0]!r} is missing in a frame; run `neeco "
                 "check` on the capture"
             )
-        root = tree.world_from_root(given.pose.double().numpy(), given.joints)
-        moved[item.name] = replace(given, pose=torch.from_numpy(root))
+        root = tree.world_from_root(recorded.pose.double().numpy(), recorded.joints)
+        moved[item.name] = replace(recorded, pose=torch.from_numpy(root))
     return replace(state, instruments=moved)
 
 
@@ -143,9 +143,9 @@ def _warn_of_other_size(parsed: Parsed) -> None:
     if parsed.lens is not None:
         lenses = [parsed.lens]
     faults = [other_size_fault(lens.cx, lens.cy, *lens.size) for lens in lenses if lens.size is not None]
-    found = [fault for fault in faults if fault is not None]
-    if len(found) > len(faults) / 2:
-        parsed.header("cx, cy" if parsed.lens is None else "lens").warning(*found[0])
+    wrong = [fault for fault in faults if fault is not None]
+    if len(wrong) > len(faults) / 2:
+        parsed.header("cx, cy" if parsed.lens is None else "lens").warning(*wrong[0])
 
 
 def _parse(path: Path, report: ProblemReport, transforms: str, background: float, as_source: bool) -> Parsed:

@@ -169,23 +169,23 @@ def _camera(image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> C
     """Raises NeecoError, which does not name the image, for distorted images read in place, too."""
     if image.camera_id not in cameras:
         raise NeecoError(f"uses camera {image.camera_id}, which the model lacks; export it again")
-    given = cameras[image.camera_id]
-    names = _COEFFICIENTS.get(given.model)
+    camera = cameras[image.camera_id]
+    names = _COEFFICIENTS.get(camera.model)
     if names is None:
         raise NeecoError(
-            f"its camera model is {given.model}; run `colmap image_undistorter` first, which gives PINHOLE"
+            f"its camera model is {camera.model}; run `colmap image_undistorter` first, which gives PINHOLE"
         )
-    fx, fy, cx, cy = (given.params[0], *given.params[: len(given.params) - len(names)])[-4:]  # or one focal length
-    width, height, coefficients = given.width, given.height, given.params[len(given.params) - len(names) :]
+    fx, fy, cx, cy = (camera.params[0], *camera.params[: len(camera.params) - len(names)])[-4:]  # or one focal length
+    width, height, coefficients = camera.width, camera.height, camera.params[len(camera.params) - len(names) :]
     fault = size_fault(width, height) or focal_fault(fx, fy, width, height) or center_fault(cx, cy, width, height)
     if fault is not None or not all(math.isfinite(value) for value in coefficients):
         message = "its distortion is not finite" if fault is None else f"its camera is impossible: {fault[0]}"
         raise NeecoError(f"{message}; repair the cameras file")
     stated = dict(zip(names, coefficients, strict=True))
-    distortion = opencv_distortion(given.model, stated, (fx, fy, cx, cy), (width, height))
+    distortion = opencv_distortion(camera.model, stated, (fx, fy, cx, cy), (width, height))
     if distortion and not parsed.as_source:
         raise NeecoError(
-            f"its camera model is {given.model}: the images are distorted; undistort them: neeco ingest {parsed.root} "
+            f"its camera model is {camera.model}: the images are distorted; undistort them: neeco ingest {parsed.root} "
             "--output CAPTURE (or `colmap image_undistorter`)"
         )
     pose = torch.from_numpy(_world_from_camera(image)).float()

@@ -63,19 +63,19 @@ def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
         pose = item.child("pose").rigid()
         nodes = _joint_nodes(item)
         joints = {joint: child.number() for joint, child in (nodes or {}).items()}
-        known = {joint: value for joint, value in joints.items() if value is not None}
+        valid = {joint: value for joint, value in joints.items() if value is not None}
         trust = item.child("trust").number() if item.has("trust") else None
         if trust is not None and not 0 <= trust <= 1:
             item.child("trust").error(f"is {trust:g}, not a share", "give 0 to 1, or leave it out")
             trust = None
-        uncertainty = parse_uncertainty(item.child("uncertainty"), known) if item.has("uncertainty") else None
+        uncertainty = parse_uncertainty(item.child("uncertainty"), valid) if item.has("uncertainty") else None
         if name in states:
             item.child("name").error(f"{printable(name)} comes twice here", "keep one state per instrument")
             good = False
-        if name is None or pose is None or nodes is None or len(known) < len(joints):
+        if name is None or pose is None or nodes is None or len(valid) < len(joints):
             good = False
             continue
-        states[name] = InstrumentState(torch.from_numpy(pose), known, trust, uncertainty)
+        states[name] = InstrumentState(torch.from_numpy(pose), valid, trust, uncertainty)
     return states if good else None
 
 
@@ -114,9 +114,9 @@ def all_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -
     joints: dict[str, dict[str, Limits]] = {item.name: dict(item.joints) for item in declared}
     for frame in frames:
         for name, state in frame.state.instruments.items():
-            known = joints.setdefault(name, {})
+            limits = joints.setdefault(name, {})
             for joint in state.joints:
-                known.setdefault(joint, None)
+                limits.setdefault(joint, None)
     stated = {item.name: item for item in declared}
     return tuple(
         replace(stated[name], joints=limits) if name in stated else Instrument(name, limits)
@@ -141,8 +141,8 @@ def parse_base_uncertainty(node: Node) -> BaseUncertainty | None:
     rows = [row for item in covariance.items() if (row := item.numbers(6, "rad and mm")) is not None]
     if center is None or not isinstance(covariance.value, list) or len(rows) < len(covariance.value):
         return None
-    found = np.array(rows)
-    if found.shape != (6, 6) or not np.allclose(found, found.T) or np.linalg.eigvalsh(found).min() <= 0:
+    matrix = np.array(rows)
+    if matrix.shape != (6, 6) or not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix).min() <= 0:
         covariance.error("is no covariance", "give 6 x 6 numbers, symmetric and positive definite")
         return None
     return BaseUncertainty(tuple(center), tuple(map(tuple, rows)))
@@ -158,12 +158,12 @@ def parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty | None:
     named: dict[str, float] = {}
     good = translation is not None and rotation is not None
     if node.has("joints_deg"):
-        given = node.child("joints_deg")
-        good &= given.is_object()
-        for name in given.value if isinstance(given.value, dict) else ():
-            deviation = given.child(name).number(least=0)
+        deviations = node.child("joints_deg")
+        good &= deviations.is_object()
+        for name in deviations.value if isinstance(deviations.value, dict) else ():
+            deviation = deviations.child(name).number(least=0)
             if name not in joints:
-                given.child(name).error("the state has no such joint", "leave it out")
+                deviations.child(name).error("the state has no such joint", "leave it out")
                 good = False
             elif deviation is None:
                 good = False
@@ -194,16 +194,16 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
     node = Node(value, where, "", RaisingReport())
     if not isinstance(node.child("instruments").value, list):
         node.child("instruments").error("missing", 'expected {"instruments": [{"name", "pose", "joints"}]}')
-    known = {instrument.name: instrument for instrument in instruments}
+    by_name = {instrument.name: instrument for instrument in instruments}
     names = [item.child("name") for item in node.child("instruments").items()]
     for name in names:
-        if not isinstance(name.value, str) or name.value not in known:
-            name.error(f"{name.value!r} is not in the scene", f"it has {', '.join(known) or 'no instruments'}")
-    if missing := [name for name in known if name not in [item.value for item in names]]:
+        if not isinstance(name.value, str) or name.value not in by_name:
+            name.error(f"{name.value!r} is not in the scene", f"it has {', '.join(by_name) or 'no instruments'}")
+    if missing := [name for name in by_name if name not in [item.value for item in names]]:
         node.child("instruments").error(f"{', '.join(missing)} missing", "give every instrument of the scene")
-    given = parse_instruments(node) or {}
-    for item, instrument in zip(node.child("instruments").items(), given, strict=True):
-        _check_joints(item, known[instrument])
+    parsed = parse_instruments(node) or {}
+    for item, instrument in zip(node.child("instruments").items(), parsed, strict=True):
+        _check_joints(item, by_name[instrument])
     time = node.child("time").number() if node.has("time") else None
     camera = node.child("camera")
     if isinstance(camera.value, dict):
@@ -212,10 +212,10 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
     # in the scene's order, so that files list them in one order, without joints that the scene does not have
     states = {
         name: InstrumentState(
-            given[name].pose,
-            {joint: given[name].joints.get(joint, item.halfway(joint)) for joint in item.joints},
+            parsed[name].pose,
+            {joint: parsed[name].joints.get(joint, item.halfway(joint)) for joint in item.joints},
         )
-        for name, item in known.items()
+        for name, item in by_name.items()
     }
     return StateLine(State(states, time or 0.0), None if pose is None else swap_camera_axes(pose))
 

@@ -64,12 +64,12 @@ def _by_name(parsed: Parsed) -> Parsed:
     ranks = None if parsed.timed else instants(names, [Lens.of(frame.camera) for frame in parsed.frames])
     if ranks is None:
         return parsed
-    found = parsed.of_rows(sorted(range(len(ranks)), key=ranks.__getitem__))
-    found.frames = [
+    ordered = parsed.of_rows(sorted(range(len(ranks)), key=ranks.__getitem__))
+    ordered.frames = [
         replace(frame, state=replace(frame.state, time=float(rank)))
-        for frame, rank in zip(found.frames, sorted(ranks), strict=True)
+        for frame, rank in zip(ordered.frames, sorted(ranks), strict=True)
     ]
-    return found
+    return ordered
 
 
 def is_blender(document: Node) -> bool:
@@ -118,11 +118,11 @@ def _frame_objects(document: Node) -> list[dict[str, Any]]:
 def _warn_of_unread_states(document: Node, parsed: Parsed) -> None:
     """Warn of states under other names than `instruments`, where no frame has any under that."""
     for index, frame in enumerate(_frame_objects(document)):
-        found = [key for key in STATE_LIKE if frame.get(key) is not None]
-        if found and not parsed.instruments:
+        keys = [key for key in STATE_LIKE if frame.get(key) is not None]
+        if keys and not parsed.instruments:
             message = "is not read: instrument states belong into `instruments`"
             remedy = 'write [{"name", "pose": 4x4 mm, "joints": {name: rad}}] there'
-            document.child("frames").item(index).child(found[0]).warning(message, remedy)
+            document.child("frames").item(index).child(keys[0]).warning(message, remedy)
             return
 
 
@@ -277,11 +277,11 @@ def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()
 def _image(node: Node, folder: Path, parsed: Parsed, extensions: tuple[str, ...]) -> Path | None:
     """`_file` of a frame's image. Of a source, one that is nowhere is counted, and no error."""
     before = len(node.report.problems)
-    found = _file(node, folder, parsed.root, extensions)
+    path = _file(node, folder, parsed.root, extensions)
     problems = node.report.problems
     if parsed.as_source and len(problems) > before and problems[-1].remedy == NOWHERE:
         parsed.absent.append(problems.pop())
-    return found
+    return path
 
 
 class _HeaderReport(ProblemReport):

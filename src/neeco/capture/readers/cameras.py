@@ -62,7 +62,7 @@ def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion | None
         message = f"is {printable(wrong[0].value)}; this lens model cannot be undistorted"
         wrong[0].error(message, "undistort the images first, and write PINHOLE")
         return None
-    found: dict[str, Node] = {}
+    nodes: dict[str, Node] = {}
     for key in LISTS:
         node = node_of(key)
         zeros = isinstance(node.value, list) and all(as_float(item) == 0 for item in node.value)
@@ -72,22 +72,22 @@ def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion | None
         if names is None:
             node.error(f"expected 4, 5, 6 or 8 coefficients, found {printable(node.value)}", "correct it")
             return None
-        found |= dict(zip(NAMES[:4] if model in FISHEYE and len(names) == 4 else names, node.items(), strict=True))
+        nodes |= dict(zip(NAMES[:4] if model in FISHEYE and len(names) == 4 else names, node.items(), strict=True))
     for name in NAMES:
         node = node_of(name)
-        if node.value is None or (as_float(node.value) == 0 and name in found):
+        if node.value is None or (as_float(node.value) == 0 and name in nodes):
             continue
-        if name in found and found[name].value != node.value:
-            node.error(f"is {printable(node.value)}, and {found[name].field} is another", "state each once")
+        if name in nodes and nodes[name].value != node.value:
+            node.error(f"is {printable(node.value)}, but {nodes[name].field} differs", "state each once")
             return None
-        found.setdefault(name, node)
-    numbers = {name: node.number() for name, node in found.items()}
-    known = {name: number for name, number in numbers.items() if number}
+        nodes.setdefault(name, node)
+    numbers = {name: node.number() for name, node in nodes.items()}
+    coefficients = {name: number for name, number in numbers.items() if number}
     if None in numbers.values():
         return None
     if model in FISHEYE:
-        return StatedDistortion(model, known, named if named.value else node_of("is_fisheye"))
-    return StatedDistortion(model, known, found[min(known, key=NAMES.index)] if known else None)
+        return StatedDistortion(model, coefficients, named if named.value else node_of("is_fisheye"))
+    return StatedDistortion(model, coefficients, nodes[min(coefficients, key=NAMES.index)] if coefficients else None)
 
 
 def opencv_distortion(
@@ -148,15 +148,15 @@ def fit_rational(
     weight = radius
     for _ in range(8):
         rows = np.hstack([powers, -share[:, None] * powers]) * weight[:, None]
-        found = np.linalg.lstsq(rows, (share - 1) * weight, rcond=None)[0]
-        weight = radius / np.maximum(1 + powers @ found[3:], 1e-6)
-    error = np.abs((1 + powers @ found[:3]) / (1 + powers @ found[3:]) - share) * radius * max(fl_x, fl_y)
+        solution = np.linalg.lstsq(rows, (share - 1) * weight, rcond=None)[0]
+        weight = radius / np.maximum(1 + powers @ solution[3:], 1e-6)
+    error = np.abs((1 + powers @ solution[:3]) / (1 + powers @ solution[3:]) - share) * radius * max(fl_x, fl_y)
     if not error.max() < MAX_MISFIT_PX:
         raise NeecoError(
             f"this lens bends too much for OpenCV's rational model ({error.max():.2f} px off); crop the images, or "
             "calibrate again"
         )
-    return (*found[:2].tolist(), 0.0, 0.0, *found[2:].tolist())
+    return (*solution[:2].tolist(), 0.0, 0.0, *solution[2:].tolist())
 
 
 def _polynomial(squares: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
@@ -193,15 +193,15 @@ def parse_lens(node: Node) -> Lens | None:
 
 def _distortion(node: Node) -> tuple[float, ...] | None:
     """The coefficients up to the last that is given, as many as one of OpenCV's models has."""
-    given = [node.has(name) for name in COEFFICIENT_NAMES]
-    last = len(given) - given[::-1].index(True) if any(given) else 0
+    stated = [node.has(name) for name in COEFFICIENT_NAMES]
+    last = len(stated) - stated[::-1].index(True) if any(stated) else 0
     names = COEFFICIENT_NAMES[: min(count for count in COEFFICIENT_COUNTS if count >= last)]
     read = [
         node.child(name).number(above=-MAX_COEFFICIENT, below=MAX_COEFFICIENT) if node.has(name) else 0.0
         for name in names
     ]
-    known = tuple(value for value in read if value is not None)
-    return known if len(known) == len(read) else None
+    values = tuple(value for value in read if value is not None)
+    return values if len(values) == len(read) else None
 
 
 def _border(node: Node) -> Border | None:

@@ -34,13 +34,13 @@ def parse_kinematics(node: Node) -> KinematicTree | None:
         return None
     links = [_parse_link(item) for item in node.child("links").items()]
     pose_of = node.child("pose_of").text() if node.has("pose_of") else None
-    known = tuple(link for link in links if link is not None)
-    if len(known) < len(links) or not isinstance(node.child("links").value, list):
+    parsed = tuple(link for link in links if link is not None)
+    if len(parsed) < len(links) or not isinstance(node.child("links").value, list):
         return None
     if node.has("pose_of") and pose_of is None:
         return None
     try:
-        return KinematicTree(known, pose_of)
+        return KinematicTree(parsed, pose_of)
     except NeecoError as error:
         node.child("links").error_from(error)
         return None
@@ -58,10 +58,10 @@ def _parse_link(node: Node) -> Link | None:
         return None
     name = node.child("name").text()
     parent = node.child("parent").text() if node.has("parent") else None
-    given = node.child("type")
-    kind = given.text() if node.has("type") else FIXED
+    type_node = node.child("type")
+    kind = type_node.text() if node.has("type") else FIXED
     if kind is not None and kind not in JOINT_TYPES:
-        given.error(f"is {printable(kind)}", f"write {', '.join(JOINT_TYPES)}")
+        type_node.error(f"is {printable(kind)}", f"write {', '.join(JOINT_TYPES)}")
         kind = None
     origin = _origin(node.child("origin")) if node.has("origin") else np.eye(4)
     axis = _axis(node.child("axis")) if node.has("axis") else np.array([0.0, 0.0, 1.0])
@@ -96,26 +96,26 @@ def _origin(node: Node) -> Array | None:
 
 
 def _axis(node: Node) -> Array | None:
-    given = node.numbers(3, "x, y, z of the axis in the parent's frame")
-    if given is None:
+    direction = node.numbers(3, "x, y, z of the axis in the parent's frame")
+    if direction is None:
         return None
-    length = math.hypot(*given)
+    length = math.hypot(*direction)
     if not 1e-6 < length < 1e6:
         node.error("is no direction", "give three numbers that are not all 0")
         return None
     if (
         abs(length - 1) < UNIT_TOLERANCE
     ):  # as written by us: divided again, its last digits would change with every reading
-        return np.array(given)
-    return np.array(given) / length
+        return np.array(direction)
+    return np.array(direction) / length
 
 
 def _gains(node: Node) -> dict[str, float] | None:
     if not node.is_object():
         return None
-    found = {name: node.child(name).number(above=-MAX_GAIN, below=MAX_GAIN) for name in node.value}
-    known = {name: gain for name, gain in found.items() if gain is not None}
-    return known if len(known) == len(found) else None
+    gains = {name: node.child(name).number(above=-MAX_GAIN, below=MAX_GAIN) for name in node.value}
+    valid = {name: gain for name, gain in gains.items() if gain is not None}
+    return valid if len(valid) == len(gains) else None
 
 
 DVRK_READINGS = ("wrist_pitch", "wrist_yaw", "jaw")  # what drives the joints beyond the roll
@@ -139,8 +139,8 @@ def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) 
     document.is_object()
     frames = document.child("DH")
     if frames.child("convention").value != "modified":
-        found = printable(frames.child("convention").value)
-        frames.child("convention").error(f"is {found}, not 'modified'", "give a tool file of the dVRK")
+        convention = printable(frames.child("convention").value)
+        frames.child("convention").error(f"is {convention}, not 'modified'", "give a tool file of the dVRK")
     # older files call them outer_wrist_pitch and outer_wrist_yaw
     joints = {(item.child("name").text() or "").removeprefix("outer_"): item for item in frames.child("joints").items()}
     # hooks and spatulas have an entry for jaws, too, which no force moves
@@ -148,10 +148,10 @@ def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) 
     for joint in DVRK_READINGS[:2]:
         if joint not in joints:
             frames.child("joints").error(f"there is no joint {joint}", "only tools with a wrist have a tree")
-    known = DVRK_READINGS if has_jaws else DVRK_READINGS[:2]
-    for given in names:
-        if given not in known:
-            raise NeecoError(f"{path}: readings: {given!r} is no joint of this tool; it has {', '.join(known)}")
+    available = DVRK_READINGS if has_jaws else DVRK_READINGS[:2]
+    for name in names:
+        if name not in available:
+            raise NeecoError(f"{path}: readings: {name!r} is no joint of this tool; it has {', '.join(available)}")
     pitch, yaw, jaw = (names.get(joint, joint) for joint in DVRK_READINGS)
     wrist, pitch_axis = _frame(joints["wrist_pitch"])
     pivot, yaw_axis = _frame(joints["wrist_yaw"])
@@ -222,19 +222,19 @@ def read_urdf(
     if not robot.links:
         raise NeecoError(f"{path}: defines no link; give the robot's URDF")
     children: dict[str, list[Any]] = {}
-    known = {link.name: link for link in robot.links}
+    by_name = {link.name: link for link in robot.links}
     for joint in robot.joints:
         children.setdefault(joint.parent, []).append(joint)
         for name in (joint.parent, joint.child):
-            if name not in known:
+            if name not in by_name:
                 raise NeecoError(
                     f"{path}: joint {joint.name!r} joins {name!r}, which is no link; add it, or correct it"
                 )
     carried = {joint.child for joint in robot.joints}
-    tops = [name for name in known if name not in carried]
+    tops = [name for name in by_name if name not in carried]
     for what, name in (("root", root), ("pose_of", pose_of)):
-        if name is not None and name not in known:
-            raise NeecoError(f"{path}: {what}: there is no link {name!r}; name one of {', '.join(known)}")
+        if name is not None and name not in by_name:
+            raise NeecoError(f"{path}: {what}: there is no link {name!r}; name one of {', '.join(by_name)}")
     if root is None and len(tops) != 1:
         raise NeecoError(f"{path}: one link has no parent, the root; found {', '.join(tops) or 'none'}; name `root`")
     first = tops[0] if root is None else root
@@ -244,10 +244,10 @@ def read_urdf(
         if twice := next((name for name in defined if defined.count(name) > 1), None):
             raise NeecoError(f"{path}: {what} {twice!r} is defined twice; rename one of them")
     moving = {joint.name for _, joint in reached if joint is not None and TYPES.get(joint.type) != FIXED}
-    for given in names:
-        if given not in moving:
-            raise NeecoError(f"{path}: readings: {given!r} is no joint that moves; it has {', '.join(sorted(moving))}")
-    visible = {name for name, _ in reached if known[name].visuals}
+    for named in names:
+        if named not in moving:
+            raise NeecoError(f"{path}: readings: {named!r} is no joint that moves; it has {', '.join(sorted(moving))}")
+    visible = {name for name, _ in reached if by_name[name].visuals}
     reached_joints = {joint.name: joint for _, joint in reached if joint is not None}
     links = []
     for name, joint in reached:
@@ -283,7 +283,7 @@ def _refuse_xacro(path: Path, text: str) -> None:
     if _SUBSTITUTION.search(text) or re.search(rf"[<\s/](?:{prefixes}):[\w.-]+[\s=/>]", text):
         stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
         target = f"{stem}.urdf" if path.suffix == ".xacro" else f"{stem}_processed.urdf"
-        raise NeecoError(f"{path}: is xacro; run `xacro {path.name} > {target}` and give that")
+        raise NeecoError(f"{path}: is xacro; run `xacro {path.name} > {target}` and give the result")
 
 
 def _below(first: str, children: Mapping[str, list[Any]], path: Path) -> Iterator[Any]:
@@ -300,7 +300,7 @@ def _below(first: str, children: Mapping[str, list[Any]], path: Path) -> Iterato
 
 def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body: bool, path: Path) -> Link:
     if joint.type not in TYPES:
-        raise NeecoError(f"{path}: joint {joint.name!r} is {joint.type}; {', '.join(TYPES)} can be had")
+        raise NeecoError(f"{path}: joint {joint.name!r} is {joint.type}; {', '.join(TYPES)}is supported")
     kind, origin = TYPES[joint.type], np.eye(4)
     if joint.origin is not None:
         turn = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0]).as_matrix()

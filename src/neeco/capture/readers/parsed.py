@@ -87,8 +87,8 @@ def inside(root: Path, folder: Path, text: str) -> Path:
         if follows_links():
             return path
         raise NeecoError(
-            f"{printable(text)} is a link, or lies in one, that leaves the capture's folder; copy there what it "
-            "leads to, or add --follow-links where you trust it"
+            f"{printable(text)} is a link, or lies in one, that leaves the capture's folder; copy its target "
+            "there, or add --follow-links if you trust it"
         )
     if outside:
         raise NeecoError(f"{printable(text)} leaves the capture's folder; copy the file into it and name it from there")
@@ -127,15 +127,15 @@ def relative_name(file: Path, root: Path) -> str:
 
 def missing_file(folder: Path, text: str) -> Fault:
     """Return what is wrong with a path, relative to `folder`, at which there is no file, and what to do."""
-    message, found = f"no such file: {printable(text)}", similar_file(folder, text)
-    if found is None:
+    message, similar = f"no such file: {printable(text)}", similar_file(folder, text)
+    if similar is None:
         return message, NOWHERE
-    if _normal(found) == _normal(text):
+    if _normal(similar) == _normal(text):
         form = (
-            "in another Unicode form (macOS decomposes accents)" if found.lower() != text.lower() else "in other case"
+            "in another Unicode form (macOS decomposes accents)" if similar.lower() != text.lower() else "in other case"
         )
-        return message, f"{printable(found)} is there, {form}: correct the path"
-    return message, f"{printable(found)} is there: correct the path"
+        return message, f"{printable(similar)} is there, {form}: correct the path"
+    return message, f"{printable(similar)} is there: correct the path"
 
 
 def similar_file(folder: Path, text: str) -> str | None:

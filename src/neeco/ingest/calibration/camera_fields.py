@@ -79,10 +79,10 @@ def read_calibration(path: Path) -> Any:
         if "<opencv_storage" not in text:
             raise NeecoError(f"{path}: is XML, but not OpenCV's (<opencv_storage>); save the calibration as YAML")
         header = "" if text.lstrip().startswith("<?xml") else '<?xml version="1.0"?>\n'
-        found = _by_opencv(header + text.lstrip())
-        if found is None:
+        parsed = _by_opencv(header + text.lstrip())
+        if parsed is None:
             raise NeecoError(f"{path}: is XML that OpenCV cannot read; save the calibration again")
-        return found
+        return parsed
     # `%YAML:1.0` is OpenCV's own spelling, which YAML itself does not allow
     lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
     begun = next((number for number, line in enumerate(lines) if re.match(r"\s*[^\s#-]", line)), 0)
@@ -194,10 +194,10 @@ def _side(keys: Mapping[str, Any], side: str) -> dict[str, Any]:
     if isinstance(section, dict) and "data" not in section:
         return _plain(section)
     shared = [name for names in (*_SIZES, _SIZE_LISTS, _MODELS) for name in names]
-    found = {name: keys[f"camera{name}"] for name in shared if f"camera{name}" in keys}  # Camera.width, Camera1.fx
-    found |= {name: keys[name] for name in shared if name in keys}
-    found |= {name.removesuffix(side): value for name, value in keys.items() if name.endswith(side) and name != side}
-    return found | {
+    fields = {name: keys[f"camera{name}"] for name in shared if f"camera{name}" in keys}  # Camera.width, Camera1.fx
+    fields |= {name: keys[name] for name in shared if name in keys}
+    fields |= {name.removesuffix(side): value for name, value in keys.items() if name.endswith(side) and name != side}
+    return fields | {
         name.removeprefix(side): value for name, value in keys.items() if name.startswith(side) and name != side
     }
 
@@ -232,9 +232,9 @@ def _camera(where: Path | str, keys: Mapping[str, Any], pair_of: bool = False) -
     elif isinstance(listed, list):
         four = matrix_numbers(where, listed, "intrinsics")
     else:
-        held = _plain(listed) if isinstance(listed, dict) else keys
-        names = next(names for names in _FOCAL if set(names) <= set(held))
-        four = matrix_numbers(where, [held[name] for name in names], ", ".join(names))
+        named = _plain(listed) if isinstance(listed, dict) else keys
+        names = next(names for names in _FOCAL if set(names) <= set(named))
+        four = matrix_numbers(where, [named[name] for name in names], ", ".join(names))
     size = next(((keys[w], keys[h]) for w, h in _SIZES if w in keys and h in keys), (None, None))
     both = first_of(keys, _SIZE_LISTS)
     if isinstance(both, list) and len(both) == 2:
@@ -252,13 +252,13 @@ def _distortion(where: Path | str, keys: Mapping[str, Any], fisheye: bool) -> li
     if vector is not None:
         return matrix_numbers(where, vector, "distortion_coefficients")
     sections = [keys.get(name) for name in ("projectionparameters", "distortionparameters")]
-    held = dict(keys)
+    named = dict(keys)
     for section in sections:
-        held |= _plain(section) if isinstance(section, dict) else {}
-    names = _COEFFICIENTS if not fisheye else _FISHEYE_COEFFICIENTS["mu" in held]
-    given = [index for index, name in enumerate(names) if held.get(name) is not None]
-    if not given:
+        named |= _plain(section) if isinstance(section, dict) else {}
+    names = _COEFFICIENTS if not fisheye else _FISHEYE_COEFFICIENTS["mu" in named]
+    present = [index for index, name in enumerate(names) if named.get(name) is not None]
+    if not present:
         return []
-    count = next(length for length in (4, 5, 8) if length > given[-1])
-    values = [held.get(name) or 0.0 for name in names[:count]]
+    count = next(length for length in (4, 5, 8) if length > present[-1])
+    values = [named.get(name) or 0.0 for name in names[:count]]
     return matrix_numbers(where, values, ", ".join(names[:count]))

@@ -87,8 +87,8 @@ def opencv_lens(where: Path | str, document: Any) -> Lens:
     NeecoError."""
     cameras = cameras_in(where, document)
     if not cameras:
-        given = isinstance(document, dict)
-        raise NeecoError(f"{where}: {'camera_matrix: missing' if given else 'no keys'}; expected {EXPECTED}")
+        is_mapping = isinstance(document, dict)
+        raise NeecoError(f"{where}: {'camera_matrix: missing' if is_mapping else 'no keys'}; expected {EXPECTED}")
     return lens_of(where, cameras[0])
 
 
@@ -108,8 +108,8 @@ def checked_lens(
     fisheye: bool = False,
 ) -> Lens:
     """A lens of fl_x, fl_y, cx, cy px (pixel centres at +0.5) and OpenCV's coefficients. Raises NeecoError."""
-    for field, given in (("fl_x, fl_y, cx, cy", values), ("distortion", distortion)):
-        for value in given:
+    for field, numbers in (("fl_x, fl_y, cx, cy", values), ("distortion", distortion)):
+        for value in numbers:
             number = as_float(value)
             if number is None or not abs(number) < MAX_NUMBER:  # NaN compares false
                 raise NeecoError(f"{source}: {field}: {printable(value)} is not a usable number; calibrate again")
@@ -132,7 +132,7 @@ def image_size(path: Path | str, width: Any, height: Any) -> tuple[int, int] | N
         return None
     sides = [number for value in (width, height) if (number := as_float(value)) is not None]
     if len(sides) < 2 or size_fault(*sides) is not None:
-        raise NeecoError(f"{path}: image size: {printable(width)} x {printable(height)} is not one; correct it")
+        raise NeecoError(f"{path}: image size: {printable(width)} x {printable(height)} is no image size; correct it")
     return int(width), int(height)
 
 
@@ -209,8 +209,8 @@ def _dark_threshold(brightness: np.ndarray) -> float | None:
 def _touching_corners(dark: np.ndarray) -> np.ndarray:
     """The dark regions that hold a corner of the image."""
     labels, _ = ndimage.label(dark)
-    found = {int(labels[row, column]) for row in (1, -2) for column in (1, -2)} - {0}
-    return np.isin(labels, list(found))
+    touching = {int(labels[row, column]) for row in (1, -2) for column in (1, -2)} - {0}
+    return np.isin(labels, list(touching))
 
 
 def _border_edge(outside: np.ndarray) -> np.ndarray:

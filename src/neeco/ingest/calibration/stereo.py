@@ -157,8 +157,8 @@ def _two_cameras(
         source = path.with_name("ex" + path.name[2:])
         if not source.is_file():
             raise NeecoError(f"{path}: R: missing; put {source.name}, which OpenCV writes with it, next to it")
-        found = read_calibration(source)
-        keys = {word(str(name)): value for name, value in found.items()} if isinstance(found, dict) else {}
+        extrinsics = read_calibration(source)
+        keys = {word(str(name)): value for name, value in extrinsics.items()} if isinstance(extrinsics, dict) else {}
         turn, shift = first_of(keys, _TURNS), first_of(keys, _SHIFTS)
     if turn is None or shift is None:
         raise NeecoError(f"{source}: R, T: missing; give the right camera's rotation and translation, as OpenCV does")
@@ -180,13 +180,13 @@ def _of_intuitive(path: Path, document: dict[Any, Any]) -> dict[str, Any]:
         raise NeecoError(f"{path}: intrinsics: expected two cameras, left and right, each with f, c and k; write them")
     if not isinstance(extrinsics, dict):
         raise NeecoError(f"{path}: extrinsics: expected om and T; write them")
-    found: dict[str, Any] = {"R": extrinsics.get("om"), "T": extrinsics.get("T")}
+    converted: dict[str, Any] = {"R": extrinsics.get("om"), "T": extrinsics.get("T")}
     for number, (side, camera) in enumerate(zip(("left", "right"), cameras, strict=True)):
         f, c = (matrix_numbers(path, camera.get(key), f"intrinsics[{number}].{key}") for key in ("f", "c"))
         if len(f) != 2 or len(c) != 2:
             raise NeecoError(f"{path}: intrinsics[{number}]: f and c take two numbers each; correct them")
-        found[side] = _camera_keys(f, c, camera.get("k", []), (document.get("width"), document.get("height")))
-    return found
+        converted[side] = _camera_keys(f, c, camera.get("k", []), (document.get("width"), document.get("height")))
+    return converted
 
 
 def _of_ini(path: Path) -> dict[str, Any]:
@@ -198,7 +198,7 @@ def _of_ini(path: Path) -> dict[str, Any]:
     except configparser.Error as error:
         reason = " ".join(str(error).replace("<string>", path.name).split())[:160]
         raise NeecoError(f"{path}: not readable as an .ini file ({reason}); save the calibration again") from None
-    found: dict[str, Any] = {}
+    converted: dict[str, Any] = {}
     poses = []
     for section, side in (("StereoLeft", "left"), ("StereoRight", "right")):
         if not parser.has_section(section):
@@ -212,12 +212,12 @@ def _of_ini(path: Path) -> dict[str, Any]:
             if len(numbers[stem]) != count:
                 raise NeecoError(f"{path}: [{section}] {stem}x, {stem}y: missing; save the calibration again")
         size = numbers["res_"] if len(numbers["res_"]) == 2 else [None, None]
-        found[side] = _camera_keys(numbers["fc_"], numbers["cc_"], numbers["kc_"], size)
+        converted[side] = _camera_keys(numbers["fc_"], numbers["cc_"], numbers["kc_"], size)
         poses.append((numbers["r_"], numbers["t_"]))
     (turn, shift), right = poses
     if any(shift) or (turn and not np.allclose(turn, np.eye(3).ravel()[: len(turn)], atol=1e-6)):
         raise NeecoError(f"{path}: [StereoLeft] R, T: the left camera must be the origin; give the right one's from it")
-    return found | {"R": right[0], "T": right[1]}
+    return converted | {"R": right[0], "T": right[1]}
 
 
 def _indexed(stem: str, values: dict[str, str]) -> list[str]:
@@ -259,10 +259,10 @@ def _right_beside(path: Path) -> Path:
 
 
 def _numbers(path: Path | str, document: Mapping[str, Any], names: tuple[str, ...], count: int) -> np.ndarray:
-    found = matrix_numbers(path, first_of(document, names), names[0])
-    if len(found) != count:
-        raise NeecoError(f"{path}: {names[0]}: needs {count} numbers, has {len(found)}; write it as ROS does")
-    return np.array(found)
+    values = matrix_numbers(path, first_of(document, names), names[0])
+    if len(values) != count:
+        raise NeecoError(f"{path}: {names[0]}: needs {count} numbers, has {len(values)}; write it as ROS does")
+    return np.array(values)
 
 
 def _lens(path: Path, camera: CameraNumbers) -> Lens:

@@ -120,14 +120,14 @@ def map_keyframes(job: dict[str, Any], database: Path) -> None:
         set_focal_length(database, job["focal"])
     say("mapping", done=0, total=len(job["names"]))
     models = global_mapping(job, database, folder) if job["global"] else incremental_mapping(job, database, folder)
-    found: dict[str, Any] = {"models": [], "focal": 0.0, "distortion": 0.0, "points": 0, "error": 0.0, "parallax": 0.0}
+    stats: dict[str, Any] = {"models": [], "focal": 0.0, "distortion": 0.0, "points": 0, "error": 0.0, "parallax": 0.0}
     if models:
         model = max(models.values(), key=lambda model: model.num_reg_images())
         if job["focal"] and model.num_reg_images() >= job["least"]:
             model = estimate_lens(job, database, folder, model)
         model.write(str(folder))
         camera = next(iter(model.cameras.values()))
-        found = {
+        stats = {
             "models": sorted((other.num_reg_images() for other in models.values()), reverse=True),
             "focal": float(camera.params[0]),
             "distortion": float(camera.params[3]) if job["focal"] else 0.0,
@@ -135,8 +135,8 @@ def map_keyframes(job: dict[str, Any], database: Path) -> None:
             "error": float(model.compute_mean_reprojection_error()),
             "parallax": parallax(model),
         }
-        found["models"][0] = model.num_reg_images()
-    folder.joinpath("attempt.json").write_text(json.dumps(found))
+        stats["models"][0] = model.num_reg_images()
+    folder.joinpath("attempt.json").write_text(json.dumps(stats))
 
 
 def incremental_mapping(
@@ -238,14 +238,14 @@ def register_others(job: dict[str, Any], database: Path, model: pycolmap.Reconst
     mapper.begin_reconstruction(model)
     for sweep in range(SETTINGS.sweeps):
         missing = [image for image in model.images.values() if not image.has_pose]
-        found = 0
+        registered = 0
         for image in sorted(missing, key=lambda image: image.name):
             if mapper.register_next_image(options.mapper, image.image_id):
-                found += 1
+                registered += 1
                 if sweep > 0:
                     mapper.triangulate_image(options.triangulation, image.image_id)
             say("mapping", done=model.num_reg_images(), total=len(job["names"]))
-        if found == 0:
+        if registered == 0:
             break
     mapper.end_reconstruction(False)
 

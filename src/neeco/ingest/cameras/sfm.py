@@ -33,23 +33,23 @@ class SfmSettings:
     min_field_of_view: float = 30.0  # degrees, of an estimated lens
     max_field_of_view: float = 140.0  # degrees
     max_distortion: float = 0.35  # share of its radius by which an estimated lens shifts the farthest pixel
-    complete_share: float = 0.9  # share of the keyframes that ends the search
+    complete_share: float = 0.9  # share of the keyframes with a camera that ends the search
     rank_step: float = 0.05  # share of the keyframes by which one attempt outranks another whatever its error
     max_error_px: float = 2.5  # mean reprojection error
     min_parallax_deg: float = 1.0  # between the views of a point
     still_share: float = 0.02  # of the image's width, by which a still scope's features move (tissue breathes)
     homography_share: float = 0.004  # of the image's width: inlier threshold of a homography
     min_explained: float = 0.9  # share of the epipolar inliers that a homography explains without parallax
-    min_matches: int = 30  # of features
-    min_pairs: int = 5  # of views
-    key_neighbours: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16)  # keyframes on, that a keyframe is matched with
-    near_keyframes: int = 3  # on each side, that another frame is matched with
+    min_matches: int = 30  # minimum number of matched features of a pair of views
+    min_pairs: int = 5  # minimum number of pairs of views
+    key_neighbours: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16)  # offsets of keyframes that are matched
+    near_keyframes: int = 3  # keyframes on each side that another frame is matched with
     loop_stride: int = 4  # keyframes between those that are all matched with each other: closes loops
-    large_px: int = 1280  # of an image whose features are not detected at twice the size: takes four times as long
-    dense_factor: int = 3  # on the number of features, in the attempt from more of them
+    large_px: int = 1280  # image size from which features are not detected at twice the size: takes four times as long
+    dense_factor: int = 3  # factor on the number of features in the attempt with more of them
     peak: float = 0.004  # minimum contrast of a feature: tissue is smooth, COLMAP's 0.0067 leaves too few
-    dense_peak: float = 0.002  # the same, in the attempt from more features
-    motion_pairs: int = 40  # of keyframes, that are tested for parallax
+    dense_peak: float = 0.002  # minimum contrast in the attempt with more features
+    motion_pairs: int = 40  # number of pairs of keyframes that are tested for parallax
 
 
 SETTINGS = SfmSettings()
@@ -288,10 +288,10 @@ class StructureFromMotion:
         best = self._search(progress)
         return self._run(self.job | self._parameters(best.strategy) | {"task": "register"}, progress, best)
 
-    def adjust(self, found: SfmResult, outliers: np.ndarray, progress: StageProgress) -> SfmResult:
+    def adjust(self, result: SfmResult, outliers: np.ndarray, progress: StageProgress) -> SfmResult:
         """The same after bundle adjustment without the observations marked in `outliers` [Q]."""
-        rows = found.observations[outliers]
-        names = [self.names[index] for index in found.indices]
+        rows = result.observations[outliers]
+        names = [self.names[index] for index in result.indices]
         drop = [(names[int(row)], int(number)) for row, number in zip(rows[:, 0], rows[:, 4], strict=True)]
         best = best_attempt(self.attempts)
         job = self.job | {"task": "adjust", "drop": drop, "database": ""}
@@ -374,9 +374,9 @@ class StructureFromMotion:
             self._work(self.job | parameters | {"task": "map"}, progress)
         except NeecoError as error:  # the others may do with less memory
             return Attempt(strategy, len(self.keys), fault=str(error).removeprefix(f"{self.source}: "))
-        found = read_json(Path(parameters["model"]) / "attempt.json")
-        found["models"] = tuple(found["models"])
-        return judge(Attempt(strategy, len(self.keys), **found), self.size, self._least)
+        facts = read_json(Path(parameters["model"]) / "attempt.json")
+        facts["models"] = tuple(facts["models"])
+        return judge(Attempt(strategy, len(self.keys), **facts), self.size, self._least)
 
     def _failure(self, progress: StageProgress) -> str:
         """Explain why no strategy was of use, and what to do."""
@@ -407,10 +407,10 @@ class StructureFromMotion:
         result.unlink(missing_ok=True)
         self._work(job, progress)
         with np.load(result) as saved:  # plain arrays; object arrays are refused by default
-            found = [str(name) for name in saved["names"]]
-            if len(found) < MIN_FRAMES:
+            placed = [str(name) for name in saved["names"]]
+            if len(placed) < MIN_FRAMES:
                 raise NeecoError(
-                    f"{self.source}: a camera was found for only {len(found)} of {len(self.names)} frames (at least "
+                    f"{self.source}: a camera was found for only {len(placed)} of {len(self.names)} frames (at least "
                     f"{MIN_FRAMES} are needed); see docs/recording.md"
                 )
             if len(saved["points"]) == 0:
@@ -421,7 +421,7 @@ class StructureFromMotion:
             if best is not None and best.strategy.focal:
                 lens = estimated_lens(best.focal, best.distortion, self.size)
             return SfmResult(
-                indices=np.array([row[name] for name in found]),
+                indices=np.array([row[name] for name in placed]),
                 lens=lens,
                 reprojection_px=float(saved["reprojection"]),
                 **{name: saved[name] for name in arrays},
@@ -460,7 +460,7 @@ def run_worker(job_file: Path, source: Path, progress: StageProgress) -> float:
     if code != 0:
         tail = log_file.read_text(errors="replace").strip().splitlines()[-1:] or ["no message"]
         raise NeecoError(
-            f"{source}: structure from motion stopped with status {code} ({tail[0][:300]}); is there memory left? "
-            "Try fewer --frames"
+            f"{source}: structure from motion stopped with status {code} ({tail[0][:300]}); if memory ran out, "
+            "use fewer --frames"
         )
     return seconds

@@ -35,15 +35,15 @@ from neeco.ingest.recording.model import IngestSettings, Recording, VideoFile
 class StillScopeSettings:
     """Settings of the test whether a scope stands still, and of its second camera."""
 
-    n_frames: int = 24  # spread over the recording, that are compared with each other
-    n_cells: int = 20  # across an image, with a feature each
-    min_texture: float = 2e-5  # of a feature: the lesser eigenvalue of its slopes' covariance, of a white of 1
-    min_features: int = 30  # of an image
+    n_frames: int = 24  # frames, spread over the recording, that are compared with each other
+    n_cells: int = 20  # cells across an image, with a feature each
+    min_texture: float = 2e-5  # minimum texture of a feature: lesser eigenvalue of its slopes' covariance, white is 1
+    min_features: int = 30  # minimum number of features of an image
     in_place: float = 0.0125  # share of the image's width within which a feature is in place (tissue breathes)
-    max_return_px: float = 1.0  # error of a feature that is tracked there and back
-    still_share: float = 0.2  # of the features, in place in frames of a still scope; the others move or breathe
-    still_pairs: float = 0.85  # share of the pairs of frames, in which they are
-    max_epipolar: float = 0.004  # of the image's width, distance from epipolar lines: a quarter of a degree
+    max_return_px: float = 1.0  # maximum error of a feature that is tracked forwards and back
+    still_share: float = 0.2  # minimum share of features in place between two frames of a still scope
+    still_pairs: float = 0.85  # minimum share of the pairs of frames for which this holds
+    max_epipolar: float = 0.004  # maximum distance from epipolar lines, share of the image's width: 0.25 degrees
 
 
 STILL_SCOPE = StillScopeSettings()
@@ -80,13 +80,13 @@ def same_place(first: np.ndarray, second: np.ndarray) -> float | None:
 
 def _share_in_place(first: np.ndarray, second: np.ndarray) -> float | None:
     """`same_place` of equalised images [H, W]."""
-    found = _features(first)
-    if len(found) < STILL_SCOPE.min_features:
+    features = _features(first)
+    if len(features) < STILL_SCOPE.min_features:
         return None
-    there, seen, _ = cv2.calcOpticalFlowPyrLK(first, second, found, found.copy(), **TRACKING)
+    there, seen, _ = cv2.calcOpticalFlowPyrLK(first, second, features, features.copy(), **TRACKING)
     back, seen_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, there.copy(), **TRACKING)
-    returns = np.linalg.norm(back - found, axis=-1)[:, 0] < STILL_SCOPE.max_return_px
-    near = np.linalg.norm(there - found, axis=-1)[:, 0] < STILL_SCOPE.in_place * first.shape[1]
+    returns = np.linalg.norm(back - features, axis=-1)[:, 0] < STILL_SCOPE.max_return_px
+    near = np.linalg.norm(there - features, axis=-1)[:, 0] < STILL_SCOPE.in_place * first.shape[1]
     return float((returns & near & (seen[:, 0] > 0) & (seen_back[:, 0] > 0)).mean())
 
 
@@ -197,11 +197,11 @@ def _pairs(right: np.ndarray, left: np.ndarray, selected: np.ndarray, one_clock:
     nearest = np.abs(right - moments[:, None]).argmin(axis=1)
     off = np.abs(right[nearest] - moments)
     step = float(np.median(np.diff(left)))
-    found: dict[int, int] = {}
+    pairs: dict[int, int] = {}
     for row in np.argsort(off, kind="stable").tolist():
-        if off[row] < step / 2 and int(nearest[row]) not in found.values():
-            found[row] = int(nearest[row])
-    return found
+        if off[row] < step / 2 and int(nearest[row]) not in pairs.values():
+            pairs[row] = int(nearest[row])
+    return pairs
 
 
 def still_cameras(count: int) -> SfmResult:
@@ -229,12 +229,12 @@ def look_behind(
         none = np.zeros((camera.height, camera.width), dtype=bool)
 
         def hidden(place: int) -> np.ndarray:
-            row, found = rows[place], none
+            row, mask = rows[place], none
             for name, shape in shapes.items():
-                placed, known = poses[name]
-                if known[row]:
-                    found = found | project_mask(shape, camera_from_world @ placed[row], camera)
-            return found
+                placed, valid = poses[name]
+                if valid[row]:
+                    mask = mask | project_mask(shape, camera_from_world @ placed[row], camera)
+            return mask
 
         return hidden if shapes else None
 
@@ -247,9 +247,9 @@ def look_behind(
         other = find_background(lambda place: right.load(rows[place]), len(rows), hidden)
         surface, doubt = _by_stereo(background, other, views, right)
         if surface is None:
-            notes.append("the stereo partner's images match too little for depth; is its calibration this scope's?")
+            notes.append("the stereo partner's images match too little for depth; check its calibration")
     if surface is None:
-        deepest = [float(placed[known, 2, 3].max()) for placed, known in poses.values() if known.any()]
+        deepest = [float(placed[valid, 2, 3].max()) for placed, valid in poses.values() if valid.any()]
         swept = [(shape, poses[name][0][poses[name][1]]) for name, shape in shapes.items()]
         small = views.reduced_pinhole
         surface = surface_behind(swept, small, max(deepest, default=None), settings.scene_distance_mm)
@@ -264,7 +264,7 @@ def _by_stereo(
 ) -> tuple[TissueSurface | None, str]:
     """Return the surface from two cameras' backgrounds, None where they match too little or differ in size; and a doubt
     about their calibration."""
-    shown = left.seen > 0 if views.visible is None else (left.seen > 0) & views.visible
+    visible = left.seen > 0 if views.visible is None else (left.seen > 0) & views.visible
     if right.colors.shape != left.colors.shape:
         return None, ""
     size = views.reduced_pinhole.size
@@ -276,9 +276,9 @@ def _by_stereo(
     if error is not None and error > limit:
         doubt = (
             f"what the second camera shows lies {error:.1f} px off where its calibration puts it (median; up to "
-            f"{limit:.1f} px is usual): is the calibration this scope's, and of these images?"
+            f"{limit:.1f} px is usual): check that the calibration is this scope's and of these images"
         )
-    return surface_from_stereo(left.colors, right.colors, lenses, right_from_left, shown, size), doubt
+    return surface_from_stereo(left.colors, right.colors, lenses, right_from_left, visible, size), doubt
 
 
 def _rough_shapes(
@@ -294,18 +294,18 @@ def _rough_shapes(
     size = -(-masks.shape[2] // FLOW.step_px), -(-masks.shape[1] // FLOW.step_px)
     evidence = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in masks])
     if views.visible is not None:
-        shown = cv2.resize(reduced(views.visible.astype(np.uint8) * 255), size, interpolation=cv2.INTER_AREA) == 255
-        evidence[:, ~shown] = np.nan
+        visible = cv2.resize(reduced(views.visible.astype(np.uint8) * 255), size, interpolation=cv2.INTER_AREA) == 255
+        evidence[:, ~visible] = np.nan
     shapes, lags = {}, {}
     for name, poses_at in tracked.items():
-        poses, known = (values[rows] for values in poses_at(0.0))
-        shape = carve_shape(evidence[known], poses[known], small)
+        poses, valid = (values[rows] for values in poses_at(0.0))
+        shape = carve_shape(evidence[valid], poses[valid], small)
         if shape is not None:
             shapes[name] = shape
 
         def at_rows(lag: float, of: PosesAt = poses_at) -> tuple[np.ndarray, np.ndarray]:
-            poses, known = of(lag)
-            return poses[rows], known[rows]
+            poses, valid = of(lag)
+            return poses[rows], valid[rows]
 
         lags[name] = best_lag(evidence, at_rows, small, longest_lag)
     return shapes, lags

@@ -66,9 +66,9 @@ class TissueSurface:
         depth = self.depth[v.astype(int), u.astype(int)]
         x, y = np.minimum(u * scale, width - 0.5), np.minimum(v * scale, height - 0.5)
         row, column = y.astype(int), x.astype(int)
-        shown = np.isfinite(depth) if visible is None else visible[row, column] & np.isfinite(depth)
+        valid = np.isfinite(depth) if visible is None else visible[row, column] & np.isfinite(depth)
         rays = np.stack([(x - pinhole.cx) / pinhole.fl_x, (y - pinhole.cy) / pinhole.fl_y, np.ones(len(x))], -1)
-        return (rays * depth[:, None])[shown], np.rint(colors[row, column][shown]).astype(np.uint8)
+        return (rays * depth[:, None])[valid], np.rint(colors[row, column][valid]).astype(np.uint8)
 
 
 def surface_behind(
@@ -122,16 +122,16 @@ def _smoothest_behind(most: np.ndarray) -> np.ndarray:
     """Inverse depths [rows, columns] that bend least, nowhere more than `most` (0: nothing is known there), and near
     it, or near the least of all: cells at which the surface would come before an instrument hold it back, until none
     does."""
-    known = most > 0
-    wanted, weight = np.where(known, most, most[known].min()), np.full(most.shape, SETTINGS.pull_weight)
+    bound = most > 0
+    wanted, weight = np.where(bound, most, most[bound].min()), np.full(most.shape, SETTINGS.pull_weight)
     for _ in range(SETTINGS.max_rounds):
-        found = _smoothed(wanted, weight)
-        before = known & (found > most * 1.001) & (weight < 1)
+        smooth = _smoothed(wanted, weight)
+        before = bound & (smooth > most * 1.001) & (weight < 1)
         if not before.any():
             break
         weight[before] = 1.0
     # beyond all that is known it may bend to infinity
-    return np.maximum(found, SETTINGS.min_inverse_ratio * most[known].min())
+    return np.maximum(smooth, SETTINGS.min_inverse_ratio * most[bound].min())
 
 
 def _smoothed(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -219,20 +219,20 @@ def epipolar_error(
 
 def _median_filled(depth: np.ndarray) -> np.ndarray:
     """Return depth [H, W] mm without single outliers; NaN stays."""
-    found = cv2.medianBlur(np.nan_to_num(depth, nan=0.0).astype(np.float32), 5)
-    return np.where(found > 0, found, np.nan)
+    filtered = cv2.medianBlur(np.nan_to_num(depth, nan=0.0).astype(np.float32), 5)
+    return np.where(filtered > 0, filtered, np.nan)
 
 
 def _in_cells(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """Medians [rows, columns] of values [H, W] in cells; NaN where fewer than half are known."""
     tall = np.array_split(values, rows, axis=0)
-    found = np.full((rows, columns), np.nan)
+    medians = np.full((rows, columns), np.nan)
     for row, band in enumerate(tall):
         for column, cell in enumerate(np.array_split(band, columns, axis=1)):
-            known = cell[np.isfinite(cell)]
-            if 2 * len(known) >= cell.size:
-                found[row, column] = np.median(known)
-    return found
+            finite = cell[np.isfinite(cell)]
+            if 2 * len(finite) >= cell.size:
+                medians[row, column] = np.median(finite)
+    return medians
 
 
 def _matched_depth(
@@ -278,7 +278,7 @@ def _matched_depth(
     turned = rays @ turn_left.T
     x = turned[..., 0] / turned[..., 2] * new_left[0, 0] + new_left[0, 2]
     y = turned[..., 1] / turned[..., 2] * new_left[1, 1] + new_left[1, 2]
-    found = cv2.remap(
+    warped = cv2.remap(
         depth.astype(np.float32), x.astype(np.float32), y.astype(np.float32), cv2.INTER_NEAREST, borderValue=np.nan
     )
-    return np.asarray(found / turned[..., 2])  # along the rectified z, then along the left camera's
+    return np.asarray(warped / turned[..., 2])  # along the rectified z, then along the left camera's

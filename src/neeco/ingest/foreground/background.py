@@ -15,15 +15,15 @@ from neeco.capture.model import evenly_spaced
 class BackgroundSettings:
     """Settings of the background of a still scope."""
 
-    n_frames: int = 64  # for one background
-    max_bytes: int = 2**28  # of the images of one background
-    n_candidates: int = 7  # samples of a pixel, about which half of the others may lie
+    n_frames: int = 64  # maximum number of images for one background
+    max_bytes: int = 2**28  # maximum bytes of these images
+    n_candidates: int = 7  # number of a pixel's samples about which half of the others may lie
     normal_quartile: float = 0.6745  # standard deviations of a normal distribution, within which its half lies
-    noise_floor: float = 11.0  # of 255, of sensor and compression
-    max_deviations: float = 4.0  # of a pixel's own spread, within which it shows the background
-    shadow_share: tuple[float, float] = (0.35, 0.97)  # of the light, that is left in a shadow
-    shadow_tint: float = 0.08  # by which a shadow may change the ratio of two colours
-    min_saturation: float = 0.2  # of a background on which a shadow differs from a dark instrument
+    noise_floor: float = 11.0  # noise of sensor and compression, of 255
+    max_deviations: float = 4.0  # maximum deviation from the background, in standard deviations of the pixel
+    shadow_share: tuple[float, float] = (0.35, 0.97)  # range of the share of light that is left in a shadow
+    shadow_tint: float = 0.08  # maximum change of the ratio of two colours by a shadow
+    min_saturation: float = 0.2  # minimum saturation of a background on which a shadow differs from a dark instrument
 
 
 BACKGROUND = BackgroundSettings()
@@ -106,17 +106,17 @@ def _modes(frames: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndar
             distances = np.where(out, np.inf, np.abs(samples - center).mean(-1))
             return distances, np.take_along_axis(np.sort(distances, axis=0), half[None] - 1, 0)[0]
 
-        best, found = np.full(len(count), np.inf, np.float32), samples[0]
+        best, mode = np.full(len(count), np.inf, np.float32), samples[0]
         for place in np.linspace(0, 1, BACKGROUND.n_candidates):
             center = np.take_along_axis(samples, np.rint(place * (count - 1)).astype(int)[None, :, None], 0)[0]
             reach = half_about(center)[1]
-            found = np.where((reach < best)[:, None], center, found)
+            mode = np.where((reach < best)[:, None], center, mode)
             best = np.minimum(best, reach)
         for _ in range(2):  # from one sample to the mean of its half
-            distances, reach = half_about(found)
+            distances, reach = half_about(mode)
             near = distances <= reach
-            found = (samples * near[..., None]).sum(0) / near.sum(0)[:, None]
-        colors[row], spread[row] = found, reach / BACKGROUND.normal_quartile
+            mode = (samples * near[..., None]).sum(0) / near.sum(0)[:, None]
+        colors[row], spread[row] = mode, reach / BACKGROUND.normal_quartile
     return colors, spread
 
 

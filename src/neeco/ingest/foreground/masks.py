@@ -23,30 +23,30 @@ from neeco.ingest.frames.images import reduced
 class MaskSettings:
     """Thresholds of what moves."""
 
-    levels: int = 20  # of each colour
-    blur_levels: float = 0.7  # of the histogram
-    min_share: float = 1e-7  # of a colour that never occurs
+    levels: int = 20  # levels of each colour channel
+    blur_levels: float = 0.7  # standard deviation of the histogram's blur, levels
+    min_share: float = 1e-7  # share assumed of a colour that never occurs
     # before a still scope
-    min_area: float = 0.001  # share of the image
-    margin_px: int = 4  # about what moves, where its colour counts for neither side
-    hidden_px: int = 3  # about what moves, where the background does not count
-    min_odds: float = 0.5  # logarithm, from which colours belong to a piece in the first pass
-    certain_odds: float = 1.0  # logarithm, from which a pixel is instrument by its colour alone
-    tissue_odds: float = -2.0  # logarithm, up to which a pixel that moves is tissue
-    smooth_px: float = 1.5  # over which odds are averaged, at first
-    outline_px: float = 0.7  # over which odds are averaged for outlines
-    moving_share: float = 0.2  # of a piece with the instrument's colours
-    min_seen: float = 0.02  # share of images that show the background, without which it is unknown
+    min_area: float = 0.001  # minimum area of a piece, share of the image
+    margin_px: int = 4  # margin about moving pixels, whose colours count for neither side
+    hidden_px: int = 3  # margin about moving pixels, where the background does not count
+    min_odds: float = 0.5  # log odds from which pixels belong to a piece in the first pass
+    certain_odds: float = 1.0  # log odds from which a pixel is instrument by its colour alone
+    tissue_odds: float = -2.0  # log odds up to which a moving pixel is tissue
+    smooth_px: float = 1.5  # standard deviation of the blur of odds, at first
+    outline_px: float = 0.7  # standard deviation of the blur of odds, for outlines
+    moving_share: float = 0.2  # minimum share of moving pixels of a piece with the instrument's colours
+    min_seen: float = 0.02  # share of images that show the background, below which it is unknown
     # before a scope that moves
     may_move: float = 0.3  # share of neighbours in time against which a pixel moves, from which it may be an instrument
     moves: float = 0.7  # the same share, from which its colour counts as an instrument's
     still: float = 0.2  # the same share, up to which its colour counts as tissue
-    flow_min_odds: float = 1.0  # logarithm, from which colours belong to a piece
-    flow_outline_odds: float = 0.5  # logarithm, from which a pixel is instrument in the end
-    n_rounds: int = 4  # each with the colours of the masks before
-    flow_min_area: float = 0.004  # share of the image
-    flow_outline_px: float = 1.0  # over which odds are averaged for outlines
-    flow_moving_share: float = 0.3  # of a piece with the instrument's colours
+    flow_min_odds: float = 1.0  # log odds from which pixels belong to a piece
+    flow_outline_odds: float = 0.5  # log odds from which a pixel is instrument in the end
+    n_rounds: int = 4  # rounds, each with the colours of the previous masks
+    flow_min_area: float = 0.004  # minimum area of a piece, share of the image
+    flow_outline_px: float = 1.0  # standard deviation of the blur of odds, for outlines
+    flow_moving_share: float = 0.3  # minimum share of moving pixels of a piece with the instrument's colours
 
 
 MASKS = MaskSettings()
@@ -61,9 +61,9 @@ class ColorOdds:
 
     of_color: np.ndarray
 
-    def smoothed(self, found: np.ndarray, px: float) -> np.ndarray:
+    def smoothed(self, colors: np.ndarray, px: float) -> np.ndarray:
         """Log odds float32 [h, w] of the colours [h, w] of an image (`color_levels`), averaged over px."""
-        return np.asarray(cv2.GaussianBlur(self.of_color[found], (0, 0), px))
+        return np.asarray(cv2.GaussianBlur(self.of_color[colors], (0, 0), px))
 
 
 def color_levels(images: np.ndarray) -> np.ndarray:
@@ -107,26 +107,26 @@ def moving_masks(
     """
     background = find_background(lambda row: reduced(load(row)), count)
     images = np.stack([reduced(load(int(row))) for row in rows])
-    shown = _shown(images, visible)
-    moves = np.stack([whole_pieces(background.differs(image), MASKS.min_area) for image in images]) & shown
+    field = _shown(images, visible)
+    moves = np.stack([whole_pieces(background.differs(image), MASKS.min_area) for image in images]) & field
     colors = color_levels(images)
     around = np.stack([_grown(mask, MASKS.margin_px) for mask in moves])
-    odds = color_odds(colors, moves, ~around & shown)
+    odds = color_odds(colors, moves, ~around & field)
     covering = []
-    for mask, found in zip(moves, colors, strict=True):
-        likely = odds.smoothed(found, MASKS.smooth_px) > MASKS.min_odds
+    for mask, levels in zip(moves, colors, strict=True):
+        likely = odds.smoothed(levels, MASKS.smooth_px) > MASKS.min_odds
         piece = whole_pieces(likely, MASKS.min_area, mask, MASKS.moving_share)
         covering.append(_grown(mask | piece, MASKS.hidden_px))
     hidden = np.stack(covering)
     background = find_background(lambda place: images[place], len(rows), lambda place: hidden[place])
     unknown = background.seen < MASKS.min_seen
     masks = []
-    for image, found, covered in zip(images, colors, hidden, strict=True):
+    for image, levels, covered in zip(images, colors, hidden, strict=True):
         mask = whole_pieces(background.differs(image), MASKS.min_area) | (covered & unknown)
-        likely = odds.smoothed(found, MASKS.outline_px)
+        likely = odds.smoothed(levels, MASKS.outline_px)
         mask_or_color = (mask & (likely > MASKS.tissue_odds)) | (likely > MASKS.certain_odds)
         masks.append(whole_pieces(mask_or_color, MASKS.min_area, mask, MASKS.moving_share))
-    return shown & np.stack(masks)
+    return field & np.stack(masks)
 
 
 def passing_masks(
@@ -142,29 +142,29 @@ def passing_masks(
     view, where it has a border. Flow bleeds over outlines, and is 0 within an instrument without texture.
     """
     images = np.stack([reduced(load(row)) for row in rows.tolist()])
-    shown = _shown(images, visible)
+    field = _shown(images, visible)
     evidence = np.nan_to_num(flow.moving_pixels(rows, moving_px)).astype(np.float32)
     moves = np.stack([cv2.resize(share, images.shape[2:0:-1]) for share in evidence])  # [R, h, w]
-    candidates = np.stack([cv2.dilate((share > MASKS.may_move).astype(np.uint8), REACH) > 0 for share in moves]) & shown
+    candidates = np.stack([cv2.dilate((share > MASKS.may_move).astype(np.uint8), REACH) > 0 for share in moves]) & field
     colors = color_levels(images)
     inside, outside = moves > MASKS.moves, moves <= MASKS.still
     for _ in range(MASKS.n_rounds):
-        odds = color_odds(colors, inside & shown, outside & shown)
+        odds = color_odds(colors, inside & field, outside & field)
         inside = np.stack([
-            whole_pieces((odds.smoothed(found, MASKS.smooth_px) > MASKS.flow_min_odds) & may, MASKS.flow_min_area)
-            for found, may in zip(colors, candidates, strict=True)
+            whole_pieces((odds.smoothed(levels, MASKS.smooth_px) > MASKS.flow_min_odds) & may, MASKS.flow_min_area)
+            for levels, may in zip(colors, candidates, strict=True)
         ])  # fmt: skip
         outside = ~inside
     # what stood still for a while, and thin ends: of the same colours and in one piece with what moves
-    odds = color_odds(colors, inside & shown, outside & shown)
+    odds = color_odds(colors, inside & field, outside & field)
     return np.stack([
         whole_pieces(
-            (odds.smoothed(found, MASKS.flow_outline_px) > MASKS.flow_outline_odds) & shown,
+            (odds.smoothed(levels, MASKS.flow_outline_px) > MASKS.flow_outline_odds) & field,
             MASKS.flow_min_area,
             mask,
             MASKS.flow_moving_share,
         )
-        for found, mask in zip(colors, inside, strict=True)
+        for levels, mask in zip(colors, inside, strict=True)
     ])  # fmt: skip
 
 

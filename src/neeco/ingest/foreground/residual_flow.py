@@ -23,11 +23,11 @@ from neeco.ingest.frames.images import SfmResult
 class FlowSettings:
     """Settings of the flow that the scope's motion leaves."""
 
-    step_px: int = 4  # between the places where flow is compared
+    step_px: int = 4  # spacing of the places where flow is compared
     interval_s: float = 0.12  # between frames that are compared: one and two intervals before and after
     bleeding: int = 2  # places by which flow bleeds over the border of the field of view
-    patch_share: float = 0.04  # of the image: about the area of an instrument's front
-    min_depth: float = 1e-9  # in SfM's unit, that may be divided by
+    patch_share: float = 0.04  # area of a patch, share of the image: about an instrument's front
+    min_depth: float = 1e-9  # minimum depth, in SfM's unit, that may be divided by
 
 
 FLOW = FlowSettings()
@@ -69,8 +69,8 @@ class ResidualFlow:
         self.hidden = np.zeros(self.u.shape, dtype=bool)
         if visible is not None:
             size = self.u.shape[::-1]
-            shown = cv2.resize(visible.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-            self.hidden = binary_dilation(shown < 1, iterations=FLOW.bleeding)
+            share = cv2.resize(visible.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            self.hidden = binary_dilation(share < 1, iterations=FLOW.bleeding)
 
     def moving_pixels(self, rows: np.ndarray, moving_px: float) -> np.ndarray:
         """Shares [R, h, w] of the neighbours of rows [R] to which a pixel's residual flow exceeds `moving_px`; NaN
@@ -86,12 +86,12 @@ class ResidualFlow:
 
     def fastest_motion(self) -> np.ndarray:
         """Residual flow [M-1] px of the fastest patch of each frame to the next."""
-        shown = ~self.hidden
-        patch = max(1, round(FLOW.patch_share * shown.sum()))
+        visible = ~self.hidden
+        patch = max(1, round(FLOW.patch_share * visible.sum()))
         motion = np.zeros(len(self.sfm.indices) - 1)
         for row in np.flatnonzero(self.episodes[1:] == self.episodes[:-1]).tolist():
             (residual,) = self._residuals(row, [row + 1])
-            motion[row] = np.sort(residual[shown])[-patch:].mean()
+            motion[row] = np.sort(residual[visible])[-patch:].mean()
         return motion
 
     def _residuals(self, row: int, others: list[int]) -> Iterator[np.ndarray]:

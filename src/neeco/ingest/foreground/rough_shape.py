@@ -23,21 +23,21 @@ from neeco.ingest.frames.images import SfmResult
 class RoughShapeSettings:
     """Settings of the search for a rough shape."""
 
-    n_cells: int = 48  # of the carving grid, per side
-    reach: float = 0.4  # of the distance to the camera: half a side of that grid
-    min_visible: float = 0.3  # share of the frames that must have a point in view
-    min_agreement: float = 0.3  # share of the frames in which a point of the instrument lies on moving pixels
+    n_cells: int = 48  # cells of the carving grid, per side
+    reach: float = 0.4  # half a side of that grid, share of the distance to the camera
+    min_visible: float = 0.3  # minimum share of the frames with a point in view
+    min_agreement: float = 0.3  # minimum share of the frames in which a point of the instrument lies on moving pixels
     # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
     min_relative: float = 0.85
-    lag_cells: int = 16  # of the grid for lags, per side
+    lag_cells: int = 16  # cells of the grid for lags, per side
     lag_step_s: float = 0.1  # between lags that are tried
-    max_lag_s: float = 60.0  # of lags that are tried
-    min_known: float = 0.5  # share of the frames that need a pose at a lag
-    lag_gain: float = 1.1  # ratio of agreement to that at 0 and at all other lags
+    max_lag_s: float = 60.0  # maximum lag that is tried
+    min_known: float = 0.5  # minimum share of the frames with a pose at a lag
+    lag_gain: float = 1.1  # minimum ratio of agreement to that at 0 and at all other lags
     lag_peak: float = 0.8  # share of the best agreement, from which a lag counts in the weighted mean
-    lag_lobe_s: float = 0.5  # about the best lag, within which lags count in it
-    margin_px: int = 6  # about its projection
-    nearest_mm: float = 1e-3  # in front of the camera
+    lag_lobe_s: float = 0.5  # distance from the best lag within which lags count in it
+    margin_px: int = 6  # margin about the projection of the shape
+    nearest_mm: float = 1e-3  # minimum depth in front of the camera
 
 
 ROUGH_SHAPE = RoughShapeSettings()
@@ -81,9 +81,9 @@ def best_lag(evidence: np.ndarray, poses_at: PosesAt, pinhole: Lens, longest: fl
     lags = ROUGH_SHAPE.lag_step_s * np.arange(-count, count + 1)
     scores = np.zeros(len(lags))
     for index, lag in enumerate(lags):
-        poses, known = poses_at(float(lag))
-        if known.sum() >= ROUGH_SHAPE.min_known * len(evidence):
-            _, _, share, enough = _agreement(evidence[known], poses[known], pinhole, ROUGH_SHAPE.lag_cells)
+        poses, valid = poses_at(float(lag))
+        if valid.sum() >= ROUGH_SHAPE.min_known * len(evidence):
+            _, _, share, enough = _agreement(evidence[valid], poses[valid], pinhole, ROUGH_SHAPE.lag_cells)
             scores[index] = np.quantile(share[enough], 0.99) if enough.any() else 0.0
     return lag_of(scores)
 

@@ -13,12 +13,12 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 class ShaftLineSettings:
     """Settings of lines of shafts in masks."""
 
-    min_elongation: float = 2.0  # length over width of a shaft
-    min_area: float = 0.002  # share of the image: smaller pieces of a mask are noise
-    edge_px: int = 2  # from the image's border, within which a piece continues beyond it
-    entering: float = 0.5  # share of a piece, from the border, that its line is fitted to
-    min_slices: int = 6  # px along the shaft, at least, for that
-    line_rounds: int = 4  # of the robust fit of a line
+    min_elongation: float = 2.0  # minimum ratio of a shaft's length to its width
+    min_area: float = 0.002  # minimum area of a piece, share of the image: smaller ones are noise
+    edge_px: int = 2  # distance from the image's border within which a piece continues beyond it
+    entering: float = 0.5  # share of a piece, from the border, to which its line is fitted
+    min_slices: int = 6  # minimum length along the shaft for that fit, px
+    line_rounds: int = 4  # rounds of the robust fit of a line
     smooth_px: float = 1.5  # of distances: the steps of a mask's outline would be taken for its shape
 
 
@@ -76,15 +76,15 @@ def silhouettes_of(
     """Return the silhouettes of masks bool [F, h, w]. hidden: bool [h, w], beyond a round border, where no outline is
     real."""
     unknown = np.zeros(masks.shape[1:], dtype=bool) if hidden is None else hidden
-    found = np.empty(masks.shape, dtype=np.float32)
+    distances = np.empty(masks.shape, dtype=np.float32)
     for row, mask in enumerate(masks):
         inner, outer = mask | unknown, ~mask | unknown
         inside = distance_transform_edt(inner) if not inner.all() else np.full(mask.shape, np.inf)
         outside = distance_transform_edt(outer) if not outer.all() else np.full(mask.shape, np.inf)
         signed = np.where(mask, inside - 0.5, 0.5 - outside)
         limit = float(np.hypot(*mask.shape))
-        found[row] = gaussian_filter(np.clip(signed, -limit, limit), SHAFT_LINES.smooth_px, mode="nearest")
-    return Silhouettes(masks & ~unknown, found, intrinsics, shaft_lines(masks & ~unknown, hidden))
+        distances[row] = gaussian_filter(np.clip(signed, -limit, limit), SHAFT_LINES.smooth_px, mode="nearest")
+    return Silhouettes(masks & ~unknown, distances, intrinsics, shaft_lines(masks & ~unknown, hidden))
 
 
 @dataclass(frozen=True, eq=False)

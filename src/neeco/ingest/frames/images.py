@@ -82,17 +82,17 @@ def reduced(image: np.ndarray) -> np.ndarray:
 class ChoiceSettings:
     """Thresholds of the choice of frames."""
 
-    neighbours: int = 7  # frames on each side, whose sharpness a frame is compared with
-    noise: float = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
+    neighbours: int = 7  # frames on each side with which a frame's sharpness is compared
+    noise: float = 0.004  # mean absolute change of the picture, in [0, 1], caused by sensor noise alone
     noise_at_a_place: float = 0.06  # the same at one place of a thumbnail
     noise_mm: float = 0.3  # of the state, within the tracker's noise
     noise_rad: float = 0.005  # the same, of rotation
-    max_ranges: int = 3  # of frames, named in a note
-    thumbnail_px: int = 64  # width
-    min_repeated: int = 5  # repeated pictures that are worth a note where no state contradicts them
-    aspect_tolerance: float = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
-    min_point_images: int = 4  # that observe points that are tissue
-    max_point_error_px: float = 1.2  # misfit of such points
+    max_ranges: int = 3  # maximum number of ranges of frames in a note
+    thumbnail_px: int = 64  # width of thumbnails
+    min_repeated: int = 5  # minimum number of repeated pictures for a note where no state contradicts them
+    aspect_tolerance: float = 0.02  # tolerance of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
+    min_point_images: int = 4  # minimum number of images that observe a point that is tissue
+    max_point_error_px: float = 1.2  # maximum misfit of such a point
 
 
 SETTINGS = ChoiceSettings()
@@ -340,10 +340,10 @@ def _check_pixels(video: VideoSource, lens: Lens | None, where: str, data: Episo
             "intrinsics of the frames as stored, or square pixels: ffmpeg -vf scale=iw*sar:ih,setsar=1"
         )
     if lens is not None and video.pixel_aspect != 1:
-        found, expected = lens.fl_x / lens.fl_y, 1 / video.pixel_aspect
-        if abs(found / expected - 1) > SETTINGS.aspect_tolerance:
+        ratio, expected = lens.fl_x / lens.fl_y, 1 / video.pixel_aspect
+        if abs(ratio / expected - 1) > SETTINGS.aspect_tolerance:
             data.notes.add(
-                f"{where}: fl_x / fl_y is {found:.3g}, the shape of {video.path.name}'s pixels says {expected:.3g}"
+                f"{where}: fl_x / fl_y is {ratio:.3g}, the shape of {video.path.name}'s pixels says {expected:.3g}"
             )
 
 
@@ -359,11 +359,11 @@ def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[i
 
     features = frame_features(images())
     states, usable = data.coverage_states()
-    known = states.any()  # else the clocks are found later, by frames that are not frozen
-    frozen = frozen_frames(features, usable, states) if known else np.flatnonzero(features.repeats)
-    if len(frozen) >= (1 if known else SETTINGS.min_repeated):
+    posed = states.any()  # else the clocks are found later, by frames that are not frozen
+    frozen = frozen_frames(features, usable, states) if posed else np.flatnonzero(features.repeats)
+    if len(frozen) >= (1 if posed else SETTINGS.min_repeated):
         why = (
-            "while the state changes; frozen, and left out" if known else "and are left out; is the video frozen there?"
+            "while the state changes; frozen, and left out" if posed else "and are left out; check the video for stalls"
         )
         share = f"{len(frozen)} of {count} frames ({len(frozen) / count:.0%}: {describe_ranges(frozen)})"
         data.notes.add(f"{data.video.path.name}: {share} repeat the picture before them {why}")

@@ -32,23 +32,23 @@ class TextureSettings:
     (gains of 0.3 to 0.6 against the truth at 1 to 3 frames, about 1 from 5 on).
     """
 
-    column_rad: float = math.radians(3.0)  # between columns of the unrolled texture
-    max_azimuth: float = math.radians(63.0)  # either side of the view; beyond, the surface is too oblique
-    row_mm: float = 0.3  # between rows
+    column_rad: float = math.radians(3.0)  # spacing of columns of the unrolled texture
+    max_azimuth: float = math.radians(63.0)  # maximum azimuth from the view; beyond, the surface is too oblique
+    row_mm: float = 0.3  # spacing of rows
     band: tuple[float, float] = (-0.1, 0.4)  # of the working length, from the origin: beyond it jaws move on their own
-    max_columns: int = 20  # by which two textures are shifted against each other: they still overlap by half
-    max_rows: int = 4  # likewise along the shaft, whose end is known to 0.5 mm
-    row_step: int = 2  # between those shifts
-    min_visible: float = 0.9  # share of a texture that must be in the image
-    max_contrast: float = 0.8  # of logarithmic colour: a glint is clipped
+    max_columns: int = 20  # maximum shift of two textures against each other: they still overlap by half
+    max_rows: int = 4  # maximum shift along the shaft, whose end is known to 0.5 mm
+    row_step: int = 2  # step of these shifts
+    min_visible: float = 0.9  # minimum share of a texture in the image
+    max_contrast: float = 0.8  # maximum contrast of logarithmic colour: a glint is clipped
     shading_frames: float = 15.0  # standard deviation of the window over which shading is averaged
-    min_score: float = 0.3  # correlation of a hypothesis
-    max_hypotheses: int = 3  # per pair
-    near_frames: tuple[int, ...] = (5, 6, 8, 10, 12, 15, 20, 30, 60)  # between those that are always compared
-    far_frames: int = 20  # beyond which similar frames are compared: where a view comes back, drift ends
-    far_pairs: int = 8  # of these for every frame
-    block: int = 256  # frames compared with all others at a time
-    nearest_mm: float = 1.0  # in front of the camera
+    min_score: float = 0.3  # minimum correlation of a hypothesis
+    max_hypotheses: int = 3  # maximum number of hypotheses per pair
+    near_frames: tuple[int, ...] = (5, 6, 8, 10, 12, 15, 20, 30, 60)  # distances of frames always compared
+    far_frames: int = 20  # distance beyond which similar frames are compared: where a view comes back, drift ends
+    far_pairs: int = 8  # number of these for every frame
+    block: int = 256  # number of frames compared with all others at a time
+    nearest_mm: float = 1.0  # minimum depth in front of the camera
 
 
 SETTINGS = TextureSettings()
@@ -212,15 +212,15 @@ def _correlations(textures: np.ndarray, rows: slice) -> np.ndarray:
     """Normalised cross-correlation [R, F, 2 M + 1] of some textures with all of [F, A, B, C]; at [i, j, M + q] the
     second is the first shifted by q columns, and by the number of rows within `max_rows` that fits best."""
     height, width = textures.shape[1:3]
-    own = textures[rows]
-    scores = np.full((len(own), len(textures), 2 * SETTINGS.max_columns + 1), -1.0, np.float32)
+    chosen = textures[rows]
+    scores = np.full((len(chosen), len(textures), 2 * SETTINGS.max_columns + 1), -1.0, np.float32)
     for down in range(-SETTINGS.max_rows, SETTINGS.max_rows + 1, SETTINGS.row_step):
         upper, lower = slice(max(-down, 0), height - max(down, 0)), slice(max(down, 0), height - max(-down, 0))
         for shift in range(-SETTINGS.max_columns, SETTINGS.max_columns + 1):
             left, right = slice(max(-shift, 0), width - max(shift, 0)), slice(max(shift, 0), width - max(-shift, 0))
-            found = _normalised(own[:, upper, left]) @ _normalised(textures[:, lower, right]).T
+            correlation = _normalised(chosen[:, upper, left]) @ _normalised(textures[:, lower, right]).T
             best = scores[:, :, SETTINGS.max_columns + shift]
-            np.maximum(best, found, out=best)
+            np.maximum(best, correlation, out=best)
     return scores
 
 
@@ -244,9 +244,9 @@ def roll_pairs(textures: np.ndarray, visible: np.ndarray) -> RollPairs:
         # pairs are counted once: the second comes later
         scores = _correlations(textures[start:], slice(0, SETTINGS.block))
         first, second = _chosen(scores.max(-1), visible[start:])
-        turns, found = _peaks(scores[first, second])
-        good = found[:, 0] >= SETTINGS.min_score
-        blocks.append(RollPairs(first[good] + start, second[good] + start, turns[good], found[good]))
+        turns, peaks = _peaks(scores[first, second])
+        good = peaks[:, 0] >= SETTINGS.min_score
+        blocks.append(RollPairs(first[good] + start, second[good] + start, turns[good], peaks[good]))
     return RollPairs(
         *(np.concatenate([getattr(block, name) for block in blocks]) for name in ("first", "second", "turns", "scores"))
     )

@@ -22,30 +22,30 @@ class AngleSettings:
     """Thresholds and standard deviations by which roll and joints are solved."""
 
     correlation_s: float = 0.72  # s, time scale of a hand's motion
-    roll_sd: float = 0.7  # rad, of the roll's changes over longer times
-    joint_sd: float = 0.2  # rad, of a joint's, beyond what silhouettes show
-    mean_sd: float = 1.4  # rad, of the mean of either
-    texture_sd_deg: float = 4.0  # of the roll that a texture shows in one frame: from an axis 0.2 mm off
-    pair_sd_deg: float = 3.0  # of a pair of correlation 1
-    uncorrelated_sd_deg: float = 8.0  # added to that towards correlation 0
+    roll_sd: float = 0.7  # rad, standard deviation of the roll's changes over longer times
+    joint_sd: float = 0.2  # rad, standard deviation of a joint's changes, beyond what silhouettes show
+    mean_sd: float = 1.4  # rad, standard deviation of the mean of either
+    texture_sd_deg: float = 4.0  # standard deviation of the roll that one frame's texture shows: the axis is 0.2 mm off
+    pair_sd_deg: float = 3.0  # standard deviation of a pair of correlation 1
+    uncorrelated_sd_deg: float = 8.0  # added to that at correlation 0
     even_score: float = 0.5  # correlation at which a hypothesis is as likely right as wrong
-    score_scale: float = 0.08  # of the correlation about it, over which that changes
+    score_scale: float = 0.08  # scale of the correlation over which this likelihood changes
     pair_weight: float = 0.01  # residual shading shifts some hundred pairs of the same two moments by the same angle
-    gain_range: tuple[float, float] = (0.4, 1.2)  # of a turn in textures
+    gain_range: tuple[float, float] = (0.4, 1.2)  # range of the gain of a turn in textures
     gain_prior: float = 0.02  # weight of the prior of that gain, which is 1
-    min_gain_answers: int = 3  # hand-posed frames from which that gain is estimated
-    n_rounds: int = 8  # of expectation maximisation
+    min_gain_answers: int = 3  # minimum number of hand-posed frames from which that gain is estimated
+    n_rounds: int = 8  # rounds of expectation maximisation
     first_widening: float = 4.0  # factor on the pairs' deviations in the first round
-    agreeing_deg: float = 6.0  # by which a pair that fits may differ from the rolls
-    min_agreeing: int = 12  # pairs that must span a gap between frames
-    width_sd: float = 0.7  # rad, of a joint by the silhouette's width
-    shape_sd: float = 0.35  # rad, of a joint by the silhouette's whole shape
-    width_noise_deg: float = 3.0  # of an opening by its width, where the hinge's axis points at the camera
-    min_cosine: float = 0.35  # of the roll, by which an opening is divided
-    joint_sd_scale: float = 0.5  # of the posterior: the priors above leave room for any instrument
-    shape_scale: float = 0.8  # of the median distance between two silhouettes
-    jitter: float = 1e-6  # rad^2, so that covariances can be inverted
-    hand_sd_deg: float = 3.5  # of a hand-posed angle
+    agreeing_deg: float = 6.0  # maximum difference from the rolls of a pair that agrees
+    min_agreeing: int = 12  # minimum number of agreeing pairs that span a gap between frames
+    width_sd: float = 0.7  # rad, standard deviation of a joint by the silhouette's width
+    shape_sd: float = 0.35  # rad, standard deviation of a joint by the silhouette's whole shape
+    width_noise_deg: float = 3.0  # standard deviation of an opening by its width, where the hinge points at the camera
+    min_cosine: float = 0.35  # minimum cosine of the roll, by which an opening is divided
+    joint_sd_scale: float = 0.5  # factor on posterior standard deviations: the priors leave room for any instrument
+    shape_scale: float = 0.8  # ratio of the kernel's length to the median distance between two silhouettes
+    jitter: float = 1e-6  # rad^2, added to variances so that covariances can be inverted
+    hand_sd_deg: float = 3.5  # standard deviation of a hand-posed angle
 
 
 SETTINGS = AngleSettings()
@@ -105,20 +105,20 @@ def _chained(
     np.add.at(precision, (frames, frames), np.radians(SETTINGS.hand_sd_deg) ** -2)
     np.add.at(pull, frames, (angles - center) * np.radians(SETTINGS.hand_sd_deg) ** -2)
     rolls = np.linalg.solve(precision, pull)
-    own = np.eye(len(times)) * np.radians(SETTINGS.texture_sd_deg) ** -2
-    shown, known, share = rolls, precision, 1.0
+    noise_precision = np.eye(len(times)) * np.radians(SETTINGS.texture_sd_deg) ** -2
+    texture_rolls, information, share = rolls, precision, 1.0
     for sharpness in np.linspace(0.0, 1.6, SETTINGS.n_rounds).clip(max=1.0):
         widened = SETTINGS.first_widening + (1 - SETTINGS.first_widening) * sharpness
-        weights, turns = _likely(pairs, shown, view, share, widened)
+        weights, turns = _likely(pairs, texture_rolls, view, share, widened)
         between, toward = _differences(pairs, weights, turns, len(times))
         # textures show the roll and an error of each frame, which is solved for, too
-        inner = np.linalg.solve(between + own, np.column_stack([own, toward]))
-        known = precision + own - own @ inner[:, :-1]
-        rolls = np.linalg.solve(known, pull + own @ inner[:, -1])
-        shown = inner[:, :-1] @ rolls + inner[:, -1]
+        inner = np.linalg.solve(between + noise_precision, np.column_stack([noise_precision, toward]))
+        information = precision + noise_precision - noise_precision @ inner[:, :-1]
+        rolls = np.linalg.solve(information, pull + noise_precision @ inner[:, -1])
+        texture_rolls = inner[:, :-1] @ rolls + inner[:, -1]
         if len(frames) >= SETTINGS.min_gain_answers:
             share = _share_shown(pairs, rolls + view, weights, turns, view, share)
-    return AnglePosterior(rolls + center + view, np.linalg.inv(known))
+    return AnglePosterior(rolls + center + view, np.linalg.inv(information))
 
 
 def solve_joint(
@@ -153,8 +153,8 @@ def solve_joint(
 
 def chain_breaks(pairs: RollPairs, rolls: AnglePosterior) -> list[int]:
     """Frames before which the chain of rolls breaks: too few pairs that agree with the rolls span the gap."""
-    found = rolls.values[pairs.second] - rolls.values[pairs.first]
-    agree = np.abs(_wrapped(found[:, None] - pairs.turns)) < np.radians(SETTINGS.agreeing_deg)
+    turned = rolls.values[pairs.second] - rolls.values[pairs.first]
+    agree = np.abs(_wrapped(turned[:, None] - pairs.turns)) < np.radians(SETTINGS.agreeing_deg)
     good = (agree & (pairs.scores > 0)).any(1)
     spans = np.zeros(len(rolls.values) + 1)
     np.add.at(spans, pairs.first[good] + 1, 1)

@@ -31,15 +31,15 @@ JAWS = "jaw_angle"  # name of a joint that nothing logged
 class MeasurementSettings:
     """Measures of silhouettes beyond the wrist."""
 
-    min_opening: float = 0.5  # of the shaft's diameter, by which silhouettes of jaws differ in width
-    step_mm: float = 0.5  # between pixels of stabilised silhouettes
-    along: tuple[float, float] = (0.3, 1.2)  # of the working length, from the origin: beyond the wrist
-    across: float = 0.8  # of the working length, to either side
-    max_distance_mm: float = 1.5  # from an outline, at which distances saturate
-    width_rank: int = 3  # of the widest cross sections: the first may be a glint on the tissue
+    min_opening: float = 0.5  # minimum change of the silhouettes' width of jaws, share of the shaft's diameter
+    step_mm: float = 0.5  # size of a pixel of stabilised silhouettes
+    along: tuple[float, float] = (0.3, 1.2)  # range of the working length, from the origin: beyond the wrist
+    across: float = 0.8  # range to either side, share of the working length
+    max_distance_mm: float = 1.5  # maximum distance from an outline, at which distances saturate
+    width_rank: int = 3  # rank of the cross section by width that counts: the first may be a glint on the tissue
     blur_mm: float = 1.0  # standard deviation of the silhouettes' blur
-    median_frames: int = 5  # of outlines: glints on the tissue stay behind when the instrument moves on
-    n_components: int = 24  # principal ones
+    median_frames: int = 5  # frames of a median outline: glints on the tissue stay behind when the instrument moves on
+    n_components: int = 24  # number of principal components
 
 
 SETTINGS = MeasurementSettings()
@@ -108,7 +108,7 @@ def measure(capture: Capture, load_mask: Mapping[str, Load]) -> dict[str, Measur
     def load(frame: int) -> np.ndarray:
         return np.asarray(open_image(capture.frames[frame].image_path).convert("RGB"))
 
-    found = {}
+    measured = {}
     for instrument in capture.instruments:
         if instrument.from_video is None:
             continue
@@ -118,25 +118,25 @@ def measure(capture: Capture, load_mask: Mapping[str, Load]) -> dict[str, Measur
         shapes = silhouette_shapes(shafts, masks)
         opened = np.quantile(shapes.widths, 0.95) - np.quantile(shapes.widths, 0.05)
         jaws = not instrument.joints and opened > SETTINGS.min_opening * shafts.diameter_mm
-        found[instrument.name] = Measurements(roll_pairs(textures, seen), shapes, seen, (JAWS,) if jaws else ())
-    return found
+        measured[instrument.name] = Measurements(roll_pairs(textures, seen), shapes, seen, (JAWS,) if jaws else ())
+    return measured
 
 
 def write_measurements(capture: Capture, measured: Mapping[str, Measurements]) -> None:
     """Write them into the capture's folder, whole or not at all. Raises NeecoError."""
     tensors: dict[str, np.ndarray] = {}
-    for number, found in enumerate(measured.values()):
+    for number, item in enumerate(measured.values()):
         stored = {
-            "first": found.pairs.first.astype(np.int32),
-            "second": found.pairs.second.astype(np.int32),
-            "turns": found.pairs.turns.astype(np.float32),
-            "scores": found.pairs.scores.astype(np.float32),
-            "widths": found.shapes.widths.astype(np.float32),
-            "shapes": found.shapes.shapes.astype(np.float32),
-            "seen": found.seen,
+            "first": item.pairs.first.astype(np.int32),
+            "second": item.pairs.second.astype(np.int32),
+            "turns": item.pairs.turns.astype(np.float32),
+            "scores": item.pairs.scores.astype(np.float32),
+            "widths": item.shapes.widths.astype(np.float32),
+            "shapes": item.shapes.shapes.astype(np.float32),
+            "seen": item.seen,
         }
         tensors |= {f"{number}/{name}": np.ascontiguousarray(value) for name, value in stored.items()}
-    joints = json.dumps({name: found.joints for name, found in measured.items()}, allow_nan=False)
+    joints = json.dumps({name: item.joints for name, item in measured.items()}, allow_nan=False)
     notes = {"format": FORMAT, "frames": _frames(capture), "joints": joints}
     write_atomically(capture.root / FILE, lambda path: save_file(tensors, path, metadata=notes))
 
@@ -158,7 +158,7 @@ def read_measurements(capture: Capture) -> dict[str, Measurements]:
     if notes.get("format") != FORMAT or notes.get("frames") != _frames(capture):
         raise NeecoError(f"{path}: was measured in other frames than transforms.json has; {again}")
     count = len(capture.frames)
-    found = {}
+    measurements = {}
     for number, (name, by_hand) in enumerate(joints.items()):
         part = {key.partition("/")[2]: value for key, value in tensors.items() if key.startswith(f"{number}/")}
         try:
@@ -172,8 +172,8 @@ def read_measurements(capture: Capture) -> dict[str, Measurements]:
             whole = False
         if not whole:
             raise NeecoError(f"{path}: {name}: is not as neeco writes it; {again}")
-        found[name] = measured
-    return found
+        measurements[name] = measured
+    return measurements
 
 
 def _frames(capture: Capture) -> str:

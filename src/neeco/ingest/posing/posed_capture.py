@@ -44,15 +44,15 @@ REMEDY = "mend or remove that line"
 class PosingSettings:
     """Thresholds of suggested frames and of answers that contradict each other."""
 
-    n_suggested: int = 10  # frames in all
-    jaw_limits: tuple[float, float] = (0.0, 2.1)  # rad, of unknown jaws
-    frame_s: float = 0.04  # from frame to frame, where the recording does not say
-    near_break: int = 3  # frames from a break of the chain that count as at it
+    n_suggested: int = 10  # number of suggested frames
+    jaw_limits: tuple[float, float] = (0.0, 2.1)  # rad, limits of unknown jaws
+    frame_s: float = 0.04  # s between frames, where the recording states no times
+    near_break: int = 3  # distance in frames from a break of the chain that counts as at it
     extreme: float = 0.05  # share of the frames in which jaws are called widest or narrowest
-    outlier_deg: float = 12.0  # by which an answer must differ to count as an outlier
-    outlier_sd: float = 3.0  # standard deviations, likewise
-    min_answers: int = 3  # from which on they can contradict each other
-    max_degrees: int = 720  # of an angle in the file of answers
+    outlier_deg: float = 12.0  # minimum difference of an outlier from the other answers
+    outlier_sd: float = 3.0  # the same in standard deviations
+    min_answers: int = 3  # minimum number of answers that can contradict each other
+    max_degrees: int = 720  # maximum angle in the file of answers
 
 
 POSING = PosingSettings()
@@ -108,7 +108,7 @@ def answers_for(
     at `place` has not, and for joints other than the instrument's."""
     index = {name: number for number, name in enumerate(frames)}
     wanted = set(joints)
-    found = []
+    matching = []
     for answer in answers:
         if answer.instrument != instrument:
             continue
@@ -117,8 +117,8 @@ def answers_for(
         if set(answer.joints_deg) != wanted:
             expected = ", ".join(sorted(wanted)) or "none"
             raise NeecoError(f"{place / FILE}: frame {answer.frame}: joints_deg: expected {expected}; {REMEDY}")
-        found.append((index[answer.frame], answer))
-    return found
+        matching.append((index[answer.frame], answer))
+    return matching
 
 
 def _line(answer: HandPose) -> str:
@@ -209,33 +209,33 @@ class SolvedPosing:
     def outliers(self) -> list[OutlierAnswer]:
         """Answers that differ from an earlier one of the same frame; and of roll and of each joint the one that differs
         most from the others' prediction, as a wrong one makes others look wrong, too."""
-        found = []
+        outliers = []
         for what, solved in self.angles.items():
             worst, least = None, POSING.outlier_sd
             for position, (frame, answer) in enumerate(self.answers):
                 angle = _angle(answer, what)
                 earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
                 if earlier is not None and abs(apart := half_turn(angle - _angle(earlier, what))) > POSING.outlier_deg:
-                    found.append(OutlierAnswer(frame, what, apart, "an earlier answer"))
+                    outliers.append(OutlierAnswer(frame, what, apart, "an earlier answer"))
                 # leaving one answer out of a Gaussian posterior
                 left = max(1 - (float(solved.deviations[frame]) / math.radians(SETTINGS.hand_sd_deg)) ** 2, 0.02)
                 apart = half_turn(angle - math.degrees(solved.values[frame])) / left
                 far = abs(apart) * math.sqrt(left) / SETTINGS.hand_sd_deg
                 if len(self.answers) >= POSING.min_answers and abs(apart) > POSING.outlier_deg and far > least:
                     worst, least = OutlierAnswer(frame, what, half_turn(apart), "what its neighbours say"), far
-            found += [] if worst is None else [worst]
-        return found
+            outliers += [] if worst is None else [worst]
+        return outliers
 
     def deviations(self) -> dict[str, tuple[float, float]]:
         """Median and 95 % quantile of the standard deviations, degrees, of roll and each joint; 180 where nothing is
         known."""
-        found = {}
+        quantiles = {}
         for name, solved in self.angles.items():
             deviations = solved.deviations_deg
             if name == "roll" and not self.answers:
                 deviations = np.full(len(deviations), UNKNOWN_DEG)
-            found[name] = (float(np.median(deviations)), float(np.quantile(deviations, 0.95)))
-        return found
+            quantiles[name] = (float(np.median(deviations)), float(np.quantile(deviations, 0.95)))
+        return quantiles
 
 
 def prepare(root: Path, load_mask: Mapping[str, Load]) -> None:
@@ -263,14 +263,14 @@ class PosedCapture:
         """Raises NeecoError for a capture without such instruments, or whose measurements or answers cannot be read."""
         self.root = root
         self.capture: Capture = read_capture(root)
-        found = [item for item in self.capture.instruments if item.from_video is not None]
-        if not found:
+        in_video = [item for item in self.capture.instruments if item.from_video is not None]
+        if not in_video:
             raise NeecoError(
                 f"{root}: no instrument was found in the video: all poses are known; "
                 "give a capture made by `neeco ingest --shaft-diameter`"
             )
         self.measured = read_measurements(self.capture)
-        self.instruments = {item.name: item for item in found if item.name in self.measured}
+        self.instruments = {item.name: item for item in in_video if item.name in self.measured}
         self.frames = [frame.name for frame in self.capture.frames]
         times = np.array([frame.state.time for frame in self.capture.frames], float)
         self.times = times if self.capture.timed else np.arange(len(times)) * POSING.frame_s
@@ -281,20 +281,20 @@ class PosedCapture:
         answers = read_answers(self.root) if answers is None else answers
         for answer in answers:
             if answer.instrument not in self.instruments:
-                known = ", ".join(self.instruments)
-                raise NeecoError(f"{self.root}: hand_posed.yaml: no instrument {answer.instrument!r}; known: {known}")
-        found = {}
+                names = ", ".join(self.instruments)
+                raise NeecoError(f"{self.root}: hand_posed.yaml: no instrument {answer.instrument!r}; known: {names}")
+        posings = {}
         for name, instrument in self.instruments.items():
             measured, shafts = self.measured[name], self.shafts[name]
             joints = [joint for joint in measured.joints if joint in instrument.joints]
-            own = answers_for(answers, name, self.frames, joints, self.root)
-            rolls = solve_rolls(measured.pairs, shafts.carried(), self.times, _by_frame(own, "roll"))
+            hand = answers_for(answers, name, self.frames, joints, self.root)
+            rolls = solve_rolls(measured.pairs, shafts.carried(), self.times, _by_frame(hand, "roll"))
             solved = {
-                joint: solve_joint(measured.shapes, rolls, self.times, _by_frame(own, joint), instrument.joints[joint])
+                joint: solve_joint(measured.shapes, rolls, self.times, _by_frame(hand, joint), instrument.joints[joint])
                 for joint in joints
             }
-            found[name] = SolvedPosing(instrument, shafts, measured, own, rolls, solved)
-        return found
+            posings[name] = SolvedPosing(instrument, shafts, measured, hand, rolls, solved)
+        return posings
 
     def write_states(self, posings: dict[str, SolvedPosing]) -> None:
         """Write the solved rolls and joints, and their uncertainties, into transforms.json, whole or not at all. The
@@ -314,22 +314,22 @@ class PosedCapture:
         item["joints"] = item.get("joints", {}) | {
             name: float(solved.values[frame]) for name, solved in posing.joints.items()
         }
-        known = item.get("uncertainty", {})
-        tilts = known.get("rotation_deg", [0.0, 0.0, 0.0])[:2]
+        stated = item.get("uncertainty", {})
+        tilts = stated.get("rotation_deg", [0.0, 0.0, 0.0])[:2]
         roll = float(posing.rolls.deviations_deg[frame]) if posing.answers else UNKNOWN_DEG
         item["uncertainty"] = {
-            "translation_mm": known.get("translation_mm", [0.0, 0.0, 0.0]),
+            "translation_mm": stated.get("translation_mm", [0.0, 0.0, 0.0]),
             "rotation_deg": [*tilts, roll],
-            "joints_deg": known.get("joints_deg", {})
+            "joints_deg": stated.get("joints_deg", {})
             | {name: float(solved.deviations_deg[frame]) for name, solved in posing.joints.items()},
         }
 
 
 def _by_frame(answers: Sequence[tuple[int, HandPose]], what: str) -> dict[int, list[float]]:
-    found: dict[int, list[float]] = {}
+    angles: dict[int, list[float]] = {}
     for frame, answer in answers:
-        found.setdefault(frame, []).append(math.radians(_angle(answer, what)))
-    return found
+        angles.setdefault(frame, []).append(math.radians(_angle(answer, what)))
+    return angles
 
 
 def _angle(answer: HandPose, what: str) -> float:

@@ -204,16 +204,16 @@ def recording_formats() -> tuple[RecordingFormat, ...]:
 
 def format_of(path: Path) -> RecordingFormat | None:
     """The format of a file or folder; None where no format claims it."""
-    return next((known for known in recording_formats() if known.claims(path)), None)
+    return next((reader for reader in recording_formats() if reader.claims(path)), None)
 
 
 def read_table(path: Path, stream: str | None = None) -> Table:
     """Read a log; what no format claims, as delimited text. stream: which, of a file that holds several. Raises
     NeecoError."""
     path = Path(path)
-    known = format_of(path) or recording_formats()[-1]
-    known.require_package(path)
-    return known.read(path, stream)
+    reader = format_of(path) or recording_formats()[-1]
+    reader.require_package(path)
+    return reader.read(path, stream)
 
 
 def file_state(*files: Path) -> tuple[tuple[str, int, int], ...]:
@@ -230,17 +230,17 @@ def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kin
     fitting = [stream for stream in of_kind if stream.problem is None]
     listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
     named = [stream for stream in streams if stream.name == wanted][:1]
-    found = named if wanted is not None else fitting or of_kind[:1]
-    if len(found) == 1 and found[0].problem is not None:
-        raise NeecoError(f"{path}: {found[0].name}: {found[0].problem}")
-    if len(found) == 1 and found[0] in fitting:
-        return found[0]
+    candidates = named if wanted is not None else fitting or of_kind[:1]
+    if len(candidates) == 1 and candidates[0].problem is not None:
+        raise NeecoError(f"{path}: {candidates[0].name}: {candidates[0].problem}")
+    if len(candidates) == 1 and candidates[0] in fitting:
+        return candidates[0]
     if wanted is None:
         what = f"holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream` in the recording: {listed}"
         raise NeecoError(f"{path}: {what}")
     what = f"holds no {printable(wanted)}"
-    if found:
-        what = f"{printable(wanted)} is {found[0].type}, not {' or '.join(kinds)}"
+    if candidates:
+        what = f"{printable(wanted)} is {candidates[0].type}, not {' or '.join(kinds)}"
     raise NeecoError(f"{path}: stream: {what}; name one of {listed}")
 
 
@@ -252,19 +252,19 @@ def compare_counts(
     file: of the images; noun: what a row is; unlike: share by which the numbers may differ, in addition to one. Raises
     NeecoError, with the remedy, when they differ by more.
     """
-    found = f"has {images} images for {rows} {noun}"
+    counts = f"has {images} images for {rows} {noun}"
     if abs(images - rows) > unlike * rows + 1:
-        raise NeecoError(f"{file}: {found}; they do not belong together: {remedy}")
-    return () if images == rows else (f"{file.name}: {found}; both are taken to begin together",)
+        raise NeecoError(f"{file}: {counts}; they do not belong together: {remedy}")
+    return () if images == rows else (f"{file.name}: {counts}; both are taken to begin together",)
 
 
 def compare_lengths(file: Path, video: VideoSource, rows: int, image_hz: float) -> tuple[str, ...]:
     """`compare_counts` of states that are one for every image of a video of `image_hz` images a second, whatever rate
     it has now."""
-    shown = round(float(video.times[-1] - video.times[0]) * image_hz) + 1
-    is_rate = shown != rows and abs(len(video.times) - rows) <= 1
+    images = round(float(video.times[-1] - video.times[0]) * image_hz) + 1
+    is_rate = images != rows and abs(len(video.times) - rows) <= 1
     remedy = f"as it has {len(video.times)}, say `fps: {image_hz:g}` of it" if is_rate else "give the video of this log"
-    return compare_counts(file, shown, rows, f"states at {image_hz:g} a second", MAX_UNLIKE, remedy)
+    return compare_counts(file, images, rows, f"states at {image_hz:g} a second", MAX_UNLIKE, remedy)
 
 
 def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[tuple[int, str]]]:

@@ -70,14 +70,14 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 class BagLimits:
     """Limits on what is read of a bag."""
 
-    chunk_bytes: int = 256 << 20  # unpacked; recorders write some MiB
+    chunk_bytes: int = 256 << 20  # limit on the unpacked bytes of a chunk; recorders write some MiB
     metadata_bytes: int = 16 << 20
-    joints: int = 400  # of one topic
-    bodies: int = 2000  # of all transforms
-    pixels: int = 90_000_000  # of an image, as for files of images
+    joints: int = 400  # limit on the joints of one topic
+    bodies: int = 2000  # limit on the bodies of all transforms
+    pixels: int = 90_000_000  # limit on the pixels of an image, as for files of images
     min_images: int = 2
-    skipped_images: int = 30  # that are read and dropped rather than sought over
-    other_clock_s: float = 1.0  # between stamps and receipt: they are of different clocks
+    skipped_images: int = 30  # limit on the images read and dropped instead of a seek
+    other_clock_s: float = 1.0  # limit on the s between stamps and receipt for one clock
 
 
 class _UnusableError(Exception):
@@ -97,16 +97,16 @@ class _AnyMcap(io.BufferedReader):
 
     def read(self, size: int | None = -1) -> bytes:
         start, content = self.tell(), super().read(size)
-        found = content
+        patched = content
         if start == MCAP_HEADER_AT:
-            found = b"\4\0\0\0ros2" + content
+            patched = b"\4\0\0\0ros2" + content
         elif self._opcode == MCAP_SCHEMA and size != 8:  # the length of the record
             name_end = 6 + int.from_bytes(content[2:6], "little")
             encoding = content[name_end + 4 :][: int.from_bytes(content[name_end:][:4], "little")]
             if encoding not in (b"ros2msg", b"ros2idl"):
-                found = content[:name_end] + b"\7\0\0\0ros2msg" + bytes(len(content))
+                patched = content[:name_end] + b"\7\0\0\0ros2msg" + bytes(len(content))
         self._opcode = content[0] if size == 1 and content else self._opcode
-        return found[: len(content)]
+        return patched[: len(content)]
 
 
 class _McapReader(McapReader):
@@ -225,7 +225,7 @@ def _limit_chunks(reader: Any, max_bytes: int) -> None:
         for listed in reader.chunks:
             _check_size(max(listed.uncompressed_size, listed.compressed_size), max_bytes)
     elif isinstance(reader, Ros1Reader):
-        names = {known: name for name, known in decompressors.items()}
+        names = {decompress: name for name, decompress in decompressors.items()}
         for place, chunk in reader.chunks.items():
             _check_size(chunk.datasize, max_bytes)
             limited = partial(unpack, compression=names[chunk.decompressor], max_bytes=max_bytes)

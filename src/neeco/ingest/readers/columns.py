@@ -140,11 +140,11 @@ def scale_of(
     The unit is in their names, else `stated` by the recording, else `implied` by the file's format. hint: added to
     the question when there is none. Raises NeecoError when nothing gives the unit or two sources disagree.
     """
-    found = {unit for name in names if (unit := split_unit(name, kind)[1])}
+    units = {unit for name in names if (unit := split_unit(name, kind)[1])}
     listed = ", ".join(names)
-    if len(found) > 1:
+    if len(units) > 1:
         raise NeecoError(f"{where}: columns {listed}: named in different units; write them in one {kind} unit")
-    unit = next(iter(found), None)
+    unit = next(iter(units), None)
     if unit and stated and unit != stated:
         raise NeecoError(f"{where}: columns {listed}: named in {unit}, but units.{kind} says {stated}; correct one")
     unit = unit or stated or implied
@@ -195,29 +195,29 @@ def recognise_time(header: Sequence[str]) -> RecognisedColumns:
     for wanted in _TIMES:
         behind = [name for name in plain if len(wanted) > 1 and name.endswith("_" + wanted)]
         if wanted in plain or len(behind) == 1:
-            found = plain[wanted if wanted in plain else behind[0]]
+            column = plain[wanted if wanted in plain else behind[0]]
             break
     else:
         frames = [name for name in header if _plain(name) in ("frame", "frame_number", "frame_id", "frame_no")]
         return RecognisedColumns(time=(frames[0],), counts_frames=True) if frames else RecognisedColumns()
     # `rostopic echo -p` writes %time and field.header.stamp in ns
-    ros = found == "%time" or re.fullmatch(r"\.?field\..*header\.stamp", found.lower()) is not None
-    spelled_out = _plain(found) in ("secs", "sec", "seconds", "__time")
-    return RecognisedColumns(time=(found,), time_unit="ns" if ros else "s" if spelled_out else None)
+    ros = column == "%time" or re.fullmatch(r"\.?field\..*header\.stamp", column.lower()) is not None
+    spelled_out = _plain(column) in ("secs", "sec", "seconds", "__time")
+    return RecognisedColumns(time=(column,), time_unit="ns" if ros else "s" if spelled_out else None)
 
 
-def recognise_pose(header: Sequence[str], given: _Given = _NOTHING) -> RecognisedColumns:
-    """The columns of time, position and rotation in a log of poses, none of them for two things. given: the columns of
+def recognise_pose(header: Sequence[str], named: _Given = _NOTHING) -> RecognisedColumns:
+    """The columns of time, position and rotation in a log of poses, none of them for two things. named: the columns of
     those that the recording names, by meaning: these are not looked for."""
-    left = _left(header, given)
-    when = RecognisedColumns() if "time" in given else recognise_time(left)
+    left = _left(header, named)
+    when = RecognisedColumns() if "time" in named else recognise_time(left)
     left = [name for name in left if name not in (when.time or ())]
     unclear: dict[str, str] = {}
     matrix, position, rotation, form = None, None, None, None
-    if "rotation" not in given:
+    if "rotation" not in named:
         matrix = _matrix(left)
         rotation, form = _rotation(left, matrix, unclear)
-    if "position" not in given and not (matrix and len(matrix) > 9):
+    if "position" not in named and not (matrix and len(matrix) > 9):
         position = _group(left, _POSITIONS, "length", "position", unclear)
     if shared := [name for name in position or () if name in (rotation or ())]:
         why = f"{', '.join(shared)} may be the position's or the quaternion's; name both under columns"
@@ -258,11 +258,11 @@ def _prefixes(plain: Mapping[str, str], names: Sequence[str]) -> list[str]:
     return [prefix for prefix in prefixes if all(f"{prefix}_{name}" in plain for name in names)]
 
 
-def recognise_value(header: Sequence[str], given: _Given = _NOTHING) -> tuple[str | None, RecognisedColumns]:
+def recognise_value(header: Sequence[str], named: _Given = _NOTHING) -> tuple[str | None, RecognisedColumns]:
     """Return the one column, other than the time, that can be a joint's reading; None when there are none or several.
-    given: as for `recognise_pose`."""
-    header = _left(header, given)
-    when = RecognisedColumns() if "time" in given else recognise_time(header)
+    named: as for `recognise_pose`."""
+    header = _left(header, named)
+    when = RecognisedColumns() if "time" in named else recognise_time(header)
     counters = {"frame", "seq", "index", "header_seq", "field_header_seq", "frame_id", "header_frame_id", "state"}
     others = [name for name in header if name and name not in (when.time or ()) and _plain(name) not in counters]
     others = [name for name in others if not _plain(name).startswith(("field_header", "header_"))]
@@ -275,15 +275,15 @@ def joint_columns(header: Sequence[str], bodies: Mapping[str, Sequence[str]]) ->
     posing: set[str] = set()
     for columns in bodies.values():
         pose, words = recognise_pose(columns), [_plain(name).split("_") for name in columns]
-        start = next((place for place, held in enumerate(zip(*words, strict=False)) if len(set(held)) > 1), 0)
+        start = next((place for place, group in enumerate(zip(*words, strict=False)) if len(set(group)) > 1), 0)
         moving = [name for name in columns if not _JOINT.search("_".join(_plain(name).split("_")[start:]))]
         posing |= {*(pose.position or ()), *(pose.rotation or ()), *moving}
     return [name for name in header if _JOINT.search(name) and name not in posing]
 
 
-def _left(header: Sequence[str], given: _Given) -> list[str]:
+def _left(header: Sequence[str], named: _Given) -> list[str]:
     """Return the columns without a meaning so far."""
-    taken = {name for names in given.values() for name in names}
+    taken = {name for names in named.values() for name in names}
     return [name for name in header if name not in taken]
 
 

@@ -35,8 +35,8 @@ class TextLimits:
     """Limits on a text as a table."""
 
     columns: int = 4096
-    padding: int = 16  # of its cells, by those that the text holds
-    sample_lines: int = 400  # that tell which columns hold numbers
+    padding: int = 16  # limit on the ratio of a table's cells to the cells with text
+    sample_lines: int = 400  # lines examined for the columns of numbers
 
 
 LIMITS = TextLimits()
@@ -54,7 +54,7 @@ class DelimitedText(RecordingFormat):
     def read(self, path: Path, stream: str | None = None) -> Table:
         """Raises NeecoError when absent, empty, binary or without a header line."""
         if stream is not None:
-            raise NeecoError(f"{path}: stream: a table is one; leave it out")
+            raise NeecoError(f"{path}: stream: a table has no streams; leave it out")
         text = read_cells(path)
         names, start = _header(path, text)
         used = ~text.comment & (np.arange(len(text.lines)) >= start)
@@ -78,8 +78,8 @@ class Cells:
     def numeric(self, rows: np.ndarray | slice) -> np.ndarray:
         """Return which cells [R, W] of some lines hold numbers."""
         cells = self.cells[rows]
-        found = [parse_number(cell) is not None and cell.lower() not in MISSING for cell in cells.ravel()]
-        return np.array(found, dtype=bool).reshape(cells.shape)
+        flags = [parse_number(cell) is not None and cell.lower() not in MISSING for cell in cells.ravel()]
+        return np.array(flags, dtype=bool).reshape(cells.shape)
 
     def names(self, row: int) -> list[str]:
         """Return the cells of a line."""
@@ -141,14 +141,14 @@ def _header(path: Path, text: Cells) -> tuple[list[str], int]:
 
     def is_row(row: int) -> bool:
         """Whether a line holds numbers, or a word for a missing one, wherever most do."""
-        held = text.numeric(slice(row, row + 1))[0, numeric]
+        filled = text.numeric(slice(row, row + 1))[0, numeric]
         missing = [index < text.counts[row] and text.cells[row, index].lower() in MISSING for index in numeric]
-        return bool(held.any() and (held | missing).all())
+        return bool(filled.any() and (filled | missing).all())
 
     def names_columns(row: int, columns: np.ndarray) -> bool:
         """Whether a line has no numbers where the rows have them, and names for at least half of those columns."""
-        held = text.numeric(slice(row, row + 1))[0, columns]
-        return sum(map(bool, text.cells[row, columns])) >= 0.5 * len(columns) and not held.any()
+        filled = text.numeric(slice(row, row + 1))[0, columns]
+        return sum(map(bool, text.cells[row, columns])) >= 0.5 * len(columns) and not filled.any()
 
     start = next((row for row in plain if is_row(row)), None)
     if not len(numeric) or start is None:
@@ -157,7 +157,7 @@ def _header(path: Path, text: Cells) -> tuple[list[str], int]:
     if places := [row for row in above if names_columns(row, numeric)]:
         place, others = places[-1], [row for row in above if row < places[-1]]
         units = [canonical_unit(cell.strip("[]() ")) for cell in text.cells[place]]
-        units = [unit if any(unit in known for known in UNITS.values()) else "" for unit in units]
+        units = [unit if any(unit in scales for scales in UNITS.values()) else "" for unit in units]
         filled = [unit for unit, cell in zip(units, text.cells[place], strict=True) if cell.strip("[]()- ")]
         if others and others[-1] in places and sum(map(bool, filled)) > 0.5 * len(filled) > 0:  # a line of units
             place = others.pop()
@@ -175,9 +175,9 @@ def _header(path: Path, text: Cells) -> tuple[list[str], int]:
     for row in reversed(np.flatnonzero(text.comment[:start]).tolist()):
         if text.counts[row] == text.counts[start] and names_columns(row, numeric):
             return text.names(row), start
-    found, where = printable(",".join(text.names(plain[0]))[:40]), f"{path}: line {text.lines[plain[0]]}"
+    first_cells, where = printable(",".join(text.names(plain[0]))[:40]), f"{path}: line {text.lines[plain[0]]}"
     rows = f", and the rows of numbers begin at line {text.lines[start]}" if above else ""
-    raise NeecoError(f"{where} is no header of columns (found {found}){rows}; add a line that names the columns")
+    raise NeecoError(f"{where} is no header of columns (found {first_cells}){rows}; add a line that names the columns")
 
 
 def _delimiter(lines: Sequence[str]) -> str:
@@ -209,22 +209,22 @@ def find_tools(header: Sequence[str], rows: np.ndarray) -> tuple[Body, ...]:
     port, where that is no other's."""
     plain = [_NUMBERED.sub("", name).strip() for name in header]
     starts = [index for index, name in enumerate(plain) if _PORT.match(name)]
-    found: list[tuple[range, str, list[str]]] = []
+    tools: list[tuple[range, str, list[str]]] = []
     for start, end in pairwise([*starts, len(plain)]):
         names = [name.lower() for name in plain[start:end]]
-        own = next((n for n, name in enumerate(names) if name == MARKERS or name in names[:n]), len(names))
-        if {"q0", "tx"} <= set(names[:own]):
+        length = next((n for n, name in enumerate(names) if name == MARKERS or name in names[:n]), len(names))
+        if {"q0", "tx"} <= set(names[:length]):
             match, cell = _PORT.match(plain[start]), next(filter(None, rows[:, start]), "")
             port, name = (match["port"], match["name"] or "") if match else ("", "")
             title = plain[start] if port or name else cell or plain[start]
-            found.append((range(start, start + own), title, [name, port or cell, plain[start], cell]))
-    shared = Counter(word for _, _, words in found for word in {_canonical(word) for word in words if word})
+            tools.append((range(start, start + length), title, [name, port or cell, plain[start], cell]))
+    shared = Counter(word for _, _, words in tools for word in {_canonical(word) for word in words if word})
     return tuple(
         Body(
             next((word for word in words[:2] if word and shared[_canonical(word)] == 1), printable(title)),
             tuple(columns), title=printable(title), aliases=frozenset(_canonical(word) for word in words if word),
         )
-        for columns, title, words in found
+        for columns, title, words in tools
     )  # fmt: skip
 
 
@@ -246,8 +246,8 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
     chosen = [body for body in table.bodies if wanted is None or wanted in {_canonical(body.name), *body.aliases}]
     if len(chosen) != 1:
         listed = ", ".join(body.title or printable(body.name) for body in table.bodies)
-        count, given = len(chosen) or "none", printable(source.tool)
-        problem = f"holds {len(table.bodies)} tools" if wanted is None else f"tool: {given} is {count} of them"
+        count, asked = len(chosen) or "none", printable(source.tool)
+        problem = f"holds {len(table.bodies)} tools" if wanted is None else f"tool: {asked} is {count} of them"
         raise NeecoError(f"{table.path}: {problem}; say which as `tool` in the recording: {listed}")
     columns = [*range(min(body.columns[0] for body in table.bodies)), *chosen[0].columns]
     header = tuple(_NUMBERED.sub("", table.header[index]) for index in columns)
@@ -265,8 +265,8 @@ def _refuse_mixed(table: Table, source: PoseColumns) -> None:
     named = [*(source.position or ()), *(source.rotation or ()), *([source.state] if source.state else [])]
     places = {name: table.header.index(name) for name in named if name in table.header}
     owners = {name: [body.name for body in table.bodies if place in body.columns] for name, place in places.items()}
-    strangers = [name for name, own in owners.items() if not own]
-    if strangers or len({own[0] for own in owners.values()}) > 1:
+    strangers = [name for name, bodies in owners.items() if not bodies]
+    if strangers or len({bodies[0] for bodies in owners.values()}) > 1:
         what = f"{strangers[0]} is a marker's, no tool's" if strangers else f"{', '.join(places)} are of several tools"
         raise NeecoError(f"{table.path}: columns: {what}; name the tool instead, as `tool` in the recording")
 

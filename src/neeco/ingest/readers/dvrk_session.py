@@ -72,35 +72,35 @@ class DvrkSession(RecordingFormat):
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         films, absent = _films(path)
-        found = [Stream(name, IMAGES, "video", 0, problem=why) for name, why in absent.items()]
+        streams = [Stream(name, IMAGES, "video", 0, problem=why) for name, why in absent.items()]
         if not films and not absent and visible_entries(path, "*.mp4"):
             raise NeecoError(f"{path}: nothing says the times of its videos' frames; give the session's own folder")
         # the left camera's are the frames; others are listed
         for number, name in enumerate(sorted(films, key=lambda name: ("right" in name, "left" not in name, name))):
             times = films[name].times
-            found.append(Stream(name, IMAGES, "video", len(times), rate_of(times), offered=number == 0))
+            streams.append(Stream(name, IMAGES, "video", len(times), rate_of(times), offered=number == 0))
         bag = _bag(path)
         if bag is not None:
             RosBag().require_package(bag)
             try:
-                return (*found, *RosBag().streams(bag))
+                return (*streams, *RosBag().streams(bag))
             except NeecoError as error:
-                return (*found, Stream(bag.name, OTHER, "bag", 0, problem=str(error)))
+                return (*streams, Stream(bag.name, OTHER, "bag", 0, problem=str(error)))
         for topic, file in _topics(path).items():
             try:
                 kind, columns, table = _topic(file)
             except NeecoError as error:
-                found.append(Stream(topic, OTHER, "table", 0, problem=str(error)))
+                streams.append(Stream(topic, OTHER, "table", 0, problem=str(error)))
                 continue
             match = (_POSES if kind == POSES else _JOINTS).fullmatch(topic)
             stream = Stream(topic, kind, kind, len(table.rows), offered=match is not None, body=match and match[1])
             if kind == POSES:
                 frames = _frames(table)
                 meaning = meaning_of(frames[0] if len(frames) == 1 else "", dvrk=True)
-                found.append(replace(stream, hints=(*meaning.hints, DVRK_HINT), asks=meaning.asks))
+                streams.append(replace(stream, hints=(*meaning.hints, DVRK_HINT), asks=meaning.asks))
             elif kind == READINGS:
-                found.append(replace(stream, joints=wrist_joints(_joint_names(table, columns), "/jaw/" in topic)))
-        return tuple(found)
+                streams.append(replace(stream, joints=wrist_joints(_joint_names(table, columns), "/jaw/" in topic)))
+        return tuple(streams)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         start, bag = _start(path), _bag(path)
@@ -161,7 +161,7 @@ def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:
     document = read_json(path / INDEX)
     videos = [video for entry in [document, *_list(document, "streams")] for video in _list(entry, "videos")]
     names = [video.get("file") for video in videos if isinstance(video, dict)]
-    found: dict[str, _Film] = {}
+    films: dict[str, _Film] = {}
     absent: dict[str, str] = {}
     for file in (path / str(name) for name in names if str(name).lower().endswith(".mp4") and _is_plain(name)):
         if not file.is_file():
@@ -173,10 +173,10 @@ def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:
             absent[file.stem] = str(error)
             continue
         for half, side in enumerate(HALVES.get(layout, ())):
-            found[f"{file.stem}.{side}"] = _Film(times, (file,), half)
+            films[f"{file.stem}.{side}"] = _Film(times, (file,), half)
         if layout not in HALVES:
-            found[file.stem] = _Film(times, (file,))
-    return found, absent
+            films[file.stem] = _Film(times, (file,))
+    return films, absent
 
 
 def _is_plain(name: Any) -> bool:
@@ -192,7 +192,7 @@ def _frame_times(sidecar: Path) -> tuple[np.ndarray, str]:
     if len(stamps) < 2 or not all(type(stamp) is int and 0 < stamp < 1 << 62 for stamp in stamps):
         raise NeecoError(f"{sidecar}: frames: expected a cpu_ts (ns) of each frame of the video; record again")
     if not isinstance(latency, int | float) or not abs(latency) < 60:
-        raise NeecoError(f"{sidecar}: estimated_latency: {printable(latency)} is none in s; correct it")
+        raise NeecoError(f"{sidecar}: estimated_latency: must be under 60 s (got {printable(latency)}); correct it")
     return np.array(stamps, np.int64) * 1e-9 - float(latency), str(_entry(document, "side_by_side"))
 
 
@@ -206,12 +206,12 @@ def _list(document: Any, name: str) -> list[Any]:
 
 
 def _stamped_files(path: Path) -> dict[str, _Film]:
-    found: dict[str, list[tuple[float, Path]]] = {}
+    times_and_files: dict[str, list[tuple[float, Path]]] = {}
     for file in visible_entries(path):
         if match := _STAMPED.fullmatch(file.name):
-            found.setdefault(match["name"], []).append((float(match["time"]), file))
+            times_and_files.setdefault(match["name"], []).append((float(match["time"]), file))
     films = {}
-    for name, stamped in found.items():
+    for name, stamped in times_and_files.items():
         stamped.sort()
         films[name] = _Film(np.array([time for time, _ in stamped]), tuple(file for _, file in stamped))
     return films

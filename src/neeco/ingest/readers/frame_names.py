@@ -46,9 +46,9 @@ class NamedFrame:
         """The question of a refusal; "" where nothing is open."""
         if self.frame is not None:
             return ""
-        known = {name: f"the camera's, {axes.words}" for name, axes in CAMERA_FRAMES.items()}
-        known |= {BASE: "a robot's base or a tracker"}
-        *others, last = [f"frame: {name} ({known[name]})" for name in self.choices]
+        meanings = {name: f"the camera's, {axes.words}" for name, axes in CAMERA_FRAMES.items()}
+        meanings |= {BASE: "a robot's base or a tracker"}
+        *others, last = [f"frame: {name} ({meanings[name]})" for name in self.choices]
         return f"{self.why}; say so in the recording, under poses: {', '.join(others)}, or {last}"
 
     @property
@@ -68,11 +68,11 @@ class NamedFrame:
 def meaning_of(name: str, images: Collection[str] = (), *, dvrk: bool = False) -> NamedFrame:
     """Return the meaning of a frame's own name. images: the frames of the images of the same file; dvrk: the poses are
     a dVRK's."""
-    plain, own = name.strip("/").lower(), {image.strip("/").lower() for image in images}
+    plain, image_frames = name.strip("/").lower(), {image.strip("/").lower() for image in images}
     name = printable(name).strip("'")
     last = plain.rpartition("/")[2]
     camera = (CAMERA, DVRK_ECM.name) if dvrk or _ECM.search(plain) else (CAMERA,)
-    if plain in own:
+    if plain in image_frames:
         if (dvrk or _ECM.search(plain)) and not _OPTICAL.search(plain):
             why = f"{name} is the images' own frame, in which a dVRK's poses may have its own axes or OpenCV's"
             return NamedFrame(None, why, (DVRK_ECM.name, CAMERA, BASE))
@@ -81,7 +81,7 @@ def meaning_of(name: str, images: Collection[str] = (), *, dvrk: bool = False) -
             return NamedFrame(None, why, (CAMERA, ROS_BODY.name, BASE))
         return NamedFrame(CAMERA, f"{name}, the frame of the camera: axes as ROS's images have them ({OPENCV.words})")
     if _OPTICAL.search(plain):
-        if own:
+        if image_frames:
             why = f"{name} is an optical frame, but the images are stated in {printable(', '.join(sorted(images)))}"
             return NamedFrame(None, why, (CAMERA, BASE))
         return NamedFrame(CAMERA, f"{name}, the optical frame of the camera: axes {OPENCV.words}")
@@ -102,9 +102,9 @@ def meaning_in(names: Sequence[str], *, dvrk: bool = False) -> NamedFrame | None
     """Return the meaning of the frame that names of columns, features or files hold (`pose_in_ecm`, `camera_frame`);
     None where they hold none."""
     for pattern in (_CAMERA_IN, _BASE_IN):
-        found = [pattern.search(name) for name in names]
-        words = {(match[1] or match[2]).lower() for match in found if match}
-        if not names or not all(found) or len(words) > 1:
+        matches = [pattern.search(name) for name in names]
+        words = {(match[1] or match[2]).lower() for match in matches if match}
+        if not names or not all(matches) or len(words) > 1:
             continue
         word = words.pop()
         if pattern is _BASE_IN:

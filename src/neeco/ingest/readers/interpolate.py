@@ -27,11 +27,11 @@ class SmoothingSettings:
     widths: tuple[float, ...] = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)  # half windows tried, in median steps
     max_width_s: float = 1.0
     validated: int = 600  # samples predicted to choose a width (cross-validation)
-    min_samples: int = 4  # in a window: fewer are interpolated linearly,
-    min_for_curvature: int = 6  # and fewer fitted by a line
-    rounds: int = 3  # of robust reweighting
-    cutoff_sd: float = 4.7  # of the bisquare, per axis (Beaton & Tukey 1974)
-    chunk: int = 300_000  # window samples worked on at once
+    min_samples: int = 4  # least samples in a window of a fit; fewer are interpolated linearly,
+    min_for_curvature: int = 6  # and least samples of a fit with curvature; fewer are fitted by a line
+    rounds: int = 3  # rounds of robust reweighting
+    cutoff_sd: float = 4.7  # cutoff of the bisquare in standard deviations, per axis (Beaton & Tukey 1974)
+    chunk: int = 300_000  # window samples computed at once
 
 
 SETTINGS = SmoothingSettings()

@@ -78,10 +78,10 @@ class LeRobot(RecordingFormat):
     def streams(self, path: Path) -> tuple[Stream, ...]:
         """Return those of the first episode that was downloaded; all others have the same."""
         data = self._data_set(path)
-        found = self._episode_streams(data, data.first_present())
+        streams = self._episode_streams(data, data.first_present())
         if len(data.records) > 1:
-            found = (*found, Stream(data.range_words, OTHER, "episodes with the same streams", len(data.records)))
-        return found
+            streams = (*streams, Stream(data.range_words, OTHER, "episodes with the same streams", len(data.records)))
+        return streams
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         data = self._data_set(path)
@@ -116,12 +116,12 @@ class LeRobot(RecordingFormat):
         damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
         count = int(places[-1]) + 1  # images that the states belong to, and those between
         last = int(numbers[-1]) + 1
-        shown = max(last, count) if damaged else max(last, len(numbers)) if last > count else len(numbers)
+        n_images = max(last, count) if damaged else max(last, len(numbers)) if last > count else len(numbers)
         noun, remedy = f"states of episode {episode.number}", "download the data set again, or name another episode"
         if count > len(times):
             notes = (*notes, f"{film.name}: by timestamps, not all images have {noun}; the others are left out")
-            noun, shown = f"that the timestamps of episode {episode.number} reach", min(shown, count)
-        notes = (*notes, *compare_counts(film, shown, count, noun, remedy=remedy))
+            noun, n_images = f"that the timestamps of episode {episode.number} reach", min(n_images, count)
+        notes = (*notes, *compare_counts(film, n_images, count, noun, remedy=remedy))
         row = np.full(max(last, count), -1)
         row[places] = np.arange(len(times))
         usable = row[numbers] >= 0
@@ -148,16 +148,16 @@ class LeRobot(RecordingFormat):
         match = None if stream is None else _NAME.fullmatch(stream)
         number = int(match[1]) if match else min(data.records)
         wanted = f"episode {number}/{match[2]}" if match else stream
-        named = [Stream(f"episode {number}/{key}", _kind(own), own.dtype, 0) for key, own in data.features.items()]
+        named = [Stream(f"episode {number}/{key}", _kind(each), each.dtype, 0) for key, each in data.features.items()]
         if stream is None and len(data.records) > 1:
-            examples = ", ".join(held.name for held in named if held.kind in kinds)[:300]
+            examples = ", ".join(candidate.name for candidate in named if candidate.kind in kinds)[:300]
             what = f"missing, and there are {data.range_words}; name one, as in {examples}"
             raise NeecoError(f"{data.path}: stream: {what}")
         key = choose_stream(data.path, named, wanted, kinds).name.partition("/")[2]
         return data.episode(number), key
 
     def _episode_streams(self, data: DataSet, episode: Episode) -> tuple[Stream, ...]:
-        found = []
+        streams = []
         absent = dict(episode.absent)
         for key in set(data.features) - set(data.films) - set(parquet_names(episode.data, self.limits)):
             absent[key] = f"{episode.data}: has no column {printable(key)}; download the data set again"
@@ -165,20 +165,20 @@ class LeRobot(RecordingFormat):
             feature, name = data.features[key], f"episode {episode.number}/{key}"
             if _kind(feature) == IMAGES:
                 title = f"{feature.dtype} {'x'.join(map(str, feature.shape))}"
-                found.append(Stream(name, IMAGES, title, episode.length, data.fps, problem=absent.get(key)))
+                streams.append(Stream(name, IMAGES, title, episode.length, data.fps, problem=absent.get(key)))
         for key, feature in data.features.items():
             name, kind = f"episode {episode.number}/{key}", _kind(feature)
             if kind == READINGS:
                 try:
                     if key in absent:
                         raise NeecoError(absent[key])
-                    found += self._table_streams(data, feature, name, episode)
+                    streams += self._table_streams(data, feature, name, episode)
                 except NeecoError as error:
                     title = f"{feature.dtype} of {len(feature.names)}"
-                    found.append(Stream(name, READINGS, title, episode.length, data.fps, problem=str(error)))
+                    streams.append(Stream(name, READINGS, title, episode.length, data.fps, problem=str(error)))
             elif kind == OTHER and key not in FIXED:
-                found.append(Stream(name, OTHER, f"{feature.dtype} {list(feature.shape)}", episode.length, data.fps))
-        return tuple(found)
+                streams.append(Stream(name, OTHER, f"{feature.dtype} {list(feature.shape)}", episode.length, data.fps))
+        return tuple(streams)
 
     def _table_streams(self, data: DataSet, feature: Feature, name: str, episode: Episode) -> list[Stream]:
         """Return a stream for every body that the names of a feature's columns distinguish."""

@@ -32,13 +32,13 @@ Record = dict[str, int | float]
 class LeRobotLimits:
     """Limits on what is read of a data set."""
 
-    numbers: int = 4096  # of one feature in a row; more are an image or a point cloud
-    group_bytes: int = 1 << 30  # that the columns read of a row group may unpack to
-    buffer_bytes: int = 1 << 20  # of a column, read at a time
-    pixels: int = 90_000_000  # of an image, as for files of images
-    images_at_once: int = 16  # of those that stand in Parquet
-    film_images: int = 10**7  # timestamps beyond are those of a clock
-    unit_tolerance: float = 1e-3  # of a quaternion's length, and of R^T R - I: rounding of float32 and text
+    numbers: int = 4096  # limit on the numbers of one feature in a row; more are an image or a point cloud
+    group_bytes: int = 1 << 30  # limit on the unpacked bytes of the columns read of a row group
+    buffer_bytes: int = 1 << 20  # bytes of a column read at a time
+    pixels: int = 90_000_000  # limit on the pixels of an image, as for files of images
+    images_at_once: int = 16  # images decoded at once, where Parquet holds them
+    film_images: int = 10**7  # limit on the images of a video; larger timestamps are a clock's
+    unit_tolerance: float = 1e-3  # tolerance of a quaternion's length and of R^T R - I: rounding of float32 and text
 
 
 class _NotThere(NeecoError):
@@ -182,7 +182,7 @@ def _described(path: Path, limits: LeRobotLimits, state: tuple[object, ...]) -> 
         "video_path": isinstance(stated["video_path"], str | None),
     }
     if wrong := next((name for name, good in valid.items() if not good), None):
-        raise NeecoError(f"{file}: {wrong}: {printable(info.get(wrong))} cannot be; correct it")
+        raise NeecoError(f"{file}: {wrong}: {printable(info.get(wrong))} is not valid; correct it")
     features = {key: _feature(file, key, value, limits) for key, value in stated["features"].items()}
     films = [key for key, feature in features.items() if feature.dtype == "video"]
     records = _records_3(path, films, limits) if match[2] else _records_2(path)
@@ -341,21 +341,21 @@ def _feature(file: Path, key: str, value: Any, limits: LeRobotLimits) -> Feature
         raise NeecoError(f"{file}: features: {printable(key)}: has no dtype and shape; correct it")
     count = math.prod(shape)
     numeric = re.fullmatch(r"(float|int|uint)\d+|bool", dtype) is not None and count <= limits.numbers
-    depth = any(isinstance(held, dict) and held.get(name) for held in (value, value.get("info"))
+    depth = any(isinstance(entry, dict) and entry.get(name) for entry in (value, value.get("info"))
                 for name in ("is_depth_map", "video.is_depth_map"))  # fmt: skip
     return Feature(key, dtype, tuple(shape), _names(key, shape, count, value.get("names")) if numeric else (), depth)
 
 
-def _names(key: str, shape: Sequence[int], count: int, given: Any) -> tuple[str, ...]:
+def _names(key: str, shape: Sequence[int], count: int, stated: Any) -> tuple[str, ...]:
     """Return a name of each number: as the data set names it, flat, nested, or by index, else `KEY[4]` or
     `KEY[0,3]`."""
-    if isinstance(given, dict) and all(type(index) is int for index in given.values()):
-        found = sorted(given, key=lambda name: given[name])
+    if isinstance(stated, dict) and all(type(index) is int for index in stated.values()):
+        names = sorted(stated, key=lambda name: stated[name])
     else:
-        found = list(_flat(given))
+        names = list(_flat(stated))
     plain = [key] if count == 1 else [f"{key}[{','.join(map(str, place))}]" for place in np.ndindex(*shape)]
-    unique = len(set(found)) == count == len(found) and all(name.strip() == name and name for name in found)
-    return tuple(found) if unique and not set(found) & set(FIXED) else tuple(plain)
+    unique = len(set(names)) == count == len(names) and all(name.strip() == name and name for name in names)
+    return tuple(names) if unique and not set(names) & set(FIXED) else tuple(plain)
 
 
 def _flat(value: Any, depth: int = 0) -> Iterator[str]:

@@ -33,11 +33,11 @@ _FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?
 class LogSettings:
     """Limits on the numbers of a log."""
 
-    max_distance_mm: float = 20_000.0  # no tracker of instruments reaches farther: the unit is wrong
-    max_angle: float = 4 * np.pi  # rad, more than any joint turns: the unit is wrong
-    clamped_share: float = 0.05  # of a calibration table's range: readings that far outside it count as its end
-    norm_tolerance: float = 0.02  # of a quaternion's length: numbers of two decimals pass
-    rounded_tolerance: float = 0.02  # of R^T R - I: loggers round to two decimals
+    max_distance_mm: float = 20_000.0  # limit on the distance in mm, beyond any tracker's reach: the unit is wrong
+    max_angle: float = 4 * np.pi  # limit on an angle in rad: no joint turns farther, so the unit is wrong
+    clamped_share: float = 0.05  # share of a calibration table's range: readings that far outside it count as its end
+    norm_tolerance: float = 0.02  # tolerance of a quaternion's length: numbers of two decimals pass
+    rounded_tolerance: float = 0.02  # tolerance of R^T R - I: loggers round to two decimals
 
 
 SETTINGS = LogSettings()
@@ -83,14 +83,14 @@ class ReadingLog:
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
     table = tool_columns(read_table(source.path, source.stream), source)
-    given = _given(table, time=source.time, position=source.position, rotation=source.rotation)
-    found = named.recognise_pose(table.header, given)
-    table = with_named_frame(table, (*(source.position or found.position or ()), *(source.rotation or ())))
+    stated = _given(table, time=source.time, position=source.position, rotation=source.rotation)
+    recognised = named.recognise_pose(table.header, stated)
+    table = with_named_frame(table, (*(source.position or recognised.position or ()), *(source.rotation or ())))
     frame = _frame_of(table, source)
     rows = Rows(table)
-    keep_measured(rows, source, found.state)
-    times = read_times(rows, source, found)
-    positions, quats = _poses(rows, source, found)
+    keep_measured(rows, source, recognised.state)
+    times = read_times(rows, source, recognised)
+    positions, quats = _poses(rows, source, recognised)
     drop_stuck(rows, times, np.column_stack([positions, quats]))
     times, order = in_order(rows, times, source.rate_hz)
     if np.ptp(quats[order], axis=0).max() == 0 and np.ptp(positions[order], axis=0).max() > 0:
@@ -141,12 +141,12 @@ def _frame_names(table: Table) -> list[str]:
     for index, name in enumerate(table.header):
         if table.rows.dtype != object or not _FRAME_COLUMN.fullmatch(name.strip().lower()):
             continue
-        found = sorted({cell.strip("/\"' ") for cell in table.rows[:, index]} - {""})
-        if len(found) > 1 and any(meaning_of(cell).frame != named.BASE for cell in found):
-            listed = ", ".join(found[:4])
-            raise NeecoError(f"{table.where}: {name}: poses are stated in several frames ({listed}); write one a file")
-        if len(found) == 1 and parse_number(found[0]) is None:
-            return found
+        names = sorted({cell.strip("/\"' ") for cell in table.rows[:, index]} - {""})
+        if len(names) > 1 and any(meaning_of(cell).frame != named.BASE for cell in names):
+            listed = ", ".join(names[:4])
+            raise NeecoError(f"{table.where}: {name}: poses are stated in several frames ({listed}); export one only")
+        if len(names) == 1 and parse_number(names[0]) is None:
+            return names
     return []
 
 
@@ -157,12 +157,12 @@ def _frame_of(table: Table, source: PoseColumns) -> str:
         if table.meaning is not None and table.frame is None:
             raise NeecoError(f"{table.where}: frame: {table.meaning.question}")
         return table.frame or named.BASE
-    own = CAMERA_FRAMES.get(table.frame or "")
-    if source.frame == named.CAMERA and own is not None and own.words != OPENCV.words:
+    axes = CAMERA_FRAMES.get(table.frame or "")
+    if source.frame == named.CAMERA and axes is not None and axes.words != OPENCV.words:
         raise NeecoError(
             f"{table.where}: frame: {named.CAMERA} means OpenCV's axes ({OPENCV.words}), and the file states its poses "
-            f"in {table.stated_in or own.name}, whose axes are {own.words}; leave it out (or write frame: {own.name}), "
-            f"or frame: {OPENCV.name} where they are turned already"
+            f"in {table.stated_in or axes.name}, whose axes are {axes.words}; leave it out (or write frame: "
+            f"{axes.name}), or frame: {OPENCV.name} where they are turned already"
         )
     return source.frame
 
@@ -171,13 +171,13 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     """Read a joint sensor's log, through its calibration table when there is one. Raises NeecoError naming file,
     row or column, and remedy."""
     table = read_table(source.path, source.stream)
-    given = _given(table, time=source.time, value=None if source.value is None else (source.value,))
-    recognised, found = named.recognise_value(table.header, given)
+    stated = _given(table, time=source.time, value=None if source.value is None else (source.value,))
+    recognised, when = named.recognise_value(table.header, stated)
     value = source.value or recognised
     if value is None:
         raise NeecoError(f"{source.path}: header: which column is the joint's reading? Name it as columns.value")
     rows = Rows(table)
-    times = read_times(rows, source, found)
+    times = read_times(rows, source, when)
     values = read_cells(rows, (value,))[:, 0]
     clamped: tuple[str, ...] = ()
     if source.calibration is not None:
@@ -197,33 +197,33 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
 def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
     """The columns that a recording names, by meaning, as the file spells them. Raises NeecoError for one that is not
     there, or is named for two things."""
-    given = {
+    stated = {
         meaning: tuple(table.header[column_index(table, name)] for name in names)
         for meaning, names in columns.items()
         if names is not None
     }
-    names = [name for group in given.values() for name in group]
+    names = [name for group in stated.values() for name in group]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise NeecoError(f"{table.where}: columns: {twice} is named for two things; name a column for each")
-    return given
+    return stated
 
 
-def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
+def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
     """Positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
     table = rows.table
-    rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
+    rotation, form = (source.rotation, source.form) if source.rotation else (recognised.rotation, recognised.form)
     if rotation is None or form is None:
-        raise _unclear(table, found, "rotation", "qw, qx, qy, qz columns")
-    position = source.position or found.position
+        raise _unclear(table, recognised, "rotation", "qw, qx, qy, qz columns")
+    position = source.position or recognised.position
     if form == MATRIX:
         position, read = tuple(rotation[i] for i in (3, 7, 11)), rotation
     elif position is None:
-        raise _unclear(table, found, "position", "x, y, z columns")
+        raise _unclear(table, recognised, "position", "x, y, z columns")
     else:
         read = (*position, *rotation)
-    known = (found, named.recognise_pose(table.header), named.recognise_pose((*position, *rotation)))
-    implied = next((kind.length_unit for kind in known if kind.position == position), None)
+    readings = (recognised, named.recognise_pose(table.header), named.recognise_pose((*position, *rotation)))
+    implied = next((kind.length_unit for kind in readings if kind.position == position), None)
     scale = named.scale_of(table.where, position, "length", source.units.length, implied, "")
     angle = 1.0
     if form in (EULER, ROTATION_VECTOR):
@@ -277,8 +277,8 @@ def continuous(quats: np.ndarray) -> tuple[np.ndarray, int]:
     return quats * signs[:, None], int(flips.sum())
 
 
-def _unclear(table: Table, found: RecognisedColumns, what: str, expected: str) -> NeecoError:
-    reason = found.unclear.get(what) or (found.unclear.get("quaternion") if what == "rotation" else None)
+def _unclear(table: Table, recognised: RecognisedColumns, what: str, expected: str) -> NeecoError:
+    reason = recognised.unclear.get(what) or (recognised.unclear.get("quaternion") if what == "rotation" else None)
     names = "position" if what == "position" else _FORMS
     listed = repr(", ".join(table.header[:12])[:120])
     problem = f"no {expected} found among {listed}; name them in the recording under columns: {names}"

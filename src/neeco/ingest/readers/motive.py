@@ -53,12 +53,12 @@ class MotiveExport(RecordingFormat):
 
         def values(name: str, part: str, letters: str) -> np.ndarray:
             """[R, A] of a body's columns; NaN where it was not tracked."""
-            own = {
+            places = {
                 axes[i]: str(i) for i in range(len(axes)) if (names[i], kinds[i], parts[i]) == (name, BODY_TYPE, part)
             }
-            if not set(letters) <= set(own):
+            if not set(letters) <= set(places):
                 raise NeecoError(f"{path}: {part}: a rigid body has no columns of it; export the take with 6 DoF data")
-            return numbers(raw, [own[letter] for letter in letters])[0]
+            return numbers(raw, [places[letter] for letter in letters])[0]
 
         kind, unit = preamble.get("Rotation Type", QUATERNION).lower(), canonical_unit(preamble.get("Length Units", ""))
         if kind not in (QUATERNION, *ORDERS):
@@ -68,10 +68,10 @@ class MotiveExport(RecordingFormat):
         for name in dict.fromkeys(names[kinds == BODY_TYPE]):
             quats = values(name, "rotation", "xyzw" if kind == QUATERNION else kind)
             if kind != QUATERNION:
-                known, angles = np.isfinite(quats).all(axis=1), quats
+                valid, angles = np.isfinite(quats).all(axis=1), quats
                 quats = np.full((len(angles), 4), np.nan)
-                if known.any():
-                    quats[known] = Rotation.from_euler(kind.upper(), angles[known], degrees=True).as_quat()
+                if valid.any():
+                    quats[valid] = Rotation.from_euler(kind.upper(), angles[valid], degrees=True).as_quat()
             bodies.append(Body(name, tuple(range(len(header), len(header) + 7))))
             header += [*(axis + suffix for axis in "xyz"), *QUATS]
             columns += [values(name, "position", "xyz"), quats]

@@ -58,12 +58,12 @@ class SequenceLimits:
     """Limits on what a sequence's header may promise."""
 
     line_bytes: int = 1 << 16
-    header_bytes: int = 1 << 29  # 100 000 frames of 20 transforms
+    header_bytes: int = 1 << 29  # limit on the bytes of a header: 100 000 frames of 20 transforms
     frames: int = 10_000_000
     min_images: int = 2
     side_px: int = 8192
-    zlib_ratio: int = 1032  # of unpacked to packed bytes
-    chunk_bytes: int = 1 << 20  # that are read, and unpacked, at once
+    zlib_ratio: int = 1032  # largest ratio of unpacked to packed bytes
+    chunk_bytes: int = 1 << 20  # bytes read, and unpacked, at once
 
 
 LIMITS = SequenceLimits()
@@ -188,14 +188,14 @@ def read_sequence(path: Path, state: tuple[object, ...]) -> FrameSequence:
     )
     if sequence.has_images:
         require_content(file)
-        held, promised = file.stat().st_size - start, sequence.frame_bytes * count
+        available, promised = file.stat().st_size - start, sequence.frame_bytes * count
         stored = plain.get("compresseddatasize", "")
-        if not packed and held != promised:
-            raise header.fault(f"holds {held / sequence.frame_bytes:.4g} images, its header states {count}", file)
-        if packed and re.fullmatch(r"\d{1,18}", stored) and held < int(stored):
-            raise header.fault(f"holds {held} bytes of compressed images, its header states {stored}", file)
-        if packed and promised > LIMITS.zlib_ratio * (held + 64):
-            raise header.fault(f"holds {held} bytes, of which no {count} images of {size} can come", file)
+        if not packed and available != promised:
+            raise header.fault(f"holds {available / sequence.frame_bytes:.4g} images, its header states {count}", file)
+        if packed and re.fullmatch(r"\d{1,18}", stored) and available < int(stored):
+            raise header.fault(f"holds {available} bytes of compressed images, its header states {stored}", file)
+        if packed and promised > LIMITS.zlib_ratio * (available + 64):
+            raise header.fault(f"holds {available} bytes, of which no {count} images of {size} can come", file)
     return sequence
 
 

@@ -93,10 +93,10 @@ class RosBag(RecordingFormat):
             raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
         values, (meaning, turned) = poses.table(), _meaning(survey, chosen)
         if turned is not None:
-            known = np.linalg.norm(values[:, 3:], axis=1) > 0
+            valid = np.linalg.norm(values[:, 3:], axis=1) > 0
             turn = Rotation.from_matrix(turned[:3, :3])
             values[:, :3] = turn.apply(values[:, :3]) + turned[:3, 3] / MM_PER_M
-            values[known, 3:] = (turn * Rotation.from_quat(values[known, 3:])).as_quat()
+            values[valid, 3:] = (turn * Rotation.from_quat(values[valid, 3:])).as_quat()
         stated_in = next(iter(poses.frames), None) or None
         return replace(_table(survey, chosen, poses, POSE_HEADER, values), stated_in=stated_in, meaning=meaning)
 
@@ -226,10 +226,10 @@ def _meaning(survey: Survey, name: str) -> tuple[NamedFrame, np.ndarray | None]:
         return NamedFrame(BASE), None
     frame, meaning = next(iter(frames)), meaning_of(next(iter(frames)), images, dvrk=of_dvrk(name))
     if meaning.frame is None and len(images) == 1 and frame not in images:
-        own = next(iter(images))
-        if meaning_of(own, images).frame is not None and (turned := _fixed_transform(survey, frame, own)) is not None:
-            why = f"{frame}, and turned by static transforms of the bag to {own}, the images'"
-            return NamedFrame(CAMERA, why), turned
+        image = next(iter(images))
+        turned = _fixed_transform(survey, frame, image) if meaning_of(image, images).frame is not None else None
+        if turned is not None:
+            return NamedFrame(CAMERA, f"{frame}, turned by the bag's static transforms to {image}, the images'"), turned
     return meaning, None
 
 
@@ -273,11 +273,11 @@ def _chained(survey: Survey, stream: str) -> Table:
     child, word, frame = stream.removeprefix("tf:").partition(" in ")
     where = f"{survey.path}: {stream}"
     children = {name.removeprefix("tf:") for name in survey.poses if name.startswith("tf:")}
-    known = children.union(*(survey.poses[f"tf:{name}"].frames for name in children))
-    missing = [name for name in (child, frame) if name not in known] if word else [child]
+    names = children.union(*(survey.poses[f"tf:{name}"].frames for name in children))
+    missing = [name for name in (child, frame) if name not in names] if word else [child]
     if missing:
-        listed = printable(", ".join(sorted(known)), 300).strip("'")
-        remedy = f"name one of {listed}" if known else "the bag has no tf; name a topic"
+        listed = printable(", ".join(sorted(names)), 300).strip("'")
+        remedy = f"name one of {listed}" if names else "the bag has no tf; name a topic"
         raise NeecoError(f"{where}: there is no transform of {printable(missing[0])}; {remedy}")
     ups, downs = _path(survey, where, child, frame)
     moving = [edge for edge in (*ups, *downs) if not survey.poses[f"tf:{edge}"].static]
@@ -384,4 +384,4 @@ def wrist_joints(names: Sequence[str], is_jaw: bool) -> tuple[tuple[str, str], .
     """Return (joint as tool files call it, column) of the wrist and jaw among a dVRK topic's joints."""
     if is_jaw and len(names) == 1:
         return (("jaw", joint_column(names[0])),)
-    return tuple((known, joint_column(name)) for known in DVRK_WRIST for name in names if name.endswith(known))
+    return tuple((joint, joint_column(name)) for joint in DVRK_WRIST for name in names if name.endswith(joint))

@@ -20,16 +20,16 @@ COUNTERS = (2.0**32, 2.0**16)  # values at which unsigned counters begin anew
 class RowSettings:
     """Limits on the rows of a log."""
 
-    min_samples: int = 4  # of a usable log
-    max_wrong: float = 0.05  # share of rows that may be wrong (not missing) before the file is refused
-    max_unreadable: float = 0.5  # share of rows whose cells may be no numbers
-    states: int = 8  # of those that drop rows, in the notes
-    max_same_time: float = 0.5  # share of rows at the time of another: more, and times are too coarse
-    stuck_s: float = 0.5  # a tracker's noise leaves no pose unchanged for as long,
-    stuck_samples: int = 10  # and for as many samples
-    gap_steps: float = 4.0  # a step in time longer than so many usual ones,
-    gap_s: float = 0.15  # and than this, is a gap
-    restart_steps: float = 10.0  # usual steps back, beyond which rows are not out of order: time begins anew
+    min_samples: int = 4  # least rows of a usable log
+    max_wrong: float = 0.05  # limit on the share of wrong (not missing) rows; with more, the file is refused
+    max_unreadable: float = 0.5  # limit on the share of rows whose cells are no numbers
+    states: int = 8  # number of states listed in the notes on dropped rows
+    max_same_time: float = 0.5  # limit on the share of rows at the time of another; with more, the times are too coarse
+    stuck_s: float = 0.5  # time in s without change of a pose, which a tracker's noise rules out,
+    stuck_samples: int = 10  # and the number of samples it needs
+    gap_steps: float = 4.0  # smallest step in time that is a gap, in usual steps,
+    gap_s: float = 0.15  # and in s; both hold
+    restart_steps: float = 10.0  # step back in usual steps, beyond which time begins anew
 
 
 SETTINGS = RowSettings()
@@ -88,9 +88,9 @@ def keep_measured(rows: Rows, source: PoseColumns, recognised: str | None) -> No
         )
 
 
-def read_times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColumns) -> np.ndarray:
+def read_times(rows: Rows, source: PoseColumns | JointColumns, recognised: RecognisedColumns) -> np.ndarray:
     """Return times [R] in s; rows without one are dropped."""
-    table, names, rate = rows.table, source.time or found.time, source.rate_hz
+    table, names, rate = rows.table, source.time or recognised.time, source.rate_hz
     if names is None and rate is not None:
         if headers := _headers(table, range(len(table.rows))):
             what = f"line {headers[0]} repeats the header, and its rows have no times"
@@ -99,8 +99,8 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, found: Recognised
     if names is None:
         what = "no column of times found; name it as columns.time (or add t_s), or say rate_hz"
         raise NeecoError(f"{table.where}: header: {what} where its rows come at a fixed rate")
-    cells, known = read_cells(rows, names), named.recognise_time(names)
-    if rate is not None and (len(names) == 2 or known.time_unit or named.split_unit(names[0], "time")[1]):
+    cells, meaning = read_cells(rows, names), named.recognise_time(names)
+    if rate is not None and (len(names) == 2 or meaning.time_unit or named.split_unit(names[0], "time")[1]):
         what = f"{', '.join(names)} holds times and counts no frames"
         raise NeecoError(
             f"{table.where}: rate_hz: {what}; leave rate_hz out, or name the column that counts as columns.time"
@@ -109,12 +109,12 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, found: Recognised
         return cells[:, 0] + cells[:, 1] * 1e-9
     if rate is not None:
         return cells[:, 0] / rate
-    if known.counts_frames:
+    if meaning.counts_frames:
         what = "counts frames, and nothing says how many a second; say rate_hz in the recording"
         raise NeecoError(
             f"{table.where}: {names[0]}: {what} (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
         )
-    return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, known.time_unit, "")
+    return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, meaning.time_unit, "")
 
 
 def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
@@ -185,8 +185,8 @@ def restarts(times: np.ndarray) -> tuple[float, list[int]]:
     steps = np.diff(times)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
     far = np.flatnonzero(steps < -SETTINGS.restart_steps * usual).tolist()
-    held = [back for back in far if (times[max(back - 1, 0) : back] > times[back + 1]).all()]
-    return usual, [back for back in held if (times[back + 2 : back + 3] < times[back]).all()]
+    jumps = [back for back in far if (times[max(back - 1, 0) : back] > times[back + 1]).all()]
+    return usual, [back for back in jumps if (times[back + 2 : back + 3] < times[back]).all()]
 
 
 def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float | None) -> np.ndarray:

@@ -68,18 +68,18 @@ class SurgPose(RecordingFormat):
         arms = _read(path)
         count = max(len(frames) for frames, _ in arms.poses.values())
         # the left camera's are the frames; others are listed
-        found = [
+        streams = [
             Stream(name, IMAGES, "video", count, FRAMES_PER_SECOND, offered=number == 0)
             for number, name in enumerate(_videos(path))
         ]
         for name, (frames, _) in sorted(arms.poses.items()):
-            found.append(Stream(name, POSES, "poses", len(frames), FRAMES_PER_SECOND, body=name, hints=(DVRK_HINT,)))
+            streams.append(Stream(name, POSES, "poses", len(frames), FRAMES_PER_SECOND, body=name, hints=(DVRK_HINT,)))
         for name, (frames, values) in sorted(arms.joints.items()):
             wrist = tuple(joint for joint in WRIST if joint[1] in JOINT_NAMES[: values.shape[1]])
             title = f"{name}{JOINTS_BEHIND}"
-            found.append(Stream(title, READINGS, "joints", len(frames), FRAMES_PER_SECOND, body=name, joints=wrist))
+            streams.append(Stream(title, READINGS, "joints", len(frames), FRAMES_PER_SECOND, body=name, joints=wrist))
         labels = sorted(file.name for file in path.glob("keypoints_*.yaml"))
-        return (*found, *(Stream(name, OTHER, "labels", count) for name in labels))
+        return (*streams, *(Stream(name, OTHER, "labels", count) for name in labels))
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         arms = _read(path)
@@ -103,8 +103,8 @@ class SurgPose(RecordingFormat):
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
-        found = self.stereo(path, None, None)
-        return None if found is None else found[:2]["right" in Path(name).name]
+        lenses = self.stereo(path, None, None)
+        return None if lenses is None else lenses[:2]["right" in Path(name).name]
 
     def stereo(self, path: Path, left: str | None, right: str | None) -> tuple[Lens, Lens, np.ndarray] | None:
         if left and right and right != left.replace("left", "right"):
@@ -115,14 +115,14 @@ class SurgPose(RecordingFormat):
 
 def _videos(path: Path) -> list[str]:
     """Videos, or folders of their frames, the left one in usual light first."""
-    found = []
+    videos = []
     for light in LIGHTS:
         for side in ("left", "right"):
             for name in (f"{side}_video.mp4", f"{side}_video", f"{side}_frames"):
                 if (path / light / name).exists():
-                    found.append((Path(light) / name).as_posix())
+                    videos.append((Path(light) / name).as_posix())
                     break
-    return found
+    return videos
 
 
 def _read(path: Path) -> _Arms:

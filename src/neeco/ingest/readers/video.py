@@ -32,12 +32,12 @@ class VideoSettings:
     """Limits on videos and folders of images."""
 
     min_images: int = 2
-    square: float = 0.005  # by which a square pixel's width and height may differ: 1 px of 200
-    max_rate: float = 1000.0  # frames a second, beyond which a file's own number is no rate
-    max_left_out: float = 0.1  # of a folder's images (or one): more that are missing or of another size are no slip
-    same_rate: float = 2e-4  # relative difference of frame rates that is none
-    max_corrupt: int = 1000  # frames, after which a video is given up
-    buffered_bytes: int = 512 << 20  # of a video's decoded frames; those of a larger one are decoded at every reading
+    square: float = 0.005  # tolerance of a square pixel's ratio of width to height: 1 px of 200
+    max_rate: float = 1000.0  # limit on a file's own frames a second; beyond it, the number is no rate
+    max_left_out: float = 0.1  # limit on the share of a folder's images (or one) that may be missing or of another size
+    same_rate: float = 2e-4  # relative difference below which frame rates are the same
+    max_corrupt: int = 1000  # number of corrupt frames after which a video is given up
+    buffered_bytes: int = 512 << 20  # limit on the kept bytes of decoded frames; larger videos are decoded anew
 
 
 SETTINGS = VideoSettings()
@@ -91,17 +91,17 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
             sizes.append(_open(file).size)
         except NeecoError:
             sizes.append(None)
-    known = Counter(size for size in sizes if size is not None)
-    if known.total() < SETTINGS.min_images:
-        raise NeecoError(f"{folder}: {known.total()} of {len(files)} images can be read; replace the damaged files")
-    size, count = known.most_common(1)[0]
-    other = [file for file, found in zip(files, sizes, strict=True) if found not in (None, size)]
+    counts = Counter(size for size in sizes if size is not None)
+    if counts.total() < SETTINGS.min_images:
+        raise NeecoError(f"{folder}: {counts.total()} of {len(files)} images can be read; replace the damaged files")
+    size, count = counts.most_common(1)[0]
+    other = [file for file, each in zip(files, sizes, strict=True) if each not in (None, size)]
     if not _are_few(len(other), count):
-        listed = " and ".join("x".join(map(str, found)) for found, _ in known.most_common(2))
+        listed = " and ".join("x".join(map(str, each)) for each, _ in counts.most_common(2))
         raise NeecoError(f"{other[0]}: the images of this folder are {listed}; give images of one size")
-    bad = [file for file, found in zip(files, sizes, strict=True) if found is None]
+    bad = [file for file, each in zip(files, sizes, strict=True) if each is None]
     notes += _left_out(folder, "cannot be read", bad) + _left_out(folder, "are of another size", other)
-    usable = [index for index, found in enumerate(sizes) if found == size]
+    usable = [index for index, each in enumerate(sizes) if each == size]
     return ImageFiles(folder, size, tuple(notes), stamps[usable], files=tuple(files[i] for i in usable))
 
 
@@ -213,8 +213,8 @@ class _Scan:
     turned: int = 0
     pixel_aspect: float = 1.0
     others: tuple[str, ...] = ()  # sizes of the video streams besides the one that is read
-    promised: int = 0  # frames the file's header speaks of
-    packets: int = 0  # coded frames that were read
+    promised: int = 0  # number of frames by the file's header
+    packets: int = 0  # number of coded frames read
     end: int | None = None  # of the stream by the file's header, in its time base
     buffered: list[Any] = field(default_factory=list)  # the frames, as far as they fit into memory
     buffered_bytes: int = 0
@@ -297,7 +297,7 @@ class _Scan:
             why = f" ({self.failure})" if self.failure else ""
             raise NeecoError(f"{self.path}: {len(self.stamps)} frames can be decoded{why}; give an intact video file")
         stamps = [stamp for stamp in self.stamps if stamp is not None]
-        order, numbered, own, notes = sorted(set(stamps)), False, None, self._notes(stamps)
+        order, numbered, own_rate, notes = sorted(set(stamps)), False, None, self._notes(stamps)
         if len(stamps) == len(self.stamps) and self.time_base and len(order) > 0.9 * len(stamps):
             times = (np.array(order, dtype=np.float64) - order[0]) * self.time_base
             if any(later < stamp for stamp, later in pairwise(stamps)):
@@ -309,8 +309,8 @@ class _Scan:
                 rate = 1 / float(np.median(np.diff(times)))
                 times = np.arange(len(order)) / fps
                 if abs(rate / fps - 1) >= SETTINGS.same_rate:
-                    own = rate
-                    notes.append(f"states {own:.4g} frames a second itself, the recording {fps:g}")
+                    own_rate = rate
+                    notes.append(f"states {own_rate:.4g} frames a second itself, the recording {fps:g}")
             if len(order) < len(stamps):
                 notes.append(f"{len(stamps) - len(order)} frames share a time with another; left out")
         else:
@@ -322,7 +322,7 @@ class _Scan:
             times = np.array(order) / stated
         return _Video(
             self.path, self.size, tuple(f"{self.path.name}: {note}" for note in notes), times, stamps=tuple(order),
-            numbered=numbered, threads=self.threads, part=self.part, own_fps=own, pixel_aspect=self.pixel_aspect,
+            numbered=numbered, threads=self.threads, part=self.part, own_fps=own_rate, pixel_aspect=self.pixel_aspect,
             buffered=tuple(self.buffered) if len(self.buffered) == len(self.stamps) else (),
         )  # fmt: skip
 
@@ -366,11 +366,11 @@ def _reason(error: BaseException) -> str:
 def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[str]) -> tuple[list[Path], np.ndarray]:
     """The files a table of times names (all of them, in order, when it names none) and their times [N] s."""
     table = read_table(table_path)
-    found = recognise_time(table.header)
-    column = found.time[0] if found.time else table.header[0] if len(table.header) == 1 else None
+    recognised = recognise_time(table.header)
+    column = recognised.time[0] if recognised.time else table.header[0] if len(table.header) == 1 else None
     if column is None:
         raise NeecoError(f"{table_path}: header: no column of times found; call one t_s")
-    scale = scale_of(table_path, (column,), "time", None, found.time_unit, "")
+    scale = scale_of(table_path, (column,), "time", None, recognised.time_unit, "")
     times, lines = numbers(table, (column,))[0][:, 0] * scale, table.lines
     by_name = {file.name: file for file in files} | {file.stem: file for file in files}
     columns = [[Path(str(cell)).name for cell in table.rows[:, index]] for index in range(len(table.header))]

@@ -15,10 +15,10 @@ from neeco.ingest.recording.model import IngestSettings, InstrumentLogs, Recordi
 
 def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
     """Return one recording for each of the episodes that a recording lists. Raises NeecoError."""
-    found: list[Recording] = []
+    separated: list[Recording] = []
     for recording in recordings:
-        found += [_of_episode(recording, number) for number in recording.episodes] or [recording]
-    return tuple(found)
+        separated += [_of_episode(recording, number) for number in recording.episodes] or [recording]
+    return tuple(separated)
 
 
 def _of_episode(recording: Recording, episode: int) -> Recording:
@@ -31,21 +31,21 @@ def _of_episode(recording: Recording, episode: int) -> Recording:
         if isinstance(value, tuple):
             return tuple(in_episode(item, key) for item in value)
         if isinstance(value, InstrumentLogs | StereoPartner):
-            held = {field.name: in_episode(getattr(value, field.name), field.name) for field in fields(value)}
-            return replace(value, **held)
+            values = {field.name: in_episode(getattr(value, field.name), field.name) for field in fields(value)}
+            return replace(value, **values)
         if not isinstance(value, VideoFile | PoseColumns | JointColumns):
             return value
-        known = format_of(value.file if isinstance(value, VideoFile) else value.path)
-        if known is None or known.of_episode("", episode) is None:
+        reader = format_of(value.file if isinstance(value, VideoFile) else value.path)
+        if reader is None or reader.of_episode("", episode) is None:
             return value
         if value.stream is None:
             raise NeecoError(f"{recording.path}: {key}: stream: missing; name the feature, as in observation.state")
         moved.append(key)
-        return replace(value, stream=known.of_episode(value.stream, episode))
+        return replace(value, stream=reader.of_episode(value.stream, episode))
 
     places = {"source": "video", "instruments": "instruments", "laparoscope": "laparoscope", "stereo": "stereo"}
-    held = {field: in_episode(getattr(recording, field), key) for field, key in places.items()}
-    changed = replace(recording, **held, episode=f"episode_{episode}")
+    streams = {field: in_episode(getattr(recording, field), key) for field, key in places.items()}
+    changed = replace(recording, **streams, episode=f"episode_{episode}")
     if not moved:
         raise NeecoError(
             f"{recording.path}: episodes: no file named here holds several; leave it out, and give several recordings "

@@ -146,11 +146,11 @@ class PoseSection(LogSection):
 
     def log(self, video: Path | None) -> PoseColumns:
         """Return the log; in the file of the images, it shares their clock."""
-        (rotation, form), held = self.columns.rotation, self.columns
+        (rotation, form), columns = self.columns.rotation, self.columns
         return PoseColumns(
-            self.file, self.clock or (VIDEO_CLOCK if self.file == video else TRACKER_CLOCK), time=held.time,
-            position=held.position, rotation=rotation, form=form, euler_convention=held.euler_convention,
-            state=held.state, good=held.good, units=self.units, rate_hz=self.rate_hz, tool=self.tool,
+            self.file, self.clock or (VIDEO_CLOCK if self.file == video else TRACKER_CLOCK), time=columns.time,
+            position=columns.position, rotation=rotation, form=form, euler_convention=columns.euler_convention,
+            state=columns.state, good=columns.good, units=self.units, rate_hz=self.rate_hz, tool=self.tool,
             stream=self.stream, frame=self.frame,
         )  # fmt: skip
 
@@ -236,8 +236,8 @@ class InstrumentSection(BasesSection):
             raise Fault(self.base.key, "its poses are in the camera's frame already; leave out one of the two")
         for reading in self.kinematics.readings if self.kinematics is not None else ():
             if reading not in self.joints:
-                known = ", ".join(self.joints) or "none"
-                raise Fault("kinematics", f"{printable(reading)} is no joint of it; name the recorded ones ({known})")
+                names = ", ".join(self.joints) or "none"
+                raise Fault("kinematics", f"{printable(reading)} is no joint of it; name the recorded ones ({names})")
 
     def logs(self, video: Path | None, base: StatedBase | None, shared: Sequence[str]) -> InstrumentLogs:
         """Return the instrument. base: of all instruments that state none; shared: joints that several have."""
@@ -271,9 +271,9 @@ class FramesSection:
 
     @property
     def source(self) -> VideoFile | ImageFolder:
-        found = self.video or self.images
-        assert found is not None
-        return found
+        frames = self.video or self.images
+        assert frames is not None
+        return frames
 
 
 @dataclass(frozen=True)
@@ -293,12 +293,12 @@ class StereoSection(FramesSection):
 
     def partner(self, left: VideoFile | ImageFolder) -> StereoPartner:
         """Return it as the partner of the camera that took `left`."""
-        held = left.file if isinstance(left, VideoFile) and format_of(left.file) is not None else None
+        file = left.file if isinstance(left, VideoFile) and format_of(left.file) is not None else None
         if self.source == left:
             raise Fault("stereo.video", "these are the left camera's images; name the right camera's")
         if self.calibration is not None:
             return StereoPartner(self.source, self.calibration.file, self.calibration.stream)
-        if held is None or not isinstance(self.source, VideoFile) or self.source.file != held:
+        if file is None or not isinstance(self.source, VideoFile) or self.source.file != file:
             raise Fault("stereo.calibration", "missing; give the file of a stereo calibration, or a bag that holds it")
         return StereoPartner(self.source)
 
@@ -311,11 +311,11 @@ def _intrinsics(node: Node) -> Path | tuple[float, ...]:
 
 def _episodes(node: Node) -> tuple[int, ...]:
     """Return the numbers of a list of numbers and ranges such as "3-7"."""
-    held = ranges(node)
-    count = sum(last + 1 - first for first, last in held)
+    spans = ranges(node)
+    count = sum(last + 1 - first for first, last in spans)
     if count > MAX_EPISODES:
         raise Fault(node.field, f"{count} are too many for one capture; list {MAX_EPISODES} at most")
-    numbers = [number for first, last in held for number in range(first, last + 1)]
+    numbers = [number for first, last in spans for number in range(first, last + 1)]
     twice = next((number for number in numbers if numbers.count(number) > 1), None)
     if twice is not None:
         raise Fault(node.field, f"{twice} is listed twice; list each once")
@@ -349,8 +349,8 @@ class RecordingSection(FramesSection, BasesSection):
         joints = [joint for item in self.instruments for joint in item.joints]
         by = None if self.splits is None else self.splits.unseen_by
         if by is not None and by not in joints:
-            known = ", ".join(joints) or "none"
-            raise Fault("splits.unseen_by", f"no joint is called {printable(by)}; the joints are {known}")
+            listed = ", ".join(joints) or "none"
+            raise Fault("splits.unseen_by", f"no joint is called {printable(by)}; the joints are {listed}")
 
     def recording(self, path: Path) -> Recording:
         """Return the recording that the file `path` states. Raises Fault."""
@@ -361,20 +361,20 @@ class RecordingSection(FramesSection, BasesSection):
         scope = None if self.laparoscope is None else self.laparoscope.log(video)
         sync, notes = _sync(Node(self.sync, str(path), "sync"), instruments, scope)
         stereo = None if self.stereo is None else self.stereo.partner(self.source)
-        found = Recording(
+        recording = Recording(
             path, self.source, intrinsics=self.intrinsics, instruments=instruments, laparoscope=scope, sync=sync,
             frames=self.frames, splits=self.splits, notes=notes, settings=self.settings, camera=self.camera,
             stereo=stereo, episodes=self.episodes,
         )  # fmt: skip
-        known = None if video is None else format_of(video)
-        for log in found.logs if known is not None else ():
-            if video is None or known is None or log.path != video or log.clock != VIDEO_CLOCK:
+        reader = None if video is None else format_of(video)
+        for log in recording.logs if reader is not None else ():
+            if video is None or reader is None or log.path != video or log.clock != VIDEO_CLOCK:
                 continue
-            of_log, of_images = known.clock(video, log.stream), known.clock(video, found.stream)
+            of_log, of_images = reader.clock(video, log.stream), reader.clock(video, recording.stream)
             if of_log and of_images and of_log != of_images:  # another part of one file, as of another episode
                 problem = f"{printable(log.stream)} is of {of_log}, the images of {of_images}"
                 raise Fault("stream", f"{problem}; name the same in both")
-        return found
+        return recording
 
 
 def _sync(

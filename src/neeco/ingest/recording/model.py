@@ -45,11 +45,11 @@ class VideoFile:
 
     def open(self) -> VideoSource:
         """Return the frames. Raises NeecoError."""
-        known = format_of(self.file)
-        if known is None:
+        reader = format_of(self.file)
+        if reader is None:
             return open_video(self.file, self.fps)
-        known.require_package(self.file)
-        return known.open_images(self.file, self.stream)
+        reader.require_package(self.file)
+        return reader.open_images(self.file, self.stream)
 
 
 @dataclass(frozen=True)
@@ -202,13 +202,13 @@ class Recording:
         source = self.stereo.source
         right = source if isinstance(source, VideoFile) else VideoFile(Path())
         file = self.stereo.calibration or right.file
-        known = _streams_of(file)
-        if known is None:
+        reader = _streams_of(file)
+        if reader is None:
             return *read_stereo(file), file
-        found = known.stereo(file, self.stream, self.stereo.stream or right.stream)
-        if found is None:
-            raise NeecoError(f"{file}: {known.format}: states no stereo calibration; give one as stereo.calibration")
-        return *found, file
+        calibration = reader.stereo(file, self.stream, self.stereo.stream or right.stream)
+        if calibration is None:
+            raise NeecoError(f"{file}: {reader.format}: states no stereo calibration; give one as stereo.calibration")
+        return *calibration, file
 
     def read_lens(self) -> tuple[Lens | None, str]:
         """Return the lens given, else that which the images' file states (None: to be estimated), and its source.
@@ -216,10 +216,10 @@ class Recording:
         if self.intrinsics is None and self.stereo is not None:
             left, _, _, file = self.read_stereo()
             return left, str(file)
-        if self.intrinsics is None and self.video is not None and (known := format_of(self.video)) is not None:
-            return known.lens(self.video, self.stream), str(self.video)
-        if isinstance(self.intrinsics, Path) and (known := _streams_of(self.intrinsics)) is not None:
-            if (lens := known.lens(self.intrinsics, self.stream)) is None:
+        if self.intrinsics is None and self.video is not None and (reader := format_of(self.video)) is not None:
+            return reader.lens(self.video, self.stream), str(self.video)
+        if isinstance(self.intrinsics, Path) and (reader := _streams_of(self.intrinsics)) is not None:
+            if (lens := reader.lens(self.intrinsics, self.stream)) is None:
                 raise NeecoError(f"{self.intrinsics}: states no lens of these images; give a calibration")
             return lens, str(self.intrinsics)
         if isinstance(self.intrinsics, Path) and self.intrinsics.suffix.lower() == ".ini":  # which two cameras share
@@ -237,11 +237,11 @@ class Recording:
 
 def _streams_of(file: Path) -> RecordingFormat | None:
     """Return the format of a recording that a calibration is taken from; None for a calibration's own file."""
-    known = format_of(file)
-    if known is None or known.suffixes == DELIMITED:
+    reader = format_of(file)
+    if reader is None or reader.suffixes == DELIMITED:
         return None
-    known.require_package(file)
-    return known
+    reader.require_package(file)
+    return reader
 
 
 def logs_of(

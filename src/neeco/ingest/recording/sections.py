@@ -26,10 +26,10 @@ def existing_file(node: Node) -> Path:
     name, file = text(node), Path(node.file)
     try:
         path = file.parent / Path(name).expanduser()
-        found = path.exists()
+        exists = path.exists()
     except (OSError, ValueError, RuntimeError):
-        found = False
-    if not found:
+        exists = False
+    if not exists:
         raise Fault(node.field, f"no such file: {printable(name, 120)}; correct it (relative to {file.name})")
     return path
 
@@ -73,13 +73,13 @@ def columns(*counts: int) -> Parser:
 
 def ranges(node: Node) -> tuple[tuple[int, int], ...]:
     """Return frame numbers and ranges such as "30-40", as (first, last)."""
-    found = []
+    spans = []
     for item in node.value if isinstance(node.value, list) else [node.value]:
         match = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", str(item))
         if match is None or int(match[2] or match[1]) < int(match[1]):
             raise Fault(node.field, f"{printable(item)} is no range of frames; write 12 or 30-40")
-        found.append((int(match[1]), int(match[2] or match[1])))
-    return tuple(found)
+        spans.append((int(match[1]), int(match[2] or match[1])))
+    return tuple(spans)
 
 
 Name = Annotated[str, text]

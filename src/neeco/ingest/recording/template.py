@@ -159,10 +159,10 @@ def write_template(
     source = Path(source)
     if not source.exists():
         raise NeecoError(f"{source}: no such file or folder; correct the path")
-    if (known := format_of(source)) is not None:
-        known.require_package(source)
+    if (reader := format_of(source)) is not None:
+        reader.require_package(source)
     require_content(source)
-    if source.is_file() and (known is None or not known.streams(source)):
+    if source.is_file() and (reader is None or not reader.streams(source)):
         raise NeecoError(f"{source}: is a file of no format that holds images and logs; give the recording's folder")
     files = _find_files(source)
     if not files.frames:
@@ -208,12 +208,12 @@ def _find_files(source: Path) -> _FolderFiles:
 
 def _add_streams(files: _FolderFiles, path: Path, name: str) -> bool:
     """Add the streams of what holds several, and all of them as a list to choose from."""
-    known = format_of(path)
-    if known is None:
+    reader = format_of(path)
+    if reader is None:
         return False
     try:
-        known.require_package(path)
-        streams = known.streams(path)
+        reader.require_package(path)
+        streams = reader.streams(path)
     except NeecoError as error:
         files.leave_out(name, error, path, images=True)
         return path.is_dir()
@@ -232,7 +232,7 @@ def _add_streams(files: _FolderFiles, path: Path, name: str) -> bool:
         else:
             rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
             files.leave_out(f"{title}: {stream.type}, {stream.count}{rate}")
-            if (several := _EPISODES.fullmatch(stream.name)) and known.of_episode(stream.name, 0) is not None:
+            if (several := _EPISODES.fullmatch(stream.name)) and reader.of_episode(stream.name, 0) is not None:
                 files.episodes = f"{several[1]}-{several[2]}"
     return bool(streams)
 
@@ -260,11 +260,11 @@ def _classify_table(files: _FolderFiles, name: str, file: Path) -> None:
     tools = tool_names(table)
     for tool in tools:
         try:
-            own = tool_columns(table, PoseColumns(file, tool=tool))
+            of_tool = tool_columns(table, PoseColumns(file, tool=tool))
         except NeecoError as error:
             files.leave_out(f"{name}: {tool}", error, file)
             continue
-        files.poses.append((_Log(name, tool=tool), recognise_pose(own.header)))
+        files.poses.append((_Log(name, tool=tool), recognise_pose(of_tool.header)))
     if tools:
         return
     log, pose, (value, when) = _Log(name), recognise_pose(table.header), recognise_value(table.header)
@@ -341,9 +341,9 @@ def _scope_lines(
     elif right:
         why = problem or "its second camera, begun together: measures the depth of the tissue"
         lines.append(f"# stereo: {{{right}, calibration: stereo.yaml}}   # {why}")
-    lens, known = None, None if first.stream is None else format_of(first.file)
+    lens, reader = None, None if first.stream is None else format_of(first.file)
     with suppress(NeecoError):
-        lens = known and known.lens(first.file, first.stream)
+        lens = reader and reader.lens(first.file, first.stream)
     if lens:
         lines.append(f"# intrinsics: left out, {first.name} states the lens")
     elif not calibrations and not (stereo and still):
@@ -362,18 +362,18 @@ def _second_camera(
         left.stream or left.name,
     )
     tries: list[tuple[str, str, Callable[[], Any]]] = []  # line, source of the calibration, reader
-    known = None if left.stream is None else format_of(left.file)
-    if known is None or left.stream is None:
+    reader = None if left.stream is None else format_of(left.file)
+    if reader is None or left.stream is None:
         line = next((item.line for item in others if item.name == namesake), None)
         folder = left.file.parents[left.name.count("/")]
         tries = [(line, name, partial(read_stereo, folder / name)) for name in calibrations if line]
     else:
-        streams = [item for item in known.streams(left.file) if item.kind == IMAGE_STREAMS and not item.problem]
+        streams = [item for item in reader.streams(left.file) if item.kind == IMAGE_STREAMS and not item.problem]
         names = [item.name for item in streams if item.count and item.name != left.stream]
         lines = {name: left.line.replace(left.stream, name) for name in names}
         line = lines.get(namesake)
         for name in sorted(names, key=lambda name: name != namesake):
-            tries.append((lines[name], "", partial(known.stereo, left.file, left.stream, name)))
+            tries.append((lines[name], "", partial(reader.stereo, left.file, left.stream, name)))
     problem = ""
     for images, calibration, read in tries:
         try:
@@ -415,9 +415,9 @@ def _instrument_lines(files: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
         if all(joint in DVRK_WRIST for *_, joint in logs):
             logs.sort(key=lambda log: DVRK_WRIST.index(str(log[3])))
         yield from ["    joints:"] if logs else []
-        for joint, own in zip(_unique([_joint_name(*log) for log in logs]), logs, strict=True):
+        for joint, joint_log in zip(_unique([_joint_name(*log) for log in logs]), logs, strict=True):
             yield f"      {_scalar(joint)}:"
-            yield from (f"        {line}" for line in _joint_lines(files, *own))
+            yield from (f"        {line}" for line in _joint_lines(files, *joint_log))
 
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
@@ -427,8 +427,8 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     lines = [*log.lines(), *([f"clock: {clock}"] if clock else [])]
     lines += [f"# {ask}" for ask in asks if not ask.startswith(" ")]
     if log.stream is not None and log.stream.columns is not None:  # others are recognised again when read
-        given = (("position", columns.position), (columns.form, columns.rotation))
-        lines += ["columns:", *(f"  {key}: [{', '.join(map(_scalar, names))}]" for key, names in given if names)]
+        stated = (("position", columns.position), (columns.form, columns.rotation))
+        lines += ["columns:", *(f"  {key}: [{', '.join(map(_scalar, names))}]" for key, names in stated if names)]
         lines += [f"  # {ask.strip()}" for ask in asks if ask.startswith(" ")]
     lines += [f"# columns: {what} is not clear: {why}" for what, why in columns.unclear.items()]
     return lines + _unit_lines(columns, {"length": of_length})

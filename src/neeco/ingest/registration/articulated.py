@@ -49,26 +49,26 @@ from neeco.states.outline_model import ArticulatedModel, bends, joint_values, wi
 class ArticulatedSettings:
     """Settings of the search for a base by links."""
 
-    start_frames: int = 16  # on which starts are compared
-    fit_frames: int = 48  # that the result is fitted to
+    start_frames: int = 16  # number of frames on which starts are compared
+    fit_frames: int = 48  # number of frames that the result is fitted to
     along_mm: tuple[float, float, float, float] = (-10.0, -5.0, 5.0, 10.0)  # starts along the shaft
-    rolls_rad: tuple[float, float] = (-0.25, 0.25)  # starts turned about it
-    n_refined: int = 3  # starts that are fitted to all frames
-    apart_mm: float = 3.0  # between results that count as different
-    apart_rad: float = 0.035  # between results that count as different
+    rolls_rad: tuple[float, float] = (-0.25, 0.25)  # starts turned about the shaft
+    n_refined: int = 3  # number of starts that are fitted to all frames
+    apart_mm: float = 3.0  # minimum distance between different results
+    apart_rad: float = 0.035  # minimum turn between different results
     # added to what a fit states: errors that all frames share, of shapes that are no cones and of masks
     floor_mm: float = 0.25
     floor_depth_mm: float = 0.35  # the same, along the view
     floor_deg: float = 0.25  # the same, of turns
     scatter: float = 1.3  # factor on standard deviations; assumed, as the floors are: few recordings were measured
-    usual_overlap: float = 0.85  # of the silhouette with the masks, of a right base
-    min_gain: float = 0.1  # of that overlap, by which another base betters the stated one
-    least_overlap: float = 0.4  # below, nothing is found
-    max_residual_px: float = 2.5  # above, nothing is found
-    reversed_share: float = 0.8  # of the cost, from which a joint counts as reversed
-    min_exchanged: float = 1.25  # times the cost, with poses of other moments
-    max_sds: float = 3.2  # from its prior, by which a stated length or angle may be off
-    max_shift_sds: float = 3.5  # of the base's prior, by which the base may be off
+    usual_overlap: float = 0.85  # overlap of the silhouette with the masks that a right base reaches
+    min_gain: float = 0.1  # minimum gain of that overlap by which another base betters the stated one
+    least_overlap: float = 0.4  # minimum overlap; below, nothing is found
+    max_residual_px: float = 2.5  # maximum residual; above, nothing is found
+    reversed_share: float = 0.8  # ratio of the cost with a reading reversed, below which its joint counts as reversed
+    min_exchanged: float = 1.25  # minimum ratio of the cost with poses of other moments
+    max_sds: float = 3.2  # maximum error of a stated length or angle, standard deviations of its prior
+    max_shift_sds: float = 3.5  # maximum error of the base, standard deviations of its prior
 
 
 LINKED = ArticulatedSettings()
@@ -175,13 +175,13 @@ def problem_of(
     by_shift = [motion.readings_at(float(shift)) for shift in CLOCK_SHIFTS_S]
     readings = {key: np.stack([at[key] for at in by_shift]) for key in motion.tree.readings}
     values = joint_values(motion.tree, readings)
-    known = np.isfinite(poses).all((0, 2, 3)) & np.isfinite(values).all((0, 2))
-    rows = np.flatnonzero(known & masks.any((1, 2)))
+    valid = np.isfinite(poses).all((0, 2, 3)) & np.isfinite(values).all((0, 2))
+    rows = np.flatnonzero(valid & masks.any((1, 2)))
     if len(rows) < BASES.min_frames:
         return None
     rows = rows[evenly_spaced(len(rows), LINKED.fit_frames)]
     return ArticulatedProblem(
-        model=ArticulatedModel(motion.tree, poses[len(CLOCK_SHIFTS_S) // 2][known]),
+        model=ArticulatedModel(motion.tree, poses[len(CLOCK_SHIFTS_S) // 2][valid]),
         silhouettes=silhouettes_of(masks[rows], intrinsics, hidden),
         contours=contours_of(masks[rows], hidden),
         camera_from_world=camera_from_world[rows],
@@ -220,7 +220,7 @@ def unknown_starts(problem: ArticulatedProblem, seed: int) -> list[np.ndarray]:
         raise NeecoError(too_few_shafts(shafts))
     ends = model.cones_at(model.means, problem.values[len(CLOCK_SHIFTS_S) // 2])[0]
     outermost = [2 + index for index, cone in enumerate(model.cones) if cone.child is None]
-    found = search_bases(
+    candidates = search_bases(
         problem,
         problem.prior,
         distance_to(problem, problem.prior),
@@ -230,17 +230,17 @@ def unknown_starts(problem: ArticulatedProblem, seed: int) -> list[np.ndarray]:
         end=model.rest[model.first][:3, 3],
         tips=ends[:, outermost or [1], 1].mean(1),
     )
-    return list(found.world_from_base)
+    return list(candidates.world_from_base)
 
 
 def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[ArticulatedFit]:
     """The fits that differ from each better one, the best first."""
-    found: list[ArticulatedFit] = []
+    distinct: list[ArticulatedFit] = []
     for fit in sorted(fits, key=lambda fit: fit.cost):
-        steps = [step_between(other.world_from_base, fit.world_from_base, problem.middle) for other in found]
+        steps = [step_between(other.world_from_base, fit.world_from_base, problem.middle) for other in distinct]
         if all(np.linalg.norm(s[:3]) > LINKED.apart_rad or np.linalg.norm(s[3:]) > LINKED.apart_mm for s in steps):
-            found.append(fit)
-    return found
+            distinct.append(fit)
+    return distinct
 
 
 def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
@@ -298,32 +298,32 @@ def _doubts(
     make up for reversed joints."""
     model, prior = problem.model, problem.prior
     starts = [rigid]
-    known = prior.sd_mm is not None and prior.sd_rad is not None
-    if known and overlap(problem, fit) < LINKED.usual_overlap:  # a reversed joint may have led it astray
+    has_prior = prior.sd_mm is not None and prior.sd_rad is not None
+    if has_prior and overlap(problem, fit) < LINKED.usual_overlap:  # a reversed joint may have led it astray
         starts.append(replace(rigid, world_from_base=prior.world_from_base, parameters=model.means.copy()))
     reversed_ = [
         reading
         for reading in motion.tree.readings
         if any(_reversed(problem, rigid, start, motion, reading) for start in starts)
     ]
-    found = [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
+    doubts = [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
     if prior.sd_mm is not None and prior.sd_rad is not None:
         step = step_between(prior.world_from_base, fit.world_from_base, problem.middle)
         off = np.linalg.norm(step[3:]) / prior.sd_mm, np.linalg.norm(step[:3]) / prior.sd_rad
         if max(off) > LINKED.max_shift_sds:
-            found.append(
+            doubts.append(
                 f"the base found is {max(off):.1f} standard deviations from the one stated: check its transform, "
                 "axes and unit, and which arm it is of"
             )
     sds = (fit.parameters - model.means) / model.sds
     for index in np.flatnonzero(np.abs(sds) > LINKED.max_sds) if not reversed_ else ():  # they follow from it
         part = model.names[index]
-        if part.startswith(("pivot", "offset")) and not any(part in words for words in found):
-            found.append(
+        if part.startswith(("pivot", "offset")) and not any(part in words for words in doubts):
+            doubts.append(
                 f"the {part} is {abs(sds[index]):.1f} standard deviations from what kinematics states: check the "
                 "length of the link before it, its axis, and the reading"
             )
-    return found
+    return doubts
 
 
 def _reversed(

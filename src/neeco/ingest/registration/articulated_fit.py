@@ -32,20 +32,20 @@ from neeco.states.outline_model import ArticulatedModel, Outlines
 class ArticulatedFitSettings:
     """Settings of the fit."""
 
-    max_points: int = 90  # of a mask's outline
-    # of the robust loss, one after the other; px of masks 160 wide
+    max_points: int = 90  # maximum number of points of a mask's outline
+    # widths of the robust loss, one after the other; px of masks 160 wide
     widths_px: tuple[float, float, float, float] = (10.0, 5.0, 2.5, 1.5)
     noise_px: float = 0.6  # standard deviation of an outline, px of masks 160 wide
     share: float = 0.05  # of an outline's points that count as independent
-    steps: tuple[float, float, float] = (0.005, 0.3, 0.01)  # of differences: turns rad, shifts mm, clock s
-    parameter_step: float = 0.1  # of differences, in standard deviations of priors
-    inside_px: float = -0.7  # of another cone's outline, from which a point is no outline
-    max_turn_rad: float = 0.15  # of one step
-    max_shift_mm: float = 12.0  # of one step
-    max_sds: float = 2.0  # of one step of the model's parameters
-    damping: float = 1e-2  # of Levenberg-Marquardt, at first
-    tolerance: float = 1e-4  # share of the cost, below which steps end
-    pose_blocks: int = 2  # of the recording, after which errors of logged poses are independent
+    steps: tuple[float, float, float] = (0.005, 0.3, 0.01)  # finite differences: turns rad, shifts mm, clock s
+    parameter_step: float = 0.1  # finite difference of a parameter, standard deviations of its prior
+    inside_px: float = -0.7  # signed distance from another cone's outline, above which a point is no outline
+    max_turn_rad: float = 0.15  # maximum turn of one step
+    max_shift_mm: float = 12.0  # maximum shift of one step
+    max_sds: float = 2.0  # maximum step of the model's parameters, standard deviations
+    damping: float = 1e-2  # initial Levenberg-Marquardt damping
+    tolerance: float = 1e-4  # share of the cost below which steps end
+    pose_blocks: int = 2  # blocks of the recording after which errors of logged poses are independent
 
 
 LINKED_FIT = ArticulatedFitSettings()
@@ -91,7 +91,7 @@ def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
     """Evenly spaced points [F, `max_points`, 2] px of the outlines of masks bool [F, h, w]; NaN where there are fewer.
     Those at the image's border, or beside what is hidden (bool [h, w]), do not count."""
     open_ = ~border_of(masks.shape[1:], hidden)
-    found = np.full((len(masks), LINKED_FIT.max_points, 2), np.nan)
+    contours = np.full((len(masks), LINKED_FIT.max_points, 2), np.nan)
     for row, mask in enumerate(masks):
         lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         if not lines:
@@ -100,8 +100,8 @@ def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
         points = points[open_[points[:, 1], points[:, 0]]]
         if len(points):
             chosen = np.unique(np.linspace(0, len(points) - 1, LINKED_FIT.max_points).astype(int))
-            found[row, : len(chosen)] = points[chosen] + 0.5
-    return found
+            contours[row, : len(chosen)] = points[chosen] + 0.5
+    return contours
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,22 +126,22 @@ def outlines(problem: ArticulatedProblem, fit: ArticulatedFit) -> Outlines:
 
 
 def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
-    found, owner = outlines(problem, fit), problem.model.owner
-    points = problem.model.outline_points(found)
-    others = found.distances(points)[0]
+    projected, owner = outlines(problem, fit), problem.model.owner
+    points = problem.model.outline_points(projected)
+    others = projected.distances(points)[0]
     others[:, owner, np.arange(len(owner))] = -1e3
     others[:, 1, owner == 0] = others[:, 0, owner == 1] = -1e3  # the tube continues in its end
-    valid = found.valid[:, owner] & (others.max(1) < LINKED_FIT.inside_px)
+    valid = projected.valid[:, owner] & (others.max(1) < LINKED_FIT.inside_px)
     valid &= problem.silhouettes.inside(points, margin=1.0 + SHAFT_LINES.edge_px)
-    given = np.isfinite(problem.contours[..., 0])
-    return _Points(valid, given, np.nan_to_num(problem.contours))
+    on_masks = np.isfinite(problem.contours[..., 0])
+    return _Points(valid, on_masks, np.nan_to_num(problem.contours))
 
 
 def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points) -> np.ndarray:
     """Residuals [F, N + M] px: positive where the model is too small."""
-    found = outlines(problem, fit)
-    ahead, _ = problem.silhouettes.look_up(problem.model.outline_points(found))
-    back = -found.distances(use.contours)[0].max(1)
+    projected = outlines(problem, fit)
+    ahead, _ = problem.silhouettes.look_up(problem.model.outline_points(projected))
+    back = -projected.distances(use.contours)[0].max(1)
     return np.concatenate([np.where(use.model, ahead, 0.0), np.where(use.masks, back, 0.0)], 1)
 
 
@@ -160,9 +160,9 @@ def moved(problem: ArticulatedProblem, fit: ArticulatedFit, step: np.ndarray) ->
 def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, free: np.ndarray) -> np.ndarray:
     """Derivatives [F, N + M, free] of the residuals, through those of the cones' images; and where poses' errors are
     fitted, by those of the own frame [F, N + M, free + 6]."""
-    found, model = outlines(problem, fit), problem.model
-    _, slope = problem.silhouettes.look_up(model.outline_points(found))
-    distances, places, ways = found.distances(use.contours)
+    projected, model = outlines(problem, fit), problem.model
+    _, slope = problem.silhouettes.look_up(model.outline_points(projected))
+    distances, places, ways = projected.distances(use.contours)
     nearest = distances.argmax(1)
     frame, point = np.indices(nearest.shape)
     place, way = places[frame, nearest, point], ways[frame, nearest, point]
@@ -199,18 +199,18 @@ def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, fr
 def _information(columns: np.ndarray, weights: np.ndarray, free: int) -> np.ndarray:
     """Information of the residuals, of the `free` parameters and then of every frame's own ones: columns
     [F, N + M, free + K], weights [F, N + M]; returns [free + F K] squared."""
-    common, own = columns[..., :free], columns[..., free:]
-    frames, kinds = len(columns), own.shape[-1]
+    common, per_frame = columns[..., :free], columns[..., free:]
+    frames, kinds = len(columns), per_frame.shape[-1]
     flat = common.reshape(-1, free)
     top = (flat * weights.reshape(-1, 1)).T @ flat
     if not kinds:
         return top
     full = np.zeros((free + frames * kinds,) * 2)
     full[:free, :free] = top
-    mixed = np.einsum("fnp,fn,fnk->pfk", common, weights, own).reshape(free, -1)
+    mixed = np.einsum("fnp,fn,fnk->pfk", common, weights, per_frame).reshape(free, -1)
     full[:free, free:], full[free:, :free] = mixed, mixed.T
     blocks = full[free:, free:].reshape(frames, kinds, frames, kinds)
-    blocks[np.arange(frames), :, np.arange(frames)] = np.einsum("fnj,fn,fnk->fjk", own, weights, own)
+    blocks[np.arange(frames), :, np.arange(frames)] = np.einsum("fnj,fn,fnk->fjk", per_frame, weights, per_frame)
     return full
 
 
@@ -218,9 +218,9 @@ def _scores(columns: np.ndarray, weighted: np.ndarray, free: int) -> np.ndarray:
     """Scores [F, free + F K] of frames: products of columns [F, N + M, free + K] and weighted residuals [F, N + M]."""
     products = np.einsum("fnp,fn->fp", columns, weighted)
     frames = len(products)
-    own = np.zeros((frames, frames, products.shape[1] - free))
-    own[np.arange(frames), np.arange(frames)] = products[:, free:]
-    return np.concatenate([products[:, :free], own.reshape(frames, -1)], 1)
+    per_frame = np.zeros((frames, frames, products.shape[1] - free))
+    per_frame[np.arange(frames), np.arange(frames)] = products[:, free:]
+    return np.concatenate([products[:, :free], per_frame.reshape(frames, -1)], 1)
 
 
 def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np.ndarray, np.ndarray]:
@@ -328,8 +328,8 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     scale = prior_residuals(problem, fit)[1]
     count = BASE + len(problem.model.means)
     prior = np.diag(scale[free] ** 2)
-    known = np.diag(np.append(scale[free], scale[count:]) ** 2)
-    inverse = np.linalg.inv(_information(columns, weights, len(free)) + known)[: len(free)]
+    prior_information = np.diag(np.append(scale[free], scale[count:]) ** 2)
+    inverse = np.linalg.inv(_information(columns, weights, len(free)) + prior_information)[: len(free)]
     blocks = np.stack([scores[problem.blocks == block].sum(0) for block in np.unique(problem.blocks)])
     blocks = blocks - blocks.mean(0)
     scatter = blocks.T @ blocks * len(blocks) / max(len(blocks) - 1, 1)
@@ -344,16 +344,16 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
 
 def overlap(problem: ArticulatedProblem, fit: ArticulatedFit) -> float:
     """Intersection over union of the fit's filled silhouette with the masks, over all frames."""
-    found = outlines(problem, fit)
-    along = found.ends[:, :, 1] - found.ends[:, :, 0]
+    projected = outlines(problem, fit)
+    along = projected.ends[:, :, 1] - projected.ends[:, :, 0]
     along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-6)
-    out = np.stack([-along[..., 1], along[..., 0]], -1)[:, :, None] * found.widths[..., None]
-    corners = np.concatenate([found.ends + out, (found.ends - out)[:, :, ::-1]], 2)  # [F, C, 4, 2]
+    out = np.stack([-along[..., 1], along[..., 0]], -1)[:, :, None] * projected.widths[..., None]
+    corners = np.concatenate([projected.ends + out, (projected.ends - out)[:, :, ::-1]], 2)  # [F, C, 4, 2]
     corners, ends = (
-        np.rint(np.clip(part, -1e4, 1e4) - 0.5).astype(np.int32) for part in (corners, found.ends[:, :, 1])
+        np.rint(np.clip(part, -1e4, 1e4) - 0.5).astype(np.int32) for part in (corners, projected.ends[:, :, 1])
     )
     filled = np.zeros(problem.silhouettes.masks.shape, np.uint8)
-    for row, cone in np.argwhere(found.valid):
+    for row, cone in np.argwhere(projected.valid):
         cv2.fillPoly(filled[row], [corners[row, cone]], 1)
-        cv2.circle(filled[row], ends[row, cone].tolist(), int(min(found.widths[row, cone, 1], 1e3)), 1, -1)
+        cv2.circle(filled[row], ends[row, cone].tolist(), int(min(projected.widths[row, cone, 1], 1e3)), 1, -1)
     return problem.silhouettes.overlap(filled.astype(bool))

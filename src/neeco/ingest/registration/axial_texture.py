@@ -22,15 +22,15 @@ from neeco.ingest.registration.silhouette_model import SilhouetteFit, Silhouette
 class TextureSettings:
     """Settings of the comparison of profiles."""
 
-    step_px: float = 1.0  # between samples of a profile
+    step_px: float = 1.0  # spacing of the samples of a profile
     sides_rad: tuple[float, ...] = (-0.7, -0.35, 0.0, 0.35, 0.7)  # about the line, from the side that faces the camera
-    max_shift_px: float = 14.0  # of a first fit
+    max_shift_px: float = 14.0  # maximum error of a first fit
     noise: float = 0.04  # standard deviation of the logarithm of a colour
-    dark: float = 12.0  # of 255, added before logarithms are taken
-    n_rounds: int = 5  # of shifts against the template
-    min_marked: float = 0.5  # share of the frames, whose shift must be known
-    min_overlap: float = 0.6  # of the template's information, that a frame must show
-    max_sd_px: float = 1.0  # of a frame's shift
+    dark: float = 12.0  # added before logarithms are taken, of 255
+    n_rounds: int = 5  # rounds of shifts against the template
+    min_marked: float = 0.5  # minimum share of the frames whose shift is known
+    min_overlap: float = 0.6  # minimum share of the template's information that a frame shows
+    max_sd_px: float = 1.0  # maximum standard deviation of a frame's shift
 
 
 TEXTURE = TextureSettings()
@@ -60,7 +60,7 @@ def with_marks(problem: SilhouetteProblem, fit: SilhouetteFit) -> tuple[Silhouet
 
 def _profiles(problem: SilhouetteProblem, fit: SilhouetteFit, images: np.ndarray, behind: np.ndarray) -> np.ndarray:
     """Logarithms of colours [F, K, 3] along the line, NaN where a frame's mask does not show the instrument."""
-    found, count = [], np.zeros((len(images), len(behind)))
+    samples, count = [], np.zeros((len(images), len(behind)))
     for side in TEXTURE.sides_rad:
         pixels = problem.project(surface_points(problem, fit, behind, side))
         inside = problem.silhouettes.inside(pixels, margin=1.0) & (problem.silhouettes.look_up(pixels)[0] > 0)
@@ -69,9 +69,9 @@ def _profiles(problem: SilhouetteProblem, fit: SilhouetteFit, images: np.ndarray
             cv2.remap(image, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
             for image, at in zip(images, places, strict=True)
         ])  # fmt: skip
-        found.append(np.where(inside[..., None], np.log(sampled.astype(np.float64) + TEXTURE.dark), 0.0))
+        samples.append(np.where(inside[..., None], np.log(sampled.astype(np.float64) + TEXTURE.dark), 0.0))
         count += inside
-    colors = np.sum(found, 0) / np.maximum(count, 1)[..., None]
+    colors = np.sum(samples, 0) / np.maximum(count, 1)[..., None]
     return np.where((count > len(TEXTURE.sides_rad) / 2)[..., None], colors, np.nan)
 
 
@@ -84,9 +84,9 @@ def _align(colors: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.n
     deviations = np.full(frames, np.inf)
     for _ in range(TEXTURE.n_rounds):
         moved = _shifted(colors, shifts)
-        shown = np.isfinite(moved[..., 0])
-        template, variance = _common(moved, shown)
-        used = shown.mean(0) > 0.4
+        visible = np.isfinite(moved[..., 0])
+        template, variance = _common(moved, visible)
+        used = visible.mean(0) > 0.4
         weight = np.where(used, 1 / (variance + TEXTURE.noise**2), 0.0)  # [K]
         inner = used & np.roll(used, 1) & np.roll(used, -1)
         inner[[0, -1]] = False
@@ -132,7 +132,7 @@ def _shifted(colors: np.ndarray, shifts: np.ndarray) -> np.ndarray:
     return np.where(outside[..., None], np.nan, out)
 
 
-def _common(profiles: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _common(profiles: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The median profile [K, 3] of all frames but for brightness, and its robust variance [K]."""
     offsets = np.zeros((len(profiles), 1, 3))
     with warnings.catch_warnings():
@@ -140,6 +140,6 @@ def _common(profiles: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.nda
         for _ in range(3):
             template = np.nanmedian(profiles - offsets, axis=0)
             offsets = np.nan_to_num(np.nanmedian(profiles - template, axis=1, keepdims=True))
-        rest = np.where(shown[..., None], profiles - offsets - template, np.nan)
+        rest = np.where(visible[..., None], profiles - offsets - template, np.nan)
         variance = np.square(1.48 * np.nanmedian(np.abs(rest), axis=0)).mean(-1)
     return np.nan_to_num(template), np.nan_to_num(variance, nan=1e6)

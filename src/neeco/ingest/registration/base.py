@@ -43,26 +43,26 @@ from neeco.ingest.registration.silhouette_search import COARSE, distance_to, sea
 class BaseSettings:
     """Settings of the search for a base, and of what counts as undetermined."""
 
-    min_frames: int = 12  # that show a shaft
-    search_frames: int = 40  # on which starts are compared
-    fit_frames: int = 140  # that the result is fitted to
-    n_blocks: int = 10  # stretches of a recording whose errors are taken to be independent
-    size_factors: tuple[float, float] = (1.25, 1.1)  # by which the scale is varied
-    max_size_steps: int = 8  # in one direction, of each factor
-    log_size_range: float = 0.15  # about the size, over which the loss is sampled
-    size_samples: int = 9  # of the loss over that range
-    min_overlap_ratio: float = 0.95  # to the overlap before: less of an instrument fits more easily
-    min_overlap: float = 0.25  # of the instrument's silhouette with the masks
+    min_frames: int = 12  # minimum number of frames that show a shaft
+    search_frames: int = 40  # number of frames on which starts are compared
+    fit_frames: int = 140  # number of frames that the result is fitted to
+    n_blocks: int = 10  # number of stretches of a recording whose errors are taken to be independent
+    size_factors: tuple[float, float] = (1.25, 1.1)  # factors by which the scale is varied
+    max_size_steps: int = 8  # maximum number of steps in one direction, of each factor
+    log_size_range: float = 0.15  # half the range of the logarithm of the size over which the loss is sampled
+    size_samples: int = 9  # number of samples of the loss over that range
+    min_overlap_ratio: float = 0.95  # minimum ratio to the overlap before: less of an instrument fits more easily
+    min_overlap: float = 0.25  # minimum overlap of the instrument's silhouette with the masks
     # Standard deviations that more frames do not lower, as wrists and jaws blur the tip: of the logarithm of the
     # size, and of the place along the shaft, which a rigid shape hardly determines (measured once)
     size_sd: float = 0.03
-    along_sd_mm: float = 4.0  # of the place along the shaft
-    radius_range_mm: tuple[float, float] = (1.5, 5.5)  # of shafts; one outside is first taken to be typical
-    lever_mm: float = 40.0  # from the instrument's middle, at which a turn counts as a shift
-    open_sd_mm: float = 3.0  # at that lever, from which a direction counts as undetermined
-    open_share: float = 0.7  # of the prior's standard deviation: the images have hardly reduced it
-    min_exchanged_cost: float = 1.5  # times the cost with the right poses
-    max_residual_px: float = 1.5  # median, of masks 160 wide
+    along_sd_mm: float = 4.0  # standard deviation of the place along the shaft
+    radius_range_mm: tuple[float, float] = (1.5, 5.5)  # radii of shafts; one outside is first taken to be typical
+    lever_mm: float = 40.0  # distance from the instrument's middle at which a turn counts as a shift
+    open_sd_mm: float = 3.0  # standard deviation at that lever, from which a direction is undetermined
+    open_share: float = 0.7  # share of the prior's standard deviation, from which the images have hardly reduced it
+    min_exchanged_cost: float = 1.5  # minimum ratio of the cost with poses of other moments
+    max_residual_px: float = 1.5  # maximum median residual, px of masks 160 wide
 
 
 BASES = BaseSettings()
@@ -140,17 +140,17 @@ class BaseRegistration:
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts: mm, degrees, s; None where a direction is undetermined and has no prior."""
 
-        def known(values: np.ndarray | float) -> Any:
+        def plain(values: np.ndarray | float) -> Any:
             listed = [float(value) if np.isfinite(value) else None for value in np.atleast_1d(values)]
             return listed if np.ndim(values) else listed[0]
 
         numbers = "sd_mm sd_deg sd_motion_mm clock_s clock_sd_s moved_mm turned_deg overlap explained overlap_before"
         return {
             "world_from_base": self.world_from_base.tolist(),
-            **{name: known(getattr(self, name)) for name in numbers.split()},
+            **{name: plain(getattr(self, name)) for name in numbers.split()},
             "open": list(self.open_directions),
             "doubts": list(self.doubts),
-            "covariance": [known(row) for row in self.covariance],
+            "covariance": [plain(row) for row in self.covariance],
         }
 
 
@@ -183,26 +183,26 @@ def find_base(
         raise NeecoError(too_few_shafts(shafts))
     problem = problem.take(np.flatnonzero(shafts.visible))
     few = problem.take(np.array(evenly_spaced(len(problem.blocks), BASES.search_frames)))
-    known = BasePrior.of(prior, 0.0 if clock_known else RIGID_FIT.clock_sd_s)
-    found = search_bases(few, known, distance_to(problem, known), generator)
+    base_prior = BasePrior.of(prior, 0.0 if clock_known else RIGID_FIT.clock_sd_s)
+    candidates = search_bases(few, base_prior, distance_to(problem, base_prior), generator)
     starts = [
         SilhouetteFit.of_line(base, 0.0, tip, axis, problem.readings.shape[1])
-        for base, tip, axis in zip(found.world_from_base, found.tips, found.axes, strict=True)
+        for base, tip, axis in zip(candidates.world_from_base, candidates.tips, candidates.axes, strict=True)
     ]
     if not starts:
         raise NeecoError(unmoved(stated=prior is not None))
-    best = max((fit_silhouettes(few, known, start) for start in starts), key=lambda fit: overlap(few, fit))
+    best = max((fit_silhouettes(few, base_prior, start) for start in starts), key=lambda fit: overlap(few, fit))
     radius = float(np.median(best.shape[len(best.shape) // 2 :, 0, 0]))
     if not BASES.radius_range_mm[0] < radius < BASES.radius_range_mm[1]:
-        best = refine(few, known, resized(few, best, COARSE.typical_radius_mm / radius))
-    best = _best_size(few, known, best)
-    fit = fit_silhouettes(problem, known, best, RIGID_FIT.widths_px[-2:])
+        best = refine(few, base_prior, resized(few, best, COARSE.typical_radius_mm / radius))
+    best = _best_size(few, base_prior, best)
+    fit = fit_silhouettes(problem, base_prior, best, RIGID_FIT.widths_px[-2:])
     problem, fit = with_marks(problem, fit)
-    fit = _settle_size(problem, known, refine(problem, known, fit))
+    fit = _settle_size(problem, base_prior, refine(problem, base_prior, fit))
     problem, fit = with_marks(problem, fit)
-    fit = refine(problem, known, fit)
-    _require_moved(problem, known, fit)
-    return _result(problem, known, fit)
+    fit = refine(problem, base_prior, fit)
+    _require_moved(problem, base_prior, fit)
+    return _result(problem, base_prior, fit)
 
 
 def _problem(
@@ -218,8 +218,8 @@ def _problem(
     """The frames whose poses are known at all clocks tried, at most `fit_frames`."""
     poses = np.stack([poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
     values = np.zeros((len(masks), 0)) if readings is None else np.asarray(readings, np.float64)
-    known = np.isfinite(poses).all((0, 2, 3)) & np.isfinite(values).all(1)
-    rows = np.flatnonzero(known & masks.any((1, 2)))
+    valid = np.isfinite(poses).all((0, 2, 3)) & np.isfinite(values).all(1)
+    rows = np.flatnonzero(valid & masks.any((1, 2)))
     rows = rows[evenly_spaced(len(rows), BASES.fit_frames)] if len(rows) else rows
     values = values[rows]
     if len(rows):
@@ -235,13 +235,13 @@ def _problem(
     )
 
 
-def _best_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> SilhouetteFit:
+def _best_size(problem: SilhouetteProblem, prior: BasePrior, fit: SilhouetteFit) -> SilhouetteFit:
     """The best of fits to instruments of other sizes at other distances, in ever smaller steps: for one still camera
     that is a valley along which least squares creep."""
     for step in BASES.size_factors:
         for factor in (step, 1 / step):
             for _ in range(BASES.max_size_steps):
-                other = refine(problem, known, resized(problem, fit, factor), 8)
+                other = refine(problem, prior, resized(problem, fit, factor), 8)
                 if not (
                     other.loss < fit.loss and overlap(problem, other) > BASES.min_overlap_ratio * overlap(problem, fit)
                 ):
@@ -250,10 +250,10 @@ def _best_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit)
     return fit
 
 
-def _settle_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> SilhouetteFit:
+def _settle_size(problem: SilhouetteProblem, prior: BasePrior, fit: SilhouetteFit) -> SilhouetteFit:
     """The fit at the size of least loss, by a parabola through those of sizes around."""
     logs = np.linspace(-BASES.log_size_range, BASES.log_size_range, BASES.size_samples)
-    fits = [refine(problem, known, resized(problem, fit, float(np.exp(log))), 8) for log in logs]
+    fits = [refine(problem, prior, resized(problem, fit, float(np.exp(log))), 8) for log in logs]
     losses = np.array([other.loss for other in fits])
     near = losses < losses.min() + 0.5 * (np.median(losses) - losses.min()) + 1e-9
     near |= np.abs(np.arange(BASES.size_samples) - int(np.argmin(losses))) <= 2
@@ -262,7 +262,7 @@ def _settle_size(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFi
     if curve[0] > 0:
         least = float(np.clip(-curve[1] / (2 * curve[0]), *logs[near][[0, -1]]))
     nearest = int(np.argmin(np.abs(logs - least)))
-    return refine(problem, known, resized(problem, fits[nearest], float(np.exp(least - logs[nearest]))), 8)
+    return refine(problem, prior, resized(problem, fits[nearest], float(np.exp(least - logs[nearest]))), 8)
 
 
 def overlap(problem: SilhouetteProblem, fit: SilhouetteFit) -> float:
@@ -294,15 +294,15 @@ def _filled(problem: SilhouetteProblem, pixels: np.ndarray) -> np.ndarray:
     return filled.astype(bool)
 
 
-def _require_moved(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> None:
+def _require_moved(problem: SilhouetteProblem, prior: BasePrior, fit: SilhouetteFit) -> None:
     """Raise NeecoError where poses of other moments, or none, explain the masks as well."""
     if not (fit.residual_px < BASES.max_residual_px * problem.px_scale and overlap(problem, fit) > BASES.min_overlap):
-        raise NeecoError(unmoved(stated=known.sd_mm is not None))
+        raise NeecoError(unmoved(stated=prior.sd_mm is not None))
     for share in LAYERS.exchanged_shares:
         exchanged = replace(problem, poses=np.roll(problem.poses, round(share * len(problem.blocks)), axis=1))
-        other = refine(exchanged, replace(known, sd_clock=0.0), fit, 12)
+        other = refine(exchanged, replace(prior, sd_clock=0.0), fit, 12)
         if other.cost < BASES.min_exchanged_cost * fit.cost:
-            raise NeecoError(unmoved(stated=known.sd_mm is not None))
+            raise NeecoError(unmoved(stated=prior.sd_mm is not None))
 
 
 def too_few_shafts(shafts: ShaftLines) -> str:
@@ -329,21 +329,21 @@ def unmoved(*, stated: bool, linked: bool = False) -> str:
     )
 
 
-def moved_from(given: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, Any]:
+def moved_from(reference: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, Any]:
     """Distance mm and degrees between a base and a given one, at the instrument's mean position [3] mm in its frame."""
-    turn, shift = np.linalg.norm(step_between(given, base, middle).reshape(2, 3), axis=1)
+    turn, shift = np.linalg.norm(step_between(reference, base, middle).reshape(2, 3), axis=1)
     return {"moved_mm": float(shift), "turned_deg": float(np.degrees(turn))}
 
 
-def _result(problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit) -> BaseRegistration:
+def _result(problem: SilhouetteProblem, prior: BasePrior, fit: SilhouetteFit) -> BaseRegistration:
     poses = fit.world_from_base @ instrument_in_base(problem, fit)
     shaft = unit((poses[:, :3, :3] @ fit.axis).mean(0))
-    covariance, open_directions, clock_sd = _covariance(problem, known, fit, shaft)
+    covariance, open_directions, clock_sd = _covariance(problem, prior, fit, shaft)
     moved: dict[str, Any] = {}
-    if known.sd_mm is not None:
-        moved = moved_from(known.world_from_base, fit.world_from_base, problem.middle)
-        given = replace(fit, world_from_base=known.world_from_base)
-        moved["overlap_before"] = shaft_overlap(problem, given)
+    if prior.sd_mm is not None:
+        moved = moved_from(prior.world_from_base, fit.world_from_base, problem.middle)
+        at_prior = replace(fit, world_from_base=prior.world_from_base)
+        moved["overlap_before"] = shaft_overlap(problem, at_prior)
     return BaseRegistration(
         world_from_base=fit.world_from_base,
         clock_s=fit.clock,
@@ -367,24 +367,24 @@ def in_camera(covariance: np.ndarray, camera_from_world: np.ndarray) -> np.ndarr
 
 
 def _covariance(
-    problem: SilhouetteProblem, known: BasePrior, fit: SilhouetteFit, shaft: np.ndarray
+    problem: SilhouetteProblem, prior: BasePrior, fit: SilhouetteFit, shaft: np.ndarray
 ) -> tuple[np.ndarray, tuple[str, ...], float]:
     """Covariance [6, 6] of the base (rad, mm, in the world's directions at the instrument), what is undetermined, in
     words, and the standard deviation of the clock s. shaft [3]: its direction, world."""
     away = pivot_of(problem, fit) - np.linalg.inv(problem.camera_from_world)[:, :3, 3].mean(0)  # moves by the size
     still = len(np.unique(problem.camera_from_world.round(3), axis=0)) == 1
-    covariance = fit_covariance(problem, known, fit)
-    clock_sd = float(np.sqrt(covariance[6, 6])) if known.sd_clock > 0 else 0.0
+    covariance = fit_covariance(problem, prior, fit)
+    clock_sd = float(np.sqrt(covariance[6, 6])) if prior.sd_clock > 0 else 0.0
     covariance = covariance[:6, :6]
     valleys = [BASES.along_sd_mm * shaft] + ([BASES.size_sd * away] if still else [])
     for valley in valleys:
         covariance[3:6, 3:6] += np.outer(valley, valley)
     units = LEVERS
     limit = BASES.open_sd_mm**2
-    if known.sd_rad is not None and known.sd_mm is not None:
-        units, limit = np.array([known.sd_rad] * 3 + [known.sd_mm] * 3), BASES.open_share**2
+    if prior.sd_rad is not None and prior.sd_mm is not None:
+        units, limit = np.array([prior.sd_rad] * 3 + [prior.sd_mm] * 3), BASES.open_share**2
     values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
-    if known.sd_mm is not None:  # no less is known than before
+    if prior.sd_mm is not None:  # no less is known than before
         values = np.minimum(values, 1.0)
         covariance = (vectors * values) @ vectors.T * np.outer(units, units)
     words = [
@@ -392,7 +392,7 @@ def _covariance(
         for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
         if value > limit
     ]
-    if known.sd_mm is None and words:
+    if prior.sd_mm is None and words:
         covariance = np.where(np.abs(covariance) > 1e6, np.nan, covariance)
     return covariance, tuple(dict.fromkeys(words)), clock_sd
 
@@ -430,13 +430,13 @@ def _direction(view: np.ndarray, valleys: Sequence[np.ndarray], vector: np.ndarr
 
 
 def base_from_layers(
-    prior: Prior, found: LayerFit, world_from_camera: np.ndarray, poses: np.ndarray, line: ShaftLine
+    prior: Prior, fit: LayerFit, world_from_camera: np.ndarray, poses: np.ndarray, line: ShaftLine
 ) -> BaseRegistration:
     """Return the base that two layers of a still camera's images show, given its prior. poses [F, 4, 4]:
     base_from_instrument."""
-    base = world_from_camera @ found.camera_from_base
-    shaft = unit((found.camera_from_base[:3, :3] @ poses[:, :3, :3] @ line.axis).mean(0))
-    after, before = found.covariance[:6, :6] / np.outer(LEVERS, LEVERS), np.square(found.given[:6] / LEVERS)
+    base = world_from_camera @ fit.camera_from_base
+    shaft = unit((fit.camera_from_base[:3, :3] @ poses[:, :3, :3] @ line.axis).mean(0))
+    after, before = fit.covariance[:6, :6] / np.outer(LEVERS, LEVERS), np.square(fit.given[:6] / LEVERS)
     values, vectors = np.linalg.eigh(after)
     words = [
         _direction(np.eye(3), [shaft], vector)
@@ -445,14 +445,14 @@ def base_from_layers(
     ]
     return BaseRegistration(
         world_from_base=base,
-        clock_s=found.clock,
-        clock_sd_s=float(np.sqrt(found.covariance[6, 6])),
-        covariance=found.covariance[:6, :6],
+        clock_s=fit.clock,
+        clock_sd_s=float(np.sqrt(fit.covariance[6, 6])),
+        covariance=fit.covariance[:6, :6],
         open_directions=tuple(dict.fromkeys(words)),
-        frames=found.frames,
+        frames=fit.frames,
         from_masks=False,
-        explained=found.explained,
+        explained=fit.explained,
         shaft=shaft,
-        sd_motion_mm=sd_motion(found.covariance[:6, :6], found.camera_from_base @ poses),
+        sd_motion_mm=sd_motion(fit.covariance[:6, :6], fit.camera_from_base @ poses),
         **moved_from(prior[0], base, poses[:, :3, 3].mean(0)),
     )

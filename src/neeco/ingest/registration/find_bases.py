@@ -34,14 +34,14 @@ from neeco.ingest.timing.episodes import Episode, Episodes
 class FindBasesSettings:
     """Thresholds of what is corrected by images."""
 
-    n_frames: int = 140  # searched, evenly spaced
-    min_bend_mm: float = 2.0  # from the root to the logged link: nearer, nothing bends there
-    min_read_share: float = 0.5  # of the frames, that a joint's log has to cover: those without a reading are left out
-    min_overlap: float = 0.85  # of an instrument's outline with what moves, where its place is corrected
-    min_overlap_gain: float = 0.2  # of that overlap over the one before
-    max_prior_mm: float = 8.0  # standard deviation of a place, up to which outlines find it
-    max_prior_deg: float = 5.0  # the same, of its turn
-    min_travel_mm: float = 2.0  # root mean square, from which an arm counts as moving
+    n_frames: int = 140  # maximum number of frames that are searched, evenly spaced
+    min_bend_mm: float = 2.0  # minimum distance from the root to the logged link: nearer, nothing bends there
+    min_read_share: float = 0.5  # minimum share of the frames that a joint's log covers; others are left out
+    min_overlap: float = 0.85  # minimum overlap of an instrument's outline with what moves, to correct its place
+    min_overlap_gain: float = 0.2  # minimum gain of that overlap over the one before
+    max_prior_mm: float = 8.0  # maximum standard deviation of a place that outlines find
+    max_prior_deg: float = 5.0  # maximum standard deviation of its turn
+    min_travel_mm: float = 2.0  # minimum RMS travel of an arm that moves
 
 
 PLACING = FindBasesSettings()
@@ -113,7 +113,7 @@ def find_bases(
     observed = _Observed(views, moving)
     usable = observed.visible
     arms = [_among_cameras(_arm(data, item, observed), registration) for item in unknown]
-    found = {}
+    bases = {}
     # what moves most is found most easily, and then out of the way
     for number, arm in enumerate(sorted(arms, key=lambda arm: -arm.travel)):
         progress("finding the robot's base", number, len(arms) if number else 0)
@@ -122,14 +122,14 @@ def find_bases(
         usable = usable & ~covered
         if base is None:
             assert arm.prior is not None
-            given, sd_mm, sd_deg = arm.prior
-            data = data.with_base(name, given)
+            stated, sd_mm, sd_deg = arm.prior
+            data = data.with_base(name, stated)
             data.notes.add(
                 f"instrument {name!r}: it moves by {arm.travel:.1f} mm only, too little to find its base, "
                 f"which stays as given, with standard deviations {sd_mm:.1f} mm and {sd_deg:.1f} deg"
             )
-            found[name] = BaseRegistration(
-                world_from_base=given,
+            bases[name] = BaseRegistration(
+                world_from_base=stated,
                 clock_s=0.0,
                 clock_sd_s=clock.sd,
                 covariance=np.diag(np.repeat([np.radians(sd_deg) ** 2, sd_mm**2], 3)),
@@ -142,13 +142,13 @@ def find_bases(
             clock = replace(clock.later(base.clock_s), sd=base.clock_sd_s, source=FOUND)
         data = data.with_base(name, base.world_from_base).with_moved_clock(logs[name].clock, clock)
         if arm.item.kinematics is not None:  # found with readings of the same clock, where they have none of their own
-            for own in {log.clock for log in data.parts[0].joints[name].values()}:
-                data = data if data.clock(own) is not None else data.with_moved_clock(own, clock)
+            for clock_name in {log.clock for log in data.parts[0].joints[name].values()}:
+                data = data if data.clock(clock_name) is not None else data.with_moved_clock(clock_name, clock)
         data.notes.add(describe(name, base))
         for place, doubt in enumerate(base.doubts):
             data.notes.contradict(f"base of {name}, {place}", f"instrument {name!r}: {doubt}", severe=True)
-        found[name] = base
-    return data, found
+        bases[name] = base
+    return data, bases
 
 
 def correct_placement(
@@ -170,10 +170,10 @@ def correct_placement(
     name = items[0].name
     if data.clock(logs[name].clock) is None:
         return data, {}
-    poses, known = data.instrument_poses(name, views.times)
-    if known.sum() < BASES.min_frames:
+    poses, valid = data.instrument_poses(name, views.times)
+    if valid.sum() < BASES.min_frames:
         return data, {}
-    sds = registration.placement_sd(poses[known, :3, 3])
+    sds = registration.placement_sd(poses[valid, :3, 3])
     if (
         (sds[0] <= HAND_EYE.placed_mm and sds[1] <= HAND_EYE.placed_deg)
         or sds[0] > PLACING.max_prior_mm
@@ -185,23 +185,23 @@ def correct_placement(
     observed = _Observed(views, moving)
     arm = _among_cameras(_arm(data, replace(items[0], base=stated), observed), registration)
     try:
-        found, _ = _find(arm, observed, observed.visible, alone=True)
+        base, _ = _find(arm, observed, observed.visible, alone=True)
     except NeecoError:  # the images do not determine it
         return data, {}
     least = (
         PLACING.min_overlap
-        if found is None
-        else max(PLACING.min_overlap, found.overlap_before + PLACING.min_overlap_gain)
+        if base is None
+        else max(PLACING.min_overlap, base.overlap_before + PLACING.min_overlap_gain)
     )
-    if found is None or found.doubts or not found.overlap > least:
+    if base is None or base.doubts or not base.overlap > least:
         return data, {}
     data.notes.add(
-        f"instrument {name!r}: its place was corrected by {found.moved_mm:.1f} mm and {found.turned_deg:.1f} deg from "
-        f"what moves in {found.frames} frames, as the hand-eye calibration is known to {sds[0]:.1f} mm and "
-        f"{sds[1]:.1f} deg only; its outline and what moves overlap by {found.overlap:.2f} "
-        f"({found.overlap_before:.2f} before)"
+        f"instrument {name!r}: its place was corrected by {base.moved_mm:.1f} mm and {base.turned_deg:.1f} deg from "
+        f"what moves in {base.frames} frames, as the hand-eye calibration is known to {sds[0]:.1f} mm and "
+        f"{sds[1]:.1f} deg only; its outline and what moves overlap by {base.overlap:.2f} "
+        f"({base.overlap_before:.2f} before)"
     )
-    return data.with_base(name, found.world_from_base), {name: replace(found, tracked=True)}
+    return data.with_base(name, base.world_from_base), {name: replace(base, tracked=True)}
 
 
 def follow_cameras(
@@ -209,18 +209,18 @@ def follow_cameras(
 ) -> tuple[Episodes, dict[str, BaseRegistration]]:
     """Move bases found among cameras, `before`, with these to where a later calibration places them, `after`: there
     the images show them. Both in mm, of the same frames or fewer afterwards. Those that stay as given stay."""
-    found = dict(bases)
+    followed = dict(bases)
     _, old, new = np.intersect1d(before.frames, after.frames, return_indices=True)
     motions = after.world_from_camera[new] @ np.linalg.inv(before.world_from_camera[old])
     turn = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
     for name, base in bases.items():
         if not base.frames:
             continue
-        poses, known = data.instrument_poses(name, before.times[old])
-        middle = np.append(poses[known, :3, 3].mean(0), 1.0)
+        poses, valid = data.instrument_poses(name, before.times[old])
+        middle = np.append(poses[valid, :3, 3].mean(0), 1.0)
         moved = rigid(turn, (motions @ middle).mean(0)[:3] - turn @ middle[:3]) @ base.world_from_base
-        data, found[name] = data.with_base(name, moved), replace(base, world_from_base=moved)
-    return data, found
+        data, followed[name] = data.with_base(name, moved), replace(base, world_from_base=moved)
+    return data, followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,14 +305,14 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
     clock = data.clock(log.clock) or ClockOffset(0.0, float("nan"), ASSUMED)
 
     def readings_later(shift: float) -> dict[str, np.ndarray]:
-        found = {}
+        later_readings = {}
         for joint in item.joints:
             reading = data.joint_log(partial(_reading, name=item.name, joint=joint))
-            own = data.clock(reading.clock) or clock
+            reading_clock = data.clock(reading.clock) or clock
             # a clock that is known does not move with the pose's
-            later = 0.0 if own.source in KNOWN else shift
-            found[joint] = readings_at(reading, own.at(times) + later)[0]
-        return found
+            later = 0.0 if reading_clock.source in KNOWN else shift
+            later_readings[joint] = readings_at(reading, reading_clock.at(times) + later)[0]
+        return later_readings
 
     readings = {
         joint: values
@@ -349,14 +349,14 @@ def _among_cameras(arm: _Arm, registration: Registration | None) -> _Arm:
     """Return the arm with the error of the cameras' place added to its prior, the same in all directions."""
     if registration is None or arm.prior is None:
         return arm
-    given, sd_mm, sd_deg = arm.prior
-    places = (given @ arm.poses_at(0.0))[:, :3, 3]
+    base, sd_mm, sd_deg = arm.prior
+    places = (base @ arm.poses_at(0.0))[:, :3, 3]
     places = places[np.isfinite(places).all(1)]
     if not len(places):
         return arm
     variances = np.diag(registration.uncertainty(places).covariance).reshape(2, 3).mean(1)  # rad^2, mm^2
     placed_deg, placed_mm = np.degrees(np.sqrt(variances[0])), np.sqrt(variances[1])
-    return replace(arm, prior=(given, float(np.hypot(sd_mm, placed_mm)), float(np.hypot(sd_deg, placed_deg))))
+    return replace(arm, prior=(base, float(np.hypot(sd_mm, placed_mm)), float(np.hypot(sd_deg, placed_deg))))
 
 
 def _find(
@@ -367,8 +367,8 @@ def _find(
     Return it with the pixels bool [F, h, w] that belong to no other arm. None for one of several arms that hardly
     moves: what is given has to do.
     """
-    if not alone and (found := _without_masks(arm, observed, usable)) is not None:
-        return found
+    if not alone and (by_layers := _without_masks(arm, observed, usable)) is not None:
+        return by_layers
     readings = np.stack(list(arm.readings.values()), -1) if arm.readings else None
     tree, clock_known = arm.item.kinematics, arm.clock.source in KNOWN
     motion = None if tree is None else ArticulatedMotion(tree=tree, poses_at=arm.poses_at, readings_at=arm.readings_at)
@@ -385,8 +385,8 @@ def _find(
             clock_known=clock_known,
         )  # fmt: skip
     except NeecoError as error:
-        if alone and (found := _without_masks(arm, observed, usable)) is not None:
-            return found
+        if alone and (by_layers := _without_masks(arm, observed, usable)) is not None:
+            return by_layers
         if not alone and arm.prior is not None and arm.travel < PLACING.min_travel_mm:
             return None, np.zeros_like(usable)
         assert arm.item.base is not None
@@ -404,31 +404,31 @@ def _without_masks(arm: _Arm, observed: _Observed, usable: np.ndarray) -> tuple[
     if arm.prior is None or float(np.ptp(cameras, axis=0).max()) >= 1e-6:
         return None
     poses = np.stack([arm.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
-    known = np.flatnonzero(np.isfinite(poses).all((0, 2, 3)))
+    rows = np.flatnonzero(np.isfinite(poses).all((0, 2, 3)))
     if arm.clock.source in KNOWN:  # no other clock is tried
         poses = np.tile(arm.poses_at(0.0), (len(CLOCK_SHIFTS_S), 1, 1, 1))
-        known = np.flatnonzero(np.isfinite(poses[0]).all((1, 2)))
-    line = line_through_trocar(poses[len(CLOCK_SHIFTS_S) // 2, known]) if len(known) >= BASES.min_frames else None
+        rows = np.flatnonzero(np.isfinite(poses[0]).all((1, 2)))
+    line = line_through_trocar(poses[len(CLOCK_SHIFTS_S) // 2, rows]) if len(rows) >= BASES.min_frames else None
     if line is None:
         return None
-    wrists = None if arm.wrists is None else arm.wrists[known]
-    given, sd_mm, sd_deg = arm.prior
+    wrists = None if arm.wrists is None else arm.wrists[rows]
+    base, sd_mm, sd_deg = arm.prior
     images = ArmImages(
-        images=observed.lit[known],
+        images=observed.lit[rows],
         intrinsics=observed.intrinsics,
-        poses=poses[:, known],
+        poses=poses[:, rows],
         line=line,
-        usable=usable[known],
+        usable=usable[rows],
         wrists=wrists,
     )
-    prior = np.linalg.inv(cameras[0]) @ given, sd_mm, sd_deg
+    prior = np.linalg.inv(cameras[0]) @ base, sd_mm, sd_deg
     sd_clock = 0.0 if arm.clock.source in KNOWN else RIGID_FIT.clock_sd_s
-    found = fit_layers(images, prior, sd_clock, np.random.default_rng(0))
-    if not found.found:
+    fit = fit_layers(images, prior, sd_clock, np.random.default_rng(0))
+    if not fit.found:
         return None
     covered = np.zeros_like(usable)
-    covered[known] = covered_by(found, images)
-    return base_from_layers(arm.prior, found, cameras[0], images.poses[len(CLOCK_SHIFTS_S) // 2], line), covered
+    covered[rows] = covered_by(fit, images)
+    return base_from_layers(arm.prior, fit, cameras[0], images.poses[len(CLOCK_SHIFTS_S) // 2], line), covered
 
 
 def _in_world(stated: StatedBase, cameras: np.ndarray) -> np.ndarray:
@@ -437,26 +437,26 @@ def _in_world(stated: StatedBase, cameras: np.ndarray) -> np.ndarray:
     return stated.matrix if stated.to_world else np.asarray(cameras[0] @ stated.matrix)
 
 
-def describe(name: str, found: BaseRegistration) -> str:
+def describe(name: str, base: BaseRegistration) -> str:
     """Return a sentence on a base that was found: its standard deviations, and what the recording leaves open."""
 
     def listed(values: np.ndarray) -> str:
         return ", ".join("open" if not np.isfinite(value) else f"{value:.1f}" for value in values)
 
-    words = f"instrument {name!r}: its base was found from what moves in {found.frames} frames"
-    if np.isfinite(found.moved_mm):
-        words += f", {found.moved_mm:.1f} mm and {found.turned_deg:.1f} deg from what was given"
+    words = f"instrument {name!r}: its base was found from what moves in {base.frames} frames"
+    if np.isfinite(base.moved_mm):
+        words += f", {base.moved_mm:.1f} mm and {base.turned_deg:.1f} deg from what was given"
     words += (
-        f"; standard deviations {listed(found.sd_mm)} mm and {listed(found.sd_deg)} deg (right, down, forward of the "
+        f"; standard deviations {listed(base.sd_mm)} mm and {listed(base.sd_deg)} deg (right, down, forward of the "
         "camera); "
     )
-    if not found.from_masks:
-        words += f"without outlines: its shaft explains {found.explained:.0%} of what changes in the images"
+    if not base.from_masks:
+        words += f"without outlines: its shaft explains {base.explained:.0%} of what changes in the images"
     else:
-        words += f"its outline and what moves overlap by {found.overlap:.2f}"
-    if np.isfinite(found.overlap_before):
-        words += f" ({found.overlap_before:.2f} as given)"
-    if found.open_directions:
-        what = "as given" if np.isfinite(found.moved_mm) else "as first guessed"
-        words += f"; its motion does not determine {', nor '.join(found.open_directions)}: there it stays about {what}"
+        words += f"its outline and what moves overlap by {base.overlap:.2f}"
+    if np.isfinite(base.overlap_before):
+        words += f" ({base.overlap_before:.2f} as given)"
+    if base.open_directions:
+        what = "as given" if np.isfinite(base.moved_mm) else "as first guessed"
+        words += f"; its motion does not determine {', nor '.join(base.open_directions)}: there it stays about {what}"
     return words

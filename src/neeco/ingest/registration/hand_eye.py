@@ -29,7 +29,7 @@ from neeco.ingest.timing.clock_search import CLOCK, SCOPE_MOTION, ClockOffset, c
 class HandEyeSettings:
     """Settings of the calibration."""
 
-    min_frames: int = 12  # that fall on the log
+    min_frames: int = 12  # minimum number of frames that fall on the log
     # rad, spread of the scope's directions below which the hand-eye rotation is not determined
     min_turn_rad: float = 0.05
     min_travel_mm: float = 3.0  # mm, spread of the scope's positions below which the scale is not determined
@@ -107,7 +107,7 @@ def register_with_laparoscope(
     world_from_camera: np.ndarray,
     times: np.ndarray,
     log: PoseLog,
-    known: ClockOffset | None,
+    stated: ClockOffset | None,
     settings: IngestSettings | None = None,
 ) -> Registration:
     """Estimate similarity, hand-eye and clock from SfM cameras [N, 4, 4] at video `times` [N] s and the scope's log.
@@ -117,9 +117,9 @@ def register_with_laparoscope(
     kept; else it is estimated, with a rate where that differs from 1 by CLOCK.rate_significance. Raises
     NeecoError when the scope moved too little.
     """
-    clock = clock_from_turning(world_from_camera, times, log) if known is None else known
+    clock = clock_from_turning(world_from_camera, times, log) if stated is None else stated
     problem = _HandEye(world_from_camera, times, log, clock, settings or IngestSettings())
-    if known is not None:
+    if stated is not None:
         solution, covariances = problem.solve(problem.start, (LAG, STRETCH))
     else:
         solution, covariances = problem.solve(problem.start, ())
@@ -215,9 +215,9 @@ class _HandEye:
         ]
         return np.concatenate(rows).ravel()
 
-    def solve(self, x: np.ndarray, held: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Solve all unknowns [U] from `x` on, except `held`; return them and their `_covariances`."""
-        free = np.setdiff1d(np.arange(len(x)), held)
+    def solve(self, x: np.ndarray, fixed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Solve all unknowns [U] from `x` on, except `fixed`; return them and their `_covariances`."""
+        free = np.setdiff1d(np.arange(len(x)), fixed)
 
         def of_free(values: np.ndarray) -> np.ndarray:
             changed = x.copy()
@@ -225,10 +225,10 @@ class _HandEye:
             return self.residuals(changed)
 
         solved = least_squares(of_free, x[free], loss="soft_l1", max_nfev=self.settings.registration_steps)
-        found, covariance, jacobian = x.copy(), np.zeros((len(x), len(x))), np.zeros((len(solved.fun), len(x)))
-        found[free], jacobian[:, free] = solved.x, solved.jac
+        solution, covariance, jacobian = x.copy(), np.zeros((len(x), len(x))), np.zeros((len(solved.fun), len(x)))
+        solution[free], jacobian[:, free] = solved.x, solved.jac
         covariance[np.ix_(free, free)] = np.linalg.pinv(solved.jac.T @ solved.jac)
-        return found, _covariances(solved.fun, jacobian, covariance, self.times[self.valid])
+        return solution, _covariances(solved.fun, jacobian, covariance, self.times[self.valid])
 
 
 def _covariances(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -249,20 +249,20 @@ def _covariances(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.nda
     # [C][2, 3, U, N] gain times the errors' correlation: white ones, and correlated ones
     spread = [gain, *(gain @ _correlation(apart, seconds) for seconds in HAND_EYE.correlated_s)]
     absorbed = np.stack([np.einsum("kaun,kavn->kuv", some, gain, optimize=True) for some in spread], 1)  # [2, C, U, U]
-    found, expected = list[float](), list[np.ndarray]()
+    observed, expected = list[float](), list[np.ndarray]()
     for low, high in pairwise(HAND_EYE.lags_s):
         pairs = ((apart >= low) & (apart < high)).astype(np.float64)
         if not (total := pairs.sum()):
             continue
-        own = [np.trace(pairs), *(_correlation(apart[pairs > 0], seconds).sum() for seconds in HAND_EYE.correlated_s)]
+        sums = [np.trace(pairs), *(_correlation(apart[pairs > 0], seconds).sum() for seconds in HAND_EYE.correlated_s)]
         for kind in range(2):  # positions, rotations
             near = pairs @ slopes[kind] / total  # [3, N, U]
             row = np.einsum("kcuv,anu,anv->kc", absorbed, slopes[kind], near, optimize=True)
             for component, some in enumerate(spread):
-                row[kind, component] += 3 * own[component] / total - 2 * np.einsum("aun,anu->", some[kind], near)
-            found.append(float(np.sum(weighted[kind] * (weighted[kind] @ pairs))) / total)
+                row[kind, component] += 3 * sums[component] / total - 2 * np.einsum("aun,anu->", some[kind], near)
+            observed.append(float(np.sum(weighted[kind] * (weighted[kind] @ pairs))) / total)
             expected.append(row.ravel())
-    variances, _ = nnls(np.stack(expected), np.array(found))
+    variances, _ = nnls(np.stack(expected), np.array(observed))
     return np.stack([covariance, np.tensordot(variances, absorbed.reshape(-1, unknowns, unknowns), 1)])
 
 

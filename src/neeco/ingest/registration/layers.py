@@ -24,39 +24,39 @@ from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, RIGID, mo
 class LayerSettings:
     """Settings of the fit of layers."""
 
-    radius_mm: float = 3.8  # of a shaft
-    log_radius_sd: float = 0.2  # of its logarithm
-    ahead_mm: float = 8.0  # from the logged frame's origin to the instrument's end
-    ahead_sd_mm: float = 6.0  # of that distance
-    length_mm: float = 140.0  # of the shaft that is modelled
-    max_wrist_mm: float = 40.0  # length beyond the bend
-    widths_px: tuple[int, int, int] = (40, 80, 160)  # of images, one after the other
-    n_images: tuple[int, int, int] = (30, 36, 48)  # of each width
-    color_scale: float = 20.0  # of 255, of the robust loss on colours
-    step_mm: float = 2.0  # of the cells of the shaft's colours, along it
-    n_columns: int = 5  # of these cells, across it
-    min_background: float = 2.0  # images that show a pixel's background, for it to count
-    prior_weight: float = 1e-4  # of the mean loss: cost of a parameter one standard deviation off
+    radius_mm: float = 3.8  # radius of a shaft
+    log_radius_sd: float = 0.2  # standard deviation of the radius' logarithm
+    ahead_mm: float = 8.0  # distance from the logged frame's origin to the instrument's end
+    ahead_sd_mm: float = 6.0  # standard deviation of that distance
+    length_mm: float = 140.0  # length of the shaft that is modelled
+    max_wrist_mm: float = 40.0  # maximum length beyond the bend
+    widths_px: tuple[int, int, int] = (40, 80, 160)  # widths of the reduced images, one after the other
+    n_images: tuple[int, int, int] = (30, 36, 48)  # numbers of images of each width
+    color_scale: float = 20.0  # scale of the robust loss on colours, of 255
+    step_mm: float = 2.0  # length of the cells of the shaft's colours, along it
+    n_columns: int = 5  # number of these cells across it
+    min_background: float = 2.0  # minimum number of images that show a pixel's background, for it to count
+    prior_weight: float = 1e-4  # cost of a parameter one standard deviation off, share of the mean loss
     # cross-entropy search of the base
-    n_first: int = 400  # bases tried at first
-    first_sd: float = 1.2  # standard deviations of the prior, of bases tried at first
+    n_first: int = 400  # number of bases tried at first
+    first_sd: float = 1.2  # spread of these bases, standard deviations of the prior
     # bases and rounds, in each size of image
     n_tried: tuple[tuple[int, int], tuple[int, int], tuple[int, int]] = ((60, 9), (30, 5), (24, 5))
-    widening: float = 1.5  # of the search from one size of image to the next
-    max_elite: int = 15  # of the bases tried, at most half, about which the next are tried
+    widening: float = 1.5  # factor on the spread from one size of image to the next
+    max_elite: int = 15  # maximum number of bases, at most half of those tried, about which the next are tried
     exchanged_sd: float = 0.5  # standard deviations about the result, within which exchanged poses are tried
     exchanged_shares: tuple[float, float] = (0.37, 0.61)  # of the recording, by which poses are shifted for comparison
     # standard deviations by which poses must explain images better than those of other moments
     min_certainty: float = 3.0
     probe_sd: float = 0.25  # standard deviations about the minimum, of probes for the loss's second derivatives
-    n_probes: int = 140  # of the loss about its minimum
-    size_sd: float = 0.03  # error common to all images: share of the distance
-    end_sd_mm: float = 4.0  # error common to all images, along the shaft
-    edge_sd_mm: float = 1.0  # error common to all images, in any direction
-    min_curvature: float = 1e-4  # of the loss
-    grown: float = 1.3  # times the radius, that a shaft is taken to cover
-    beyond_mm: float = 10.0  # beyond the end, that a shaft is taken to cover
-    n_blocks: int = 10  # stretches of a recording whose errors are taken to be independent
+    n_probes: int = 140  # number of these probes
+    size_sd: float = 0.03  # standard deviation of the distance, share: an error common to all images
+    end_sd_mm: float = 4.0  # standard deviation along the shaft: an error common to all images
+    edge_sd_mm: float = 1.0  # standard deviation in any direction: an error common to all images
+    min_curvature: float = 1e-4  # minimum curvature of the loss
+    grown: float = 1.3  # factor on the radius that a shaft is taken to cover
+    beyond_mm: float = 10.0  # length beyond the end that a shaft is taken to cover
+    n_blocks: int = 10  # number of stretches of a recording whose errors are taken to be independent
 
 
 LAYERS = LayerSettings()
@@ -166,8 +166,8 @@ class LayerModel:
             mean = np.einsum("fp,fpc->pc", weights, self.colors) / np.maximum(weights.sum(0), 1e-3)[:, None]
             off = np.square(self.colors - mean).mean(-1)
             weights = behind * _robust_weights(off)
-        known = behind.sum(0) > LAYERS.min_background
-        loss = np.where(known, behind * off / (off + LAYERS.color_scale**2), 0.0).sum(1)
+        has_background = behind.sum(0) > LAYERS.min_background
+        loss = np.where(has_background, behind * off / (off + LAYERS.color_scale**2), 0.0).sum(1)
         front = inside * self.usable
         rows, columns = np.nonzero(front > 0.02)
         if len(rows):
@@ -304,10 +304,10 @@ def _covariance(trial: _Trial, mean: np.ndarray, generator: np.random.Generator)
     losses = np.stack([trial.losses(mean + x) for x in probes])  # [N, F]
     pairs = np.triu_indices(N_PARAMETERS)
     terms = np.concatenate([np.ones((LAYERS.n_probes, 1)), probes, probes[:, pairs[0]] * probes[:, pairs[1]]], 1)
-    found = np.linalg.lstsq(terms, losses, rcond=None)[0] / losses.shape[1]  # [T, F]
-    slopes = np.stack([part.sum(1) for part in np.array_split(found[1 : 1 + N_PARAMETERS], LAYERS.n_blocks, axis=1)])
+    fitted = np.linalg.lstsq(terms, losses, rcond=None)[0] / losses.shape[1]  # [T, F]
+    slopes = np.stack([part.sum(1) for part in np.array_split(fitted[1 : 1 + N_PARAMETERS], LAYERS.n_blocks, axis=1)])
     curves = np.zeros((N_PARAMETERS, N_PARAMETERS))
-    curves[pairs] = found[1 + N_PARAMETERS :].sum(1)
+    curves[pairs] = fitted[1 + N_PARAMETERS :].sum(1)
     values, vectors = np.linalg.eigh(curves + curves.T)
     scatter = LAYERS.n_blocks * np.cov(slopes.T)
     variances = np.einsum("ip,ij,jp->p", vectors, scatter, vectors) / np.maximum(values, LAYERS.min_curvature) ** 2

@@ -32,26 +32,26 @@ from neeco.ingest.registration.silhouette_model import (
 class SilhouetteFitSettings:
     """Priors and settings of the fit."""
 
-    # of orders 0 (about the first guess), 1 and 2 at each station
+    # standard deviations of orders 0 (about the first guess), 1 and 2 at each station
     shape_sd_mm: tuple[float, float, float] = (10.0, 1.0, 0.7)
-    joint_sd_mm: float = 2.0  # of what a standard deviation of a reading adds to any order
-    level_sd_mm: float = 1.0  # of the difference of neighbouring radii: shafts are tubes
-    line_sd_mm: float = 30.0  # of shifts of the line about its first guess
-    line_sd_rad: float = 0.5  # of turns of the line about its first guess
-    end_sd_mm: float = 4.0  # of what a standard deviation of a reading, or its square, moves the tip
-    mark_sd_mm: float = 1e4  # of the marks' place along the line
-    clock_sd_s: float = 0.1  # of a clock that nothing gives
-    front_share: float = 0.4  # of the line, from the tip, whose sides do not count: jaws and wrist move there
-    min_medians: float = 3.0  # width of a station's loss, in medians of its residuals
-    # of the robust loss, one after the other; px of masks 160 wide
+    joint_sd_mm: float = 2.0  # standard deviation of what a standard deviation of a reading adds to any order
+    level_sd_mm: float = 1.0  # standard deviation of the difference of neighbouring radii: shafts are tubes
+    line_sd_mm: float = 30.0  # standard deviation of shifts of the line about its first guess
+    line_sd_rad: float = 0.5  # standard deviation of turns of the line about its first guess
+    end_sd_mm: float = 4.0  # standard deviation of the tip's motion per standard deviation of a reading, or its square
+    mark_sd_mm: float = 1e4  # standard deviation of the marks' place along the line
+    clock_sd_s: float = 0.1  # standard deviation of a clock that nothing gives
+    front_share: float = 0.4  # share of the line, from the tip, whose sides do not count: jaws and wrist move there
+    min_medians: float = 3.0  # minimum width of a station's loss, medians of its residuals
+    # widths of the robust loss, one after the other; px of masks 160 wide
     widths_px: tuple[float, ...] = (12.0, 6.0, 3.0, 1.5, 1.0)
-    mark_share: float = 0.125  # of that width for marks, which are exact; outlines have correlated errors in a frame
-    max_steps: int = 12  # of Levenberg-Marquardt, at each width
-    tolerance: float = 1e-5  # share of the loss, below which steps end
-    damping: float = 1e-2  # at first
-    smooth_damping: float = 1e-4  # at first, with smooth outlines
-    max_turn_rad: float = 0.15  # of the base in one step
-    max_shift_mm: float = 15.0  # of the base in one step
+    mark_share: float = 0.125  # share of that width for marks, which are exact; errors of outlines in a frame correlate
+    max_steps: int = 12  # maximum Levenberg-Marquardt steps at each width
+    tolerance: float = 1e-5  # share of the loss below which steps end
+    damping: float = 1e-2  # initial damping
+    smooth_damping: float = 1e-4  # initial damping with smooth outlines
+    max_turn_rad: float = 0.15  # maximum turn of the base in one step
+    max_shift_mm: float = 15.0  # maximum shift of the base in one step
 
 
 RIGID_FIT = SilhouetteFitSettings()
@@ -122,17 +122,17 @@ class _System:
     def residuals(self, fit: SilhouetteFit) -> _Residuals:
         """Distances px of the sides from the masks' outlines, and along the line of the tip from the masks' ends and of
         the marks from where images show them."""
-        found = sides(self.problem, fit)
-        distances, gradient = self.problem.silhouettes.look_up(found.pixels)
-        valid = self.problem.silhouettes.inside(found.pixels, margin=1.0) & (found.px_per_mm[..., 0] != 0)
+        silhouette = sides(self.problem, fit)
+        distances, gradient = self.problem.silhouettes.look_up(silhouette.pixels)
+        valid = self.problem.silhouettes.inside(silhouette.pixels, margin=1.0) & (silhouette.px_per_mm[..., 0] != 0)
         valid &= ~self.front
         lengths = self._lengths(fit)[0]
         return _Residuals(
             np.concatenate([distances, np.nan_to_num(lengths)], 1),
             np.concatenate([valid, np.isfinite(lengths)], 1),
-            (gradient * found.px_per_mm).sum(-1),
-            found.px_per_mm,
-            found.angles,
+            (gradient * silhouette.px_per_mm).sum(-1),
+            silhouette.px_per_mm,
+            silhouette.angles,
         )
 
     def _lengths(self, fit: SilhouetteFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -297,11 +297,11 @@ def fit_covariance(problem: SilhouetteProblem, prior: BasePrior, fit: Silhouette
     left = np.stack([scores[rows].sum(0) for rows in blocks])
     rows = system.prior_residuals(fit)[1]
     noise = float((weights * at.px**2).sum() / max(int(at.valid.sum()), 1))
-    observed, known = _information(columns, weights), rows.T @ rows
-    scatter = np.einsum("bpq,brq->pr", moved, moved) + left.T @ left + noise * observed + known
+    observed, by_prior = _information(columns, weights), rows.T @ rows
+    scatter = np.einsum("bpq,brq->pr", moved, moved) + left.T @ left + noise * observed + by_prior
     free = np.flatnonzero(system.free)
-    inverse = np.zeros_like(known)
-    inverse[np.ix_(free, free)] = np.linalg.inv((observed + known)[np.ix_(free, free)] + 1e-12 * np.eye(len(free)))
+    inverse = np.zeros_like(by_prior)
+    inverse[np.ix_(free, free)] = np.linalg.inv((observed + by_prior)[np.ix_(free, free)] + 1e-12 * np.eye(len(free)))
     return np.asarray((inverse @ scatter @ inverse)[:BASE, :BASE])
 
 

@@ -29,12 +29,12 @@ LINE = 4  # parameters of the line: two turns rad, two shifts mm
 class SilhouetteModelSettings:
     """Limits of the shape."""
 
-    nearest_mm: float = 5.0  # depth at which points are projected at least
-    min_radius_mm: float = 0.3  # at any station
-    max_length_mm: float = 150.0  # of the line, from the tip
-    min_length_mm: float = 15.0  # of the line, from the tip
-    radius_range_mm: tuple[float, float] = (0.5, 15.0)  # of a first guess
-    default_radius_mm: float = 3.0  # where images show none
+    nearest_mm: float = 5.0  # minimum depth at which points are projected
+    min_radius_mm: float = 0.3  # minimum radius at any station
+    max_length_mm: float = 150.0  # maximum length of the line, from the tip
+    min_length_mm: float = 15.0  # minimum length of the line, from the tip
+    radius_range_mm: tuple[float, float] = (0.5, 15.0)  # range of a first guess of the radius
+    default_radius_mm: float = 3.0  # radius where images show none
 
 
 RIGID = SilhouetteModelSettings()
@@ -262,8 +262,8 @@ def first_shape(problem: SilhouetteProblem, fit: SilhouetteFit) -> SilhouetteFit
     def line_at(stations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pixels [F, K, 2] of the line, px/mm [F, K, 2], and whether they are in the image [F, K]."""
         bare = replace(fit, stations=stations, shape=np.zeros((len(stations), kinds, N_TERMS)))
-        found = sides(problem, bare)
-        pixels, px_per_mm = found.pixels[:, : len(stations)], found.px_per_mm[:, : len(stations)]
+        projected = sides(problem, bare)
+        pixels, px_per_mm = projected.pixels[:, : len(stations)], projected.px_per_mm[:, : len(stations)]
         return pixels, px_per_mm, problem.silhouettes.inside(pixels) & px_per_mm.any(-1)
 
     behind = np.linspace(0, RIGID.max_length_mm, 61)

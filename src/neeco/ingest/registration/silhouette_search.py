@@ -23,26 +23,26 @@ from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSil
 class SilhouetteSearchSettings:
     """Settings of the search."""
 
-    n_rotations: int = 500  # tried about a rough base
-    n_uniform: int = 4000  # tried without one
-    max_start_cost: float = 2.0  # of robust losses below 1 each, and the prior's
-    typical_radius_mm: float = 3.5  # of shafts
-    line_sd_rad: float = 0.03  # of a shaft's direction in a mask: jaws open, masks fray
-    tip_sd_px: float = 5.0  # of masks: the tip's place moves with the jaws
-    line_sd_px: float = 2.0  # of masks: the distance of the tip from the line
+    n_rotations: int = 500  # number of rotations tried about a rough base
+    n_uniform: int = 4000  # number of rotations tried without one
+    max_start_cost: float = 2.0  # maximum cost of a start: robust losses below 1 each, and the prior's
+    typical_radius_mm: float = 3.5  # typical radius of a shaft
+    line_sd_rad: float = 0.03  # standard deviation of a shaft's direction in a mask: jaws open, masks fray
+    tip_sd_px: float = 5.0  # standard deviation of the tip, px of masks: it moves with the jaws
+    line_sd_px: float = 2.0  # standard deviation of the distance of the tip from the line, px of masks
     tip_sd_mm: float = 60.0  # prior distance of the tip from the tracked frame's origin
     stated_tip_sd_mm: float = 5.0  # prior distance of the tip from where links state it
     sideways_weight: float = 5e-4  # of a line's weight: where motion leaves it open, shafts are viewed from the side
-    n_rounds: int = 3  # of robust reweighting
-    chunk: int = 500  # rotations tried at once
-    min_step_rad: float = 0.004  # to which rotations are narrowed down
-    n_first: int = 40  # candidates kept at first
-    n_next: int = 20  # candidates kept in later rounds
-    n_around: int = 12  # rotations tried about each candidate
-    n_best: int = 6  # results
-    distinct_rad: float = 0.05  # between results
-    prior_weight: float = 0.02  # of the mean residual: cost of a base one standard deviation off
-    far_cost: float = 1e9  # of a base behind the cameras
+    n_rounds: int = 3  # rounds of robust reweighting
+    chunk: int = 500  # number of rotations tried at once
+    min_step_rad: float = 0.004  # minimum step to which rotations are narrowed down
+    n_first: int = 40  # number of candidates kept at first
+    n_next: int = 20  # number of candidates kept in later rounds
+    n_around: int = 12  # number of rotations tried about each candidate
+    n_best: int = 6  # number of results
+    distinct_rad: float = 0.05  # minimum turn between results
+    prior_weight: float = 0.02  # cost of a base one standard deviation off, share of the mean residual
+    far_cost: float = 1e9  # cost of a base behind the cameras
 
 
 COARSE = SilhouetteSearchSettings()
@@ -106,20 +106,20 @@ def rotations_about(center: np.ndarray, sd_rad: float, count: int, generator: np
     return Rotation.from_rotvec(vectors).as_matrix() @ center
 
 
-def distance_to(problem: LoggedSilhouettes, known: BasePrior) -> float:
+def distance_to(problem: LoggedSilhouettes, prior: BasePrior) -> float:
     """Approximate mm from the cameras to the instrument: by the prior, else by a shaft of typical size."""
     half = float(np.median([mask.max() for mask in problem.silhouettes.distances]))
     guess = COARSE.typical_radius_mm * problem.silhouettes.intrinsics[0] / max(half, 0.5)
-    if known.sd_mm is None:
+    if prior.sd_mm is None:
         return guess
-    place = problem.pivot(known.world_from_base)
+    place = problem.pivot(prior.world_from_base)
     depth = float(np.median(problem.camera_from_world[:, 2, :3] @ place + problem.camera_from_world[:, 2, 3]))
     return depth if depth > 0.2 * guess else guess
 
 
 def search_bases(
     problem: LoggedSilhouettes,
-    known: BasePrior,
+    prior: BasePrior,
     distance: float,
     generator: np.random.Generator,
     lines: ShaftLines | None = None,
@@ -127,14 +127,14 @@ def search_bases(
 ) -> Candidates:
     """The best bases by lines (the masks' shafts where None) and tips of the masks. distance: as `distance_to` has it;
     stated: what links say of the shaft (see `ShaftViews`)."""
-    if known.sd_rad is None or known.sd_mm is None:
+    if prior.sd_rad is None or prior.sd_mm is None:
         rotations = uniform_rotations(COARSE.n_uniform, generator)
         cameras = np.linalg.inv(problem.camera_from_world)  # the instrument is where most of them look
         center, sd_mm, step = (cameras[:, :3, 3] + distance * cameras[:, :3, 2]).mean(0), distance, 0.2
     else:
-        given = known.world_from_base
-        rotations = rotations_about(given[:3, :3], known.sd_rad, COARSE.n_rotations, generator)
-        center, sd_mm, step = problem.pivot(given), known.sd_mm, 0.5 * known.sd_rad
+        base = prior.world_from_base
+        rotations = rotations_about(base[:3, :3], prior.sd_rad, COARSE.n_rotations, generator)
+        center, sd_mm, step = problem.pivot(base), prior.sd_mm, 0.5 * prior.sd_rad
     views = ShaftViews(
         lines=problem.silhouettes.shafts if lines is None else lines,
         intrinsics=problem.silhouettes.intrinsics,
@@ -145,8 +145,8 @@ def search_bases(
         distance=distance,
         **stated,
     )
-    found = search(views, rotations, generator, step)
-    return found.take(np.flatnonzero(found.costs < COARSE.max_start_cost))
+    candidates = search(views, rotations, generator, step)
+    return candidates.take(np.flatnonzero(candidates.costs < COARSE.max_start_cost))
 
 
 def search(views: ShaftViews, rotations: np.ndarray, generator: np.random.Generator, first_step: float) -> Candidates:
@@ -164,9 +164,9 @@ def search(views: ShaftViews, rotations: np.ndarray, generator: np.random.Genera
 def _solve_all(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     """The best base and instrument for each rotation, the cheapest first."""
     parts = [_solve(views, rotations[first : first + COARSE.chunk]) for first in range(0, len(rotations), COARSE.chunk)]
-    found = [np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)]
-    order = np.argsort(found[0], kind="stable")
-    return Candidates(*(values[order] for values in found))
+    columns = [np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)]
+    order = np.argsort(columns[0], kind="stable")
+    return Candidates(*(values[order] for values in columns))
 
 
 def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
@@ -194,14 +194,14 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     # equations [F, 3, 3] that are 0 where the tip projects onto its place, and onto its line
     rows = np.stack([across, unit(np.cross(tip_rays, across)), normals], 1)
     scale = (fx + fy) / 2 / distance / np.array([COARSE.tip_sd_px, COARSE.tip_sd_px, COARSE.line_sd_px])
-    given = np.stack([has_tip, has_tip, has_line], -1)
+    observed = np.stack([has_tip, has_tip, has_line], -1)
 
     count = len(rotations)
     along = np.einsum("fi,bfij->bfj", normals, turned)  # [B, F, 3]
     towards = np.einsum("fi,bfij->bfj", unit(rays(on_line)), turned)
     sideways = COARSE.sideways_weight * np.einsum("bfi,bfj->bij", towards, towards)
     weight = np.broadcast_to(has_line, (count, len(has_line))).astype(float)
-    weights = np.broadcast_to(given, (count, *given.shape)).astype(float)
+    weights = np.broadcast_to(observed, (count, *observed.shape)).astype(float)
     on_tip = np.einsum("fri,bfij->bfrj", rows, turned)
     if views.end is not None:
         on_tip[:, :, 2] = 0.0
@@ -227,8 +227,8 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
         at = np.einsum("bfij,bj->bfi", turned, tip) + moved + shift[:, None]  # the tip in the world
         depth = np.einsum("bfi,fi->bf", at - places, cameras[:, :3, 2])
         off = off * (distance / np.maximum(depth, 0.1 * distance))[..., None]  # as pixels
-        weights = given / (1 + off**2)
-    costs = _mean(line_off**2 / (1 + line_off**2), has_line) + _mean(off**2 / (1 + off**2), given)
+        weights = observed / (1 + off**2)
+    costs = _mean(line_off**2 / (1 + line_off**2), has_line) + _mean(off**2 / (1 + off**2), observed)
     costs = costs + COARSE.prior_weight * np.square((shift - views.center) / views.sd_mm).sum(-1)
     costs = np.where((depth > 0).mean(1) > 0.9, costs, COARSE.far_cost)
     # of the axis' two directions, the one that leads to the tip in most images
@@ -246,7 +246,7 @@ def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
     return Candidates(costs, bases, tip, axes)
 
 
-def _mean(values: np.ndarray, given: np.ndarray) -> np.ndarray:
-    """Means [B] over all that is given."""
-    values = (values * given).reshape(len(values), -1)
-    return np.asarray(values.sum(1) / max(int(given.sum()), 1))
+def _mean(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Means [B] over all that is valid."""
+    values = (values * valid).reshape(len(values), -1)
+    return np.asarray(values.sum(1) / max(int(valid.sum()), 1))

@@ -23,17 +23,17 @@ class AxisSettings:
 
     turn_acceleration: float = 3.0  # rad/s^2, standard deviation of a hand's turns
     move_acceleration: float = 300.0  # mm/s^2, of its motion
-    play_mm: float = 2.0  # of the distance between axis and fixed trocar; errors of the cameras add to it
-    min_trocar_scale_mm: float = 0.3  # of the robust loss that finds the trocar
-    inset_px: float = 0.2  # of a common inward shift of all edges
-    scale_drift: float = 0.05  # of the cameras' scale, by their own drift
-    scale_prior: float = 0.5  # of the logarithm of the cameras' scale, before anything is measured
+    play_mm: float = 2.0  # standard deviation of the distance from axis to fixed trocar; camera errors add to it
+    min_trocar_scale_mm: float = 0.3  # minimum scale of the robust loss that finds the trocar
+    inset_px: float = 0.2  # standard deviation of a common inward shift of all edges
+    scale_drift: float = 0.05  # standard deviation of the cameras' scale, by their own drift
+    scale_prior: float = 0.5  # standard deviation of the prior on the logarithm of the cameras' scale
     edge_loss_sd: float = 2.0  # scale of the Cauchy loss on edges, standard deviations
-    max_steps: int = 30  # of Levenberg-Marquardt
-    tolerance: float = 1e-4  # share of the cost by which a step must reduce it
-    damping: float = 1e-3  # at first
-    epsilon: float = 1e-5  # of numerical derivatives, rad and mm
-    min_slope: float = 1e-6  # of these; less is rounding
+    max_steps: int = 30  # maximum Levenberg-Marquardt steps
+    tolerance: float = 1e-4  # minimum share of the cost by which a step must reduce it
+    damping: float = 1e-3  # initial damping
+    epsilon: float = 1e-5  # step of numerical derivatives, rad and mm
+    min_slope: float = 1e-6  # minimum absolute derivative; less is rounding
 
 
 SETTINGS = AxisSettings()
@@ -242,14 +242,14 @@ class _AxesProblem:
                 steps.append((LOCAL * frames[turn::3] + parameter, LOCAL * moved + parameter))
         for one in range(LOCAL * count, LOCAL * count + self.shared):
             steps.append((np.array([one]), np.full(len(base), one)))
-        found: list[tuple[np.ndarray, ...]] = []
+        entries: list[tuple[np.ndarray, ...]] = []
         for parameters, columns in steps:
             step = np.zeros(LOCAL * count + self.shared)
             step[parameters] = SETTINGS.epsilon
             slopes = (self.residuals(self.move(axes, step)) - base) / SETTINGS.epsilon
             rows = np.flatnonzero(np.abs(slopes) > SETTINGS.min_slope)
-            found.append((slopes[rows], rows, columns[rows]))
-        values, rows, columns = (np.concatenate(part) for part in zip(*found, strict=True))
+            entries.append((slopes[rows], rows, columns[rows]))
+        values, rows, columns = (np.concatenate(part) for part in zip(*entries, strict=True))
         return sparse.csr_matrix((values, (rows, columns)), shape=(len(base), LOCAL * count + self.shared))
 
     def cost(self, axes: ShaftAxes) -> float:

@@ -81,7 +81,7 @@ def outline_edges(
     count = len(masks)
     points, axes = np.tile([0.0, 0.0, 1.0], (2, count, 1))
     pixels, deviations = np.zeros((count, 2, EDGE.places, 2)), np.full((count, 2, EDGE.places), np.inf)
-    found = np.zeros(count, dtype=bool)
+    valid = np.zeros(count, dtype=bool)
     for frame in np.flatnonzero(np.isfinite(ends[:, 0])):
         both = _both_edges(masks[frame], ends[frame], directions[frame], random)
         if both is None:
@@ -93,8 +93,8 @@ def outline_edges(
             continue
         points[frame], axes[frame], pixels[frame] = point, axis, places
         deviations[frame] = EDGE.outline_sd_px * np.sqrt(EDGE.places)
-        found[frame] = True
-    return ShaftAxes(points=points, directions=axes), ShaftEdges(pixels, deviations), found
+        valid[frame] = True
+    return ShaftAxes(points=points, directions=axes), ShaftEdges(pixels, deviations), valid
 
 
 def _both_edges(
@@ -133,13 +133,13 @@ def _outline(mask: np.ndarray, point: np.ndarray, direction: np.ndarray) -> tupl
     places = (point + x[None, :, None] * direction + y[:, None, None] * aside - 0.5).astype(np.float32)
     level = cv2.remap(mask.astype(np.float32), places[..., 0], places[..., 1], cv2.INTER_LINEAR)
     height, width = mask.shape
-    shown = (places[..., 0] > 0) & (places[..., 0] < width - 1) & (places[..., 1] > 0) & (places[..., 1] < height - 1)
+    inside = (places[..., 0] > 0) & (places[..., 0] < width - 1) & (places[..., 1] > 0) & (places[..., 1] < height - 1)
     on = level > 0.5
     first, last = on.argmax(0), EDGE.strip_width - 1 - on[::-1].argmax(0)
     column = np.arange(EDGE.strip_length)
     good = on.any(0) & (first > 0) & (last < EDGE.strip_width - 1)
     before, after = np.maximum(first - 1, 0), np.minimum(last + 1, EDGE.strip_width - 1)
-    good &= shown[before, column] & shown[after, column]
+    good &= inside[before, column] & inside[after, column]
     low, high = level[before, column], level[first, column]
     left = y[first] - (high - 0.5) / np.maximum(high - low, 1e-6)
     low, high = level[after, column], level[last, column]
@@ -173,7 +173,7 @@ def with_shafts(
 ) -> np.ndarray:
     """Return masks bool [F, h, w] that end, behind the points of the axes, at these shafts' contours, in the frames
     `which` bool [F]."""
-    found = masks.copy()
+    trimmed = masks.copy()
     _, height, width = masks.shape
     v, u = np.mgrid[:height, :width] + 0.5
     places = np.stack([u, v, np.ones(u.shape)], -1)
@@ -187,8 +187,8 @@ def with_shafts(
         shaft = places[..., :2] @ along < before @ along
         lines = image_lines(contour_normals(point, direction, radius), intrinsics)
         inside = (places @ lines.T).min(-1)  # px, within the nearer contour
-        found[frame] = np.where(shaft & (inside > -wide), inside > 0, found[frame])
-    return found
+        trimmed[frame] = np.where(shaft & (inside > -wide), inside > 0, trimmed[frame])
+    return trimmed
 
 
 def shaded_edges(
@@ -260,8 +260,8 @@ def _edge(
     places = (foot[:, None] + offsets[None, :, None] * outwards - 0.5).astype(np.float32)
     colors = cv2.remap(light, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     height, width = light.shape[:2]
-    shown = (places > 0).all(-1) & (places[..., 0] < width - 1) & (places[..., 1] < height - 1)  # [S, U]
-    whole = shown.all(1)
+    inside = (places > 0).all(-1) & (places[..., 0] < width - 1) & (places[..., 1] < height - 1)  # [S, U]
+    whole = inside.all(1)
     blocks = len(foot) // EDGE.block_px
     if not blocks:
         return np.zeros((0, 2)), np.zeros(0), np.zeros(0)
@@ -283,8 +283,8 @@ def _edge(
     independent = EDGE.sample_px  # neighbouring samples are of one pixel
     sds = np.sqrt(2 * noise / independent * EDGE.step_px**2 / curvature)
     centers = foot[:cut].reshape(blocks, EDGE.block_px, 2).mean(1)[whole]
-    found = centers - shift[:, None] * line[:2]
-    return found[inner], sds[inner], noise[inner]
+    edge_places = centers - shift[:, None] * line[:2]
+    return edge_places[inner], sds[inner], noise[inner]
 
 
 def _offsets() -> np.ndarray:
@@ -374,16 +374,16 @@ def shaft_ends(images: np.ndarray, masks: np.ndarray, points: np.ndarray, direct
         odds = np.clip(color_odds(colors, is_shaft, ~is_shaft).of_color, -EDGE.max_odds, EDGE.max_odds)
         shaft, head = [], []
         for frame in frames:
-            own, along, first, last = seen[frame]
+            tints, along, first, last = seen[frame]
             bins = np.floor(along - first).astype(int)
             count = np.bincount(bins)
-            mean = np.bincount(bins, odds[own]) / np.maximum(count, 1)
+            mean = np.bincount(bins, odds[tints]) / np.maximum(count, 1)
             # the end that explains the colours of all places best
             gained = np.concatenate([[0.0], np.cumsum(mean)])
             best = int(gained.argmax())
             ends[frame] = first + best
-            shaft.append(own[along < ends[frame] - EDGE.end_margin_px])
-            head.append(own[along > ends[frame] + EDGE.end_margin_px])
+            shaft.append(tints[along < ends[frame] - EDGE.end_margin_px])
+            head.append(tints[along > ends[frame] + EDGE.end_margin_px])
         if not any(map(len, shaft)) or not any(map(len, head)):
             return np.full(len(images), np.nan)
         difference = float(odds[np.concatenate(shaft)].mean() - odds[np.concatenate(head)].mean())

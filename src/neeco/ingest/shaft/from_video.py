@@ -33,39 +33,39 @@ class ShaftSearchSettings:
     """Thresholds of instruments found in a video."""
 
     # what is asked of a recording
-    min_diameters: float = 2.0  # of visible shaft
-    min_share: float = 0.6  # of the frames that show them
-    min_frames_share: float = 0.3  # of the frames, that show an instrument with a shaft at all
-    min_frames: int = 10  # the same, at least
+    min_diameters: float = 2.0  # minimum length of visible shaft
+    min_share: float = 0.6  # minimum share of the frames that show as much
+    min_frames_share: float = 0.3  # minimum share of the frames that show an instrument with a shaft at all
+    min_frames: int = 10  # minimum number of these frames
     second_area: float = 0.3  # share of the largest piece's area, from which another is a second instrument
-    second_share: float = 0.4  # of the frames with such a piece: two instruments
+    second_share: float = 0.4  # share of the frames with such a piece, above which there are two instruments
     # first guess
     default_head_diameters: float = 5.0  # length of a head, where nothing measures it
-    depth_range: tuple[float, float] = (0.4, 2.5)  # of the median depth, for a shaft to be accepted
-    window_frames: int = 5  # to both sides, with which a frame's direction is compared
-    max_jump: float = 0.35  # difference from their median direction, for an outlier
+    depth_range: tuple[float, float] = (0.4, 2.5)  # depths of an accepted shaft, ratio to the median depth
+    window_frames: int = 5  # frames on each side with which a frame's direction is compared
+    max_jump: float = 0.35  # maximum difference from their median direction; more is an outlier
     head_range: tuple[float, float] = (0.4, 1.6)  # of the median length of the head, for an end to be accepted
-    closed_quantile: float = 0.8  # of the heads' lengths, taken for that of closed jaws
+    closed_quantile: float = 0.8  # quantile of the heads' lengths that is taken for that of closed jaws
     # solution
-    min_rounds: int = 3  # of detecting edges and solving for axes, at least
-    max_rounds: int = 7  # the same, at most
-    straight_px: float = 0.15  # by which the median of the edges may leave a straight line
-    bin_radii: float = 0.5  # of shaft, in each of which the edges are averaged
-    bins: int = 16  # of that length
-    min_filled: float = 0.3  # places on edges in a bin, per frame
-    blur_frames: int = 40  # from which the lens's blur is estimated
-    trocar_rms_mm: float = 3.0  # distance between the axes and a trocar that is fixed
+    min_rounds: int = 3  # minimum rounds of detecting edges and solving for axes
+    max_rounds: int = 7  # maximum rounds
+    straight_px: float = 0.15  # maximum deviation of the median edge from a straight line
+    bin_radii: float = 0.5  # length of shaft, radii, in which the edges are averaged
+    bins: int = 16  # number of these lengths
+    min_filled: float = 0.3  # minimum number of places on edges in one of them, per frame
+    blur_frames: int = 40  # number of frames from which the lens's blur is estimated
+    trocar_rms_mm: float = 3.0  # maximum RMS distance between the axes and a fixed trocar
     end_px: float = 1.5  # standard deviation of the shaft's end, from its colour
-    tip_mm: float = 3.0  # the same, from the tip
-    sliding_mm_s: float = 20.0  # along its axis, where the end is not observed
-    # degrees of tilt, mm across the shaft, mm along it, of a frame that is kept
+    tip_mm: float = 3.0  # standard deviation of the shaft's end, from the tip
+    sliding_mm_s: float = 20.0  # standard deviation of motion along the axis, where the end is not observed
+    # maximum standard deviations of a frame that is kept: degrees of tilt, mm across the shaft, mm along it
     max_sd: tuple[float, float, float] = (4.0, 2.5, 4.0)
-    # depth of the tissue over that of the instrument's deepest place, where nothing measures it
+    # ratio of the tissue's depth to that of the instrument's deepest place, where nothing measures it
     tissue_behind: float = 1.15
-    max_scale_sd: float = 0.15  # of its logarithm, up to which the cameras' scale is known
+    max_scale_sd: float = 0.15  # maximum standard deviation of its logarithm at which the cameras' scale is known
     roll_deg: float = 5.0  # standard deviation of a logged roll
-    reading_deg: float = 1.0  # of a logged joint
-    margin_px: int = 7  # about what moves, in which features are not the tissue's
+    reading_deg: float = 1.0  # standard deviation of a logged joint
+    margin_px: int = 7  # margin about moving pixels, in which features are not the tissue's
 
 
 SHAFT = ShaftSearchSettings()
@@ -161,18 +161,18 @@ def find_shaft(
     )
     along_sd = _along_deviation(video, axes, ends, by_color)
     uncertainties, tilt, across = _uncertainties(axes, poses := _poses(video, axes), along_sd, video)
-    known = (tilt < SHAFT.max_sd[0]) & (across < SHAFT.max_sd[1]) & (along_sd < SHAFT.max_sd[2])
-    if not known.any():
+    certain = (tilt < SHAFT.max_sd[0]) & (across < SHAFT.max_sd[1]) & (along_sd < SHAFT.max_sd[2])
+    if not certain.any():
         raise NeecoError("the shaft's direction is uncertain in all frames; film more of the shaft, and nearer")
     if not by_color:
         notes.append(
             "shaft and head have the same colour: the place along the shaft is that of the tip, which opening jaws "
             "move; a ring of tape on the shaft's end would mend it"
         )
-    sharp = with_shafts(masks, axes, video.radius, video.intrinsics, known & ends) if by_color else masks
+    sharp = with_shafts(masks, axes, video.radius, video.intrinsics, certain & ends) if by_color else masks
     return FoundShaft(
         poses=poses,
-        known=known,
+        known=certain,
         uncertainties=uncertainties,
         axes=axes,
         diameters=diameters,
@@ -223,16 +223,16 @@ def _first_axes(
         radii = (working_length or _default_head(video)) / video.radius
         along = _behind_tips(masks, lines.points, lines.directions, radii)
     ends = lines.points + along[:, None] * lines.directions
-    axes, edges, found = outline_edges(masks, ends, lines.directions, video.radius, video.intrinsics)
-    if found.sum() < max(SHAFT.min_frames, SHAFT.min_frames_share * len(masks)):
+    axes, edges, valid = outline_edges(masks, ends, lines.directions, video.radius, video.intrinsics)
+    if valid.sum() < max(SHAFT.min_frames, SHAFT.min_frames_share * len(masks)):
         raise NeecoError(
-            f"a shaft is visible in {int(found.sum())} of {len(masks)} frames; hold the scope back, so that more than "
+            f"a shaft is visible in {int(valid.sum())} of {len(masks)} frames; hold the scope back, so that more than "
             "the instrument's end shows"
         )
-    axes, edges = _bridged(video, axes, edges, found)
+    axes, edges = _bridged(video, axes, edges, valid)
     axes = solve_axes(video, axes, edges)
-    axes, known, _ = _at_end(axes, images, masks, video, working_length)
-    return axes, edges, known
+    axes, at_end, _ = _at_end(axes, images, masks, video, working_length)
+    return axes, edges, at_end
 
 
 def _behind_tips(masks: np.ndarray, points: np.ndarray, directions: np.ndarray, radii: float) -> np.ndarray:
@@ -256,11 +256,11 @@ def _passes_one_point(video: ShaftVideo, axes: ShaftAxes) -> bool:
     return float(np.sqrt(np.mean(missed**2))) < SHAFT.trocar_rms_mm
 
 
-def _bridged(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges, found: np.ndarray) -> tuple[ShaftAxes, ShaftEdges]:
+def _bridged(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges, valid: np.ndarray) -> tuple[ShaftAxes, ShaftEdges]:
     """Interpolate the axes of outlier frames from the others, which alone keep their edges."""
     depth = axes.points[:, 2]
-    usual = float(np.median(depth[found]))
-    good = found & (depth > SHAFT.depth_range[0] * usual) & (depth < SHAFT.depth_range[1] * usual)
+    usual = float(np.median(depth[valid]))
+    good = valid & (depth > SHAFT.depth_range[0] * usual) & (depth < SHAFT.depth_range[1] * usual)
     points, directions = video.world_lines(axes)
     for _ in range(2):
         for frame in np.flatnonzero(good):
@@ -307,11 +307,11 @@ def _at_end(
     else:
         shift = tips - (working_length or _default_head(video))
     shift = shift - offset
-    known = np.isfinite(shift)
-    if known.any():
-        shift = np.interp(video.times, video.times[known], shift[known])
+    valid = np.isfinite(shift)
+    if valid.any():
+        shift = np.interp(video.times, video.times[valid], shift[valid])
         axes = replace(axes, points=axes.points + shift[:, None] * axes.directions)
-    return axes, known, heads
+    return axes, valid, heads
 
 
 def _narrower_part(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges) -> float:
@@ -375,13 +375,13 @@ def _uncertainties(
     place += along_sd[:, None, None] ** 2 * axes.directions[:, :, None] * axes.directions[:, None]
     tilts = np.degrees(np.sqrt(np.einsum("fii->fi", rotation)))
     shifts = np.sqrt(np.einsum("fii->fi", place))
-    found = tuple(
+    uncertainties = tuple(
         Uncertainty((float(s[0]), float(s[1]), float(s[2])), (float(t[0]), float(t[1]), UNKNOWN_DEG))
         for s, t in zip(shifts, tilts, strict=True)
     )
     largest = np.sqrt(np.linalg.eigvalsh(axes.covariance[:, :2, :2])[:, -1])
     aside = np.sqrt(np.linalg.eigvalsh(axes.covariance[:, 2:, 2:])[:, -1])
-    return found, np.degrees(largest), aside
+    return uncertainties, np.degrees(largest), aside
 
 
 def find_in_video(
@@ -405,34 +405,34 @@ def find_in_video(
         scaled=tissue is None,
     )
     try:
-        found = find_shaft(images, masks, shared, asked.working_length_mm, asked.fixed_trocar, tissue or np.inf)
+        shaft = find_shaft(images, masks, shared, asked.working_length_mm, asked.fixed_trocar, tissue or np.inf)
     except NeecoError as error:
         raise NeecoError(f"{data.recording.path}: instrument {item.name!r}, from video: {error}") from error
-    data.notes.add(_in_words(item.name, found))
-    for note in found.notes:
+    data.notes.add(_in_words(item.name, shaft))
+    for note in shaft.notes:
         data.notes.add(f"instrument {item.name!r}, from video: {note}")
     if item.roll is None:
         data.notes.add(
             f"instrument {item.name!r}: its roll is not known (180 degrees in every state's uncertainty); log it, or "
             "pose frames by hand (`neeco view CAPTURE --annotate`)"
         )
-    poses = views.times[found.known], found.poses[found.known]
-    return replace(data, video_poses={**data.video_poses, item.name: poses}), found
+    poses = views.times[shaft.known], shaft.poses[shaft.known]
+    return replace(data, video_poses={**data.video_poses, item.name: poses}), shaft
 
 
-def _in_words(name: str, found: FoundShaft) -> str:
-    shifts = np.array([item.translation_mm for item in found.uncertainties])[found.known]
-    turns = np.array([item.rotation_deg[:2] for item in found.uncertainties])[found.known].max(1)
-    left_out = int((~found.known).sum())
+def _in_words(name: str, shaft: FoundShaft) -> str:
+    shifts = np.array([item.translation_mm for item in shaft.uncertainties])[shaft.known]
+    turns = np.array([item.rotation_deg[:2] for item in shaft.uncertainties])[shaft.known].max(1)
+    left_out = int((~shaft.known).sum())
     scale = ""
-    if found.axes.scale_sd is not None:
-        scale = f"; the cameras' scale is known to {found.axes.scale_sd:.0%}, from the trocar"
+    if shaft.axes.scale_sd is not None:
+        scale = f"; the cameras' scale is known to {shaft.axes.scale_sd:.0%}, from the trocar"
     return (
-        f"instrument {name!r} was found in the video: {found.share:.0%} of the frames show two diameters of its shaft "
-        f"({SHAFT.min_share:.0%} are needed); {left_out} of {len(found.known)} show too little of it and are left out; "
+        f"instrument {name!r} was found in the video: {shaft.share:.0%} of the frames show two diameters of its shaft "
+        f"({SHAFT.min_share:.0%} are needed); {left_out} of {len(shaft.known)} show too little of it and are left out; "
         f"its direction has a standard deviation of {np.median(turns):.1f} degrees, its place of "
         f"{np.median(shifts[:, :2]):.1f} mm across the view and {np.median(shifts[:, 2]):.1f} mm in depth; from the "
-        f"end of the shaft to the tip it is {found.working_length:.0f} mm{scale}"
+        f"end of the shaft to the tip it is {shaft.working_length:.0f} mm{scale}"
     )
 
 
@@ -448,24 +448,24 @@ def on_masks(masks: np.ndarray, sfm: SfmResult, size: tuple[int, int]) -> np.nda
     return np.asarray(around[row.astype(int), np.clip(y * height / size[1], 0, height - 1).astype(int), column] > 0)
 
 
-def uncertainties(item: InstrumentLogs, found: FoundShaft) -> tuple[Uncertainty, ...]:
+def uncertainties(item: InstrumentLogs, shaft: FoundShaft) -> tuple[Uncertainty, ...]:
     """Return the uncertainty of every state, with that of logged rolls and joints."""
     assert item.from_video is not None
-    known = found.uncertainties
+    values = shaft.uncertainties
     if item.roll is not None:
-        known = tuple(replace(one, rotation_deg=(*one.rotation_deg[:2], SHAFT.roll_deg)) for one in known)
+        values = tuple(replace(one, rotation_deg=(*one.rotation_deg[:2], SHAFT.roll_deg)) for one in values)
     joints = dict.fromkeys(item.joints, SHAFT.reading_deg)
-    return tuple(replace(one, joints_deg=joints) for one in known)
+    return tuple(replace(one, joints_deg=joints) for one in values)
 
 
-def instruments_of(recording: Recording, found: FoundShaft | None) -> tuple[Instrument, ...]:
+def instruments_of(recording: Recording, shaft: FoundShaft | None) -> tuple[Instrument, ...]:
     """Return the instruments of a recording for its capture. found: the one that was found in the video."""
     stated = []
     for item in recording.instruments:
         if item.placed:
             limits = {name: source.limits for name, source in item.joints.items()}
             in_video = None
-            if found is not None and item.from_video is not None:
-                in_video = FromVideo(item.from_video.shaft_diameter_mm, found.working_length)
+            if shaft is not None and item.from_video is not None:
+                in_video = FromVideo(item.from_video.shaft_diameter_mm, shaft.working_length)
             stated.append(Instrument(item.name, limits, item.kinematics, from_video=in_video))
     return tuple(stated)

@@ -21,20 +21,20 @@ from neeco.ingest.readers.logs import PoseLog
 class ClockSearchSettings:
     """Steps and thresholds of the search for a clock."""
 
-    step_s: float = 0.02  # of the coarse search for an offset
+    step_s: float = 0.02  # step of the coarse search for an offset
     stride_s: float = 0.12  # over which a turn is measured: long enough to stand out of the tracker's noise
-    min_correlation: float = 0.6  # of two recordings of one motion
+    min_correlation: float = 0.6  # minimum correlation of two recordings of one motion
     same_motion: float = 0.95  # correlation from which on no other rate is tried: ends are off by less than a lobe
-    min_lead: float = 0.08  # by how much the best offset must beat every other, apart from its own lobe
-    lobe_s: float = 0.3  # to either side of a peak of the correlation, that belongs to it
+    min_lead: float = 0.08  # minimum lead of the best offset over every other, apart from its own lobe
+    lobe_s: float = 0.3  # half the width of a peak of the correlation
     min_significance: float = 3.5  # sd of chance: the best of tens of offsets in a short recording has 3
-    min_overlap: float = 0.6  # of the video, that the log covers
-    max_length_s: float = 24 * 3600.0  # of a recording: a longer log or video has stray stamps
-    max_rate: float = 2.5  # s of a log in one second of the video: 60 frames a second taken for 25
-    segment_s: float = 40.0  # of the video, on which all rates are tried; around the best one the rest is added
-    rate_mismatch_s: float = 0.1  # by which the ends of a segment are off between two rates tried
-    rate_correlation: float = 0.85  # that another rate needs: of hundreds tried one fits by chance
-    rate_lead: float = 0.04  # by how much the correlation at another rate must beat that at rate 1
+    min_overlap: float = 0.6  # minimum share of the video that the log covers
+    max_length_s: float = 24 * 3600.0  # maximum length of a recording: a longer log or video has stray stamps
+    max_rate: float = 2.5  # maximum s of a log in one second of the video: 60 frames a second taken for 25
+    segment_s: float = 40.0  # length of the video on which all rates are tried; around the best one the rest is added
+    rate_mismatch_s: float = 0.1  # maximum error at the ends of a segment between two rates tried
+    rate_correlation: float = 0.85  # minimum correlation of another rate: of hundreds tried one fits by chance
+    rate_lead: float = 0.04  # minimum lead of the correlation at another rate over that at rate 1
     rate_significance: float = 2.0  # standard deviations from 1, at which a rate is taken to differ
 
 
@@ -136,13 +136,13 @@ def _spread_of_parts(observed: np.ndarray, tracked: np.ndarray, best: int) -> fl
     Each is searched near `best`, the lag of the whole video.
     """
     quarter = len(observed) // 4
-    found = []
+    offsets = []
     for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
         near, fit = correlate(observed[part], tracked)
         around = np.abs((near - part.start - best) * CLOCK.step_s) < CLOCK.lobe_s
         if around.any():
-            found.append(_vertex(near[around] - part.start, fit[around]))
-    return max(float(np.std(found)) * CLOCK.step_s if len(found) > 1 else CLOCK.lobe_s, CLOCK.step_s / 4)
+            offsets.append(_vertex(near[around] - part.start, fit[around]))
+    return max(float(np.std(offsets)) * CLOCK.step_s if len(offsets) > 1 else CLOCK.lobe_s, CLOCK.step_s / 4)
 
 
 def _check_span(log: PoseLog) -> None:
@@ -225,8 +225,8 @@ def significance(short: np.ndarray, long: np.ndarray, lag: int, correlation: flo
 def _autocorrelation(signal: np.ndarray, count: int) -> np.ndarray:
     """Return the autocorrelation of a signal at lags 1 ... count - 1."""
     centred = signal - signal.mean()
-    found = fftconvolve(centred, centred[::-1])[len(signal) - 1 :]
-    return np.asarray(found[1:count] / max(float(found[0]), 1e-18))
+    full = fftconvolve(centred, centred[::-1])[len(signal) - 1 :]
+    return np.asarray(full[1:count] / max(float(full[0]), 1e-18))
 
 
 def _vertex(lags: np.ndarray, scores: np.ndarray) -> float:

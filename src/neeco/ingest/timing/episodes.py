@@ -61,12 +61,12 @@ class Notes:
     @property
     def sentences(self) -> tuple[str, ...]:
         """Sentences on losses and assumptions; one about one of several episodes begins with its name."""
-        found = []
+        sentences = []
         for episode, name in enumerate(self._names):
             for sentence in [sentence for sentence, of in self._sentences if of == episode]:
                 everywhere = all((sentence, other) in self._sentences for other in range(len(self._names)))
-                found.append(sentence if everywhere else f"{name}: {sentence}")
-        return tuple(dict.fromkeys([*found, *(sentence for sentence, of in self._sentences if of is None)]))
+                sentences.append(sentence if everywhere else f"{name}: {sentence}")
+        return tuple(dict.fromkeys([*sentences, *(sentence for sentence, of in self._sentences if of is None)]))
 
     def contradict(self, subject: str, sentence: str, *, severe: bool, episode: int | None = None) -> None:
         """Set the contradiction about a subject, of one episode or all, in place of an earlier one; an empty sentence
@@ -78,7 +78,7 @@ class Notes:
         self._contradictions[subject, episode] = Contradiction(named, severe)
 
     def is_contradicted(self, subject: str) -> bool:
-        return any(held == subject for held, _ in self._contradictions)
+        return any(other == subject for other, _ in self._contradictions)
 
     @property
     def contradictions(self) -> tuple[Contradiction, ...]:
@@ -176,13 +176,13 @@ class Episodes:
         parts[episode] = replace(parts[episode], clocks={**parts[episode].clocks, **clocks})
         return replace(self, parts=tuple(parts))
 
-    def with_moved_clock(self, name: str, found: ClockOffset) -> Episodes:
-        """Return the episodes with a clock of the joint logs at `found`: that of every episode moves by as much."""
+    def with_moved_clock(self, name: str, target: ClockOffset) -> Episodes:
+        """Return the episodes with a clock of the joint logs at `target`: that of every episode moves by as much."""
         before = self.clock(name)
-        moved, data = found.seconds - (before.seconds if before is not None else 0.0), self
+        moved, data = target.seconds - (before.seconds if before is not None else 0.0), self
         for episode, part in enumerate(self.parts):
-            held = part.clocks.get(name, ClockOffset(0.0, 0.0, GIVEN))
-            clock = replace(held, seconds=held.seconds + moved, sd=found.sd, source=found.source)
+            current = part.clocks.get(name, ClockOffset(0.0, 0.0, GIVEN))
+            clock = replace(current, seconds=current.seconds + moved, sd=target.sd, source=target.source)
             data = data.with_clocks(episode, {name: clock})
         return data
 
@@ -215,14 +215,14 @@ class Episodes:
 
     def clock(self, name: str) -> ClockOffset | None:
         """Return a clock of the joint logs: of several episodes, known once it is known in each."""
-        held = [part.clocks.get(name) for part in self.parts]
-        known = [clock for clock in held if clock is not None]
-        if len(known) < len(held):
+        clocks = [part.clocks.get(name) for part in self.parts]
+        present = [clock for clock in clocks if clock is not None]
+        if len(present) < len(clocks):
             return None
         if self.single:
-            return known[0]
-        source = next((clock.source for clock in known if clock.source != GIVEN), GIVEN)
-        return ClockOffset(0.0, max(clock.sd for clock in known), source)
+            return present[0]
+        source = next((clock.source for clock in present if clock.source != GIVEN), GIVEN)
+        return ClockOffset(0.0, max(clock.sd for clock in present), source)
 
     def joint_log(self, of: Callable[[Episode], Log]) -> Log:
         """Return one log of every episode as one on the joint timeline, cut off where it reaches into another."""
@@ -231,29 +231,30 @@ class Episodes:
             return logs[0]
         inner, times, rows = [], [], []
         for part, log in zip(self.parts, logs, strict=True):
-            known = part.clocks.get(log.clock, ClockOffset(0.0, 0.0, GIVEN))
-            own = part.times + part.start_s
-            moved = known.video_times(log.times) + part.start_s
-            rows.append((moved > own[0] - EPISODES.pause_s / 2) & (moved < own[-1] + EPISODES.pause_s / 2))
+            clock = part.clocks.get(log.clock, ClockOffset(0.0, 0.0, GIVEN))
+            frame_times = part.times + part.start_s
+            moved = clock.video_times(log.times) + part.start_s
+            first, last = frame_times[0] - EPISODES.pause_s / 2, frame_times[-1] + EPISODES.pause_s / 2
+            rows.append((moved > first) & (moved < last))
             times.append(moved[rows[-1]])
-            inner += [tuple(known.video_times(np.array(gap)) + part.start_s) for gap in log.gaps]
+            inner += [tuple(clock.video_times(np.array(gap)) + part.start_s) for gap in log.gaps]
         joint = np.concatenate(times)
         gaps = {(before, after) for before, after in inner if before >= joint[0] and after <= joint[-1]}
         gaps |= {(float(before[-1]), float(after[0])) for before, after in pairwise(times)}
-        held: dict[str, Any] = {"times": joint, "gaps": tuple(sorted(gaps))}
+        fields: dict[str, Any] = {"times": joint, "gaps": tuple(sorted(gaps))}
         for name in ("values",) if isinstance(logs[0], ReadingLog) else ("positions", "quats"):
             columns = [getattr(log, name)[inside] for log, inside in zip(logs, rows, strict=True)]
-            held[name] = np.concatenate(columns)
-        return replace(logs[0], **held)
+            fields[name] = np.concatenate(columns)
+        return replace(logs[0], **fields)
 
     # states at times [N] s of the joint timeline, each from its episode's own logs
 
     def scope_poses(self, times: np.ndarray) -> np.ndarray:
         """Return the laparoscope's poses [N, 4, 4] in its tracker's frame."""
 
-        def of(part: Episode, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def of(part: Episode, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             assert part.scope is not None
-            return part.logged_poses(part.scope, own)
+            return part.logged_poses(part.scope, local)
 
         return self._gathered(times, of, (4, 4))[0]
 
@@ -264,21 +265,21 @@ class Episodes:
         """
         if name in self.video_poses:
             return self._found_poses(name, times)
-        poses, known = self._gathered(times, lambda part, own: part.logged_poses(part.poses[name], own + lag), (4, 4))
-        return (self.world_from_base[name] @ poses if name in self.world_from_base else poses), known
+        poses, valid = self._gathered(times, lambda part, t: part.logged_poses(part.poses[name], t + lag), (4, 4))
+        return (self.world_from_base[name] @ poses if name in self.world_from_base else poses), valid
 
     def _found_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`instrument_poses` of one found in the video, with its roll where that is logged."""
-        held, poses = self.video_poses[name]
-        if not len(held):
+        video_times, poses = self.video_poses[name]
+        if not len(video_times):
             return np.full((len(times), 4, 4), np.nan), np.zeros(len(times), dtype=bool)
-        row = np.abs(times[:, None] - held).argmin(1)
-        known = np.abs(times - held[row]) < EPISODES.same_instant
-        found = np.where(known[:, None, None], poses[row], np.nan)
+        row = np.abs(times[:, None] - video_times).argmin(1)
+        valid = np.abs(times - video_times[row]) < EPISODES.same_instant
+        resampled = np.where(valid[:, None, None], poses[row], np.nan)
         if name in self.parts[0].rolls:
-            roll, logged = self._gathered(times, lambda part, own: part.logged_readings(part.rolls[name], own), ())
-            found, known = with_roll(found, np.nan_to_num(roll)), known & logged
-        return found, known
+            roll, logged = self._gathered(times, lambda part, t: part.logged_readings(part.rolls[name], t), ())
+            resampled, valid = with_roll(resampled, np.nan_to_num(roll)), valid & logged
+        return resampled, valid
 
     def states_at(self, times: np.ndarray) -> tuple[States, np.ndarray]:
         """Return every instrument's states, and where all of them are known. All clocks have to be known.
@@ -289,18 +290,18 @@ class Episodes:
         usable = np.ones(len(times), dtype=bool)
         limits = {item.name: {j: log.limits for j, log in item.joints.items()} for item in self.recording.instruments}
         for name in (*self.parts[0].poses, *self.video_poses):
-            poses, known = self.instrument_poses(name, times)
-            usable &= known
+            poses, valid = self.instrument_poses(name, times)
+            usable &= valid
             readings = {}
             for joint in self.parts[0].joints[name]:
 
-                def of(part: Episode, own: np.ndarray, name: str = name, joint: str = joint) -> Any:
+                def of(part: Episode, local: np.ndarray, name: str = name, joint: str = joint) -> Any:
                     log = part.joints[name][joint]
-                    values, known = part.logged_readings(log, own)
-                    return self._within_limits(part, log, limits[name][joint], values), known
+                    values, valid = part.logged_readings(log, local)
+                    return self._within_limits(part, log, limits[name][joint], values), valid
 
-                readings[joint], known = self._gathered(times, of, ())
-                usable &= known
+                readings[joint], valid = self._gathered(times, of, ())
+                usable &= valid
             states[name] = (poses, readings)
         for part, rows, _ in self._each(times):
             if not usable[rows].any():
@@ -332,10 +333,10 @@ class Episodes:
         shape: tuple[int, ...],
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return values [N, *shape] that `of` gives for an episode at times of its own, and where they are known."""
-        values, known = np.full((len(times), *shape), np.nan), np.zeros(len(times), dtype=bool)
-        for part, rows, own in self._each(times):
-            values[rows], known[rows] = of(part, own)
-        return values, known
+        values, valid = np.full((len(times), *shape), np.nan), np.zeros(len(times), dtype=bool)
+        for part, rows, local in self._each(times):
+            values[rows], valid[rows] = of(part, local)
+        return values, valid
 
     def _within_limits(
         self, part: Episode, log: ReadingLog, limits: tuple[float, float] | None, values: np.ndarray
@@ -344,8 +345,8 @@ class Episodes:
         exceeds them."""
         if limits is None:
             return values
-        held = np.clip(values, *limits)
-        excess = float(np.nanmax(np.abs(values - held), initial=0.0))
+        clipped = np.clip(values, *limits)
+        excess = float(np.nanmax(np.abs(values - clipped), initial=0.0))
         if excess > EPISODES.limit_slack:
             raise NeecoError(
                 f"{log.path}: readings go {np.degrees(excess):.1f} deg beyond the joint's limits {limits[0]:g} .. "
@@ -356,7 +357,7 @@ class Episodes:
                 f"{log.path.name}: readings up to {np.degrees(excess):.1f} deg beyond the limits are held at them",
                 self.parts.index(part),
             )
-        return held
+        return clipped
 
 
 def with_roll(poses: np.ndarray, roll: np.ndarray) -> np.ndarray:

@@ -84,7 +84,7 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
     require_answers(recording, poses)
     video = recording.source.open()
     logs: list[PoseLog | ReadingLog] = [*poses.values(), *([scope] if scope else [])]
-    logs += [log for held in joints.values() for log in held.values()] + [*rolls.values()]
+    logs += [log for by_joint in joints.values() for log in by_joint.values()] + [*rolls.values()]
     for note in (*recording.notes, *(note for log in logs for note in log.notes), *video.notes):
         notes.add(note, episode)
     for item in items:
@@ -123,15 +123,15 @@ def _check_partner(recording: Recording) -> str:
     assert recording.stereo is not None
     left, right, _, calibration = recording.read_stereo()
     right.check_size(recording.stereo.source.open().size, calibration)
-    known = None if recording.video is None else format_of(recording.video)
-    own = None
+    reader = None if recording.video is None else format_of(recording.video)
+    stated = None
     with suppress(NeecoError):  # what the file states is not used
-        own = None if known is None or recording.video is None else known.lens(recording.video, recording.stream)
-    if own is None or abs(left.fl_x / own.fl_x - 1) < READING.same_focal:
+        stated = None if reader is None or recording.video is None else reader.lens(recording.video, recording.stream)
+    if stated is None or abs(left.fl_x / stated.fl_x - 1) < READING.same_focal:
         return ""
     return (
         f"stereo.calibration: {calibration.name} states a focal length of {left.fl_x:.0f} px, the images' own file "
-        f"one of {own.fl_x:.0f} px: is it of another scope, or another zoom?"
+        f"one of {stated.fl_x:.0f} px: check that it is of this scope and zoom"
     )
 
 
@@ -208,7 +208,7 @@ def _length_notes(recording: Recording, video: VideoSource, logs: Sequence[PoseL
         if beyond > MAX_UNLIKE * (times[-1] - times[0]):
             notes.append(
                 f"{log.path.name}: goes from {log.times[0]:.1f} to {log.times[-1]:.1f} s on the video's clock, the "
-                f"video from {times[0]:.1f} to {times[-1]:.1f} s: are they of one recording?"
+                f"video from {times[0]:.1f} to {times[-1]:.1f} s: check that both are of one recording"
             )
     return notes
 
@@ -237,7 +237,7 @@ class _JoinedVideo(VideoSource):
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = np.asarray(indices, dtype=np.int64)
         for video, before, after in zip(self.videos, self.first, self.first[1:], strict=False):
-            own = wanted[(wanted >= before) & (wanted < after)] - before
-            if len(own):
-                for index, image in video.read(own.tolist()):
+            local = wanted[(wanted >= before) & (wanted < after)] - before
+            if len(local):
+                for index, image in video.read(local.tolist()):
                     yield index + before, image

@@ -94,10 +94,10 @@ class DownstreamSettings:
     workers: int = 1
     transforms: str = "transforms.json"
     device: str = "auto"
-    default_counts: tuple[int, ...] = (5, 10, 20, 50)  # of labelled frames, besides all
+    default_counts: tuple[int, ...] = (5, 10, 20, 50)  # numbers of labelled frames trained on by default, besides all
     kept_fold: ClassVar[int] = 0  # whose weights and predictions are kept
-    write_every_s: float = 30.0  # results so far are written no more often: they are thousands of frames' scores
-    parts_steps: float = 2.5  # times as many steps to learn parts as one class: more of them do not help
+    write_every_s: float = 30.0  # least s between two writings of the results so far, which are large
+    parts_steps: float = 2.5  # ratio of the steps for parts to the steps for one class: more of them do not help
 
     @property
     def all_tests(self) -> list[str]:
@@ -266,12 +266,12 @@ class DownstreamJob:
         if self.fold == self.settings.kept_fold:
             write_predictions(self.folder, test, [sample.name for sample in samples], predictions)
         frames: list[dict[str, float]] = []
-        for found, example in zip(predictions, truth, strict=True):
-            if isinstance(found, Detections):
-                frames.append({"box_iou": box_iou(found, example)})
+        for prediction, example in zip(predictions, truth, strict=True):
+            if isinstance(prediction, Detections):
+                frames.append({"box_iou": box_iou(prediction, example)})
             else:
-                frames.append(mask_scores(found, example, names))
-        boxes = [found for found in predictions if isinstance(found, Detections)]
+                frames.append(mask_scores(prediction, example, names))
+        boxes = [prediction for prediction in predictions if isinstance(prediction, Detections)]
         rows = [
             {"frame": sample.name}
             | {key: None if np.isnan(value) else round(value, 5) for key, value in scores.items()}
@@ -285,10 +285,10 @@ def write_predictions(job: Path, test: str, names: Sequence[str], predictions: S
     """Write a job's predictions for a test by the frames' names: masks uint8 [H, W], or boxes [n, 6] (x0, y0, x1, y1,
     class, score)."""
     arrays = {
-        PREFIX + name: np.column_stack([found.boxes, found.classes, found.scores])
-        if isinstance(found, Detections)
-        else found
-        for name, found in zip(names, predictions, strict=True)
+        PREFIX + name: np.column_stack([prediction.boxes, prediction.classes, prediction.scores])
+        if isinstance(prediction, Detections)
+        else prediction
+        for name, prediction in zip(names, predictions, strict=True)
     }
 
     def write(file: Path) -> None:
@@ -339,14 +339,14 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
     for option in ("folds", "steps", "size", "batch"):
         value = getattr(settings, option)
         if value is not None and value < 1:
-            raise NeecoError(f"--{option}: {value} is none at all; give at least 1")
+            raise NeecoError(f"--{option} must be at least 1 (got {value})")
     check_workers(settings.workers, device_of(settings.device, drawing=False), share_gpus=True)
     if not settings.models:
         raise NeecoError("--models: none is given; name at least one")
     names = [data.name for data in settings.sets]
     for name in names:
         if name in ("", *RESERVED) or {*name} & set("+/\\") or names.count(name) > 1:
-            raise NeecoError(f"--sets {name}: conditions and folders go by this name; give each set one of its own")
+            raise NeecoError(f"--sets {name}: reserved, not usable in file names, or given twice; choose another name")
     if settings.backgrounds is not None:
         background_files(settings.backgrounds)
     words = default_conditions(names) if settings.conditions is None else settings.conditions
@@ -398,8 +398,8 @@ def _splits(capture: Capture, requested: Sequence[str]) -> tuple[str, ...]:
     usable = [split for split in capture.splits if split != "train" and split in labelled]
     for split in requested or ("",):
         if split not in usable and (split or not usable):
-            known = f"has true masks of {', '.join(usable)}" if usable else "has no true mask outside of split train"
-            raise NeecoError(f"--splits: {split or 'none is given'}: {capture.root} {known}; choose what to test on")
+            truth = f"has true masks of {', '.join(usable)}" if usable else "has no true mask outside of split train"
+            raise NeecoError(f"--splits: {split or 'none is given'}: {capture.root} {truth}; choose what to test on")
     return tuple(requested or usable)
 
 
@@ -407,7 +407,7 @@ def _check_tests(settings: DownstreamSettings, capture: Capture) -> None:
     """Raises NeecoError for other captures that cannot be tested on, or whose names mean something else."""
     for name, path in settings.tests.items():
         if name in (*capture.splits, "") or {*name} & {"/", "\\"}:
-            raise NeecoError(f"--test {name}: results go by this name; name it otherwise: --test NAME={path}")
+            raise NeecoError(f"--test {name}: is a split's name or no file name; choose another: --test NAME={path}")
         other = read_checked(path, "transforms.json")
         if class_names(other, settings.classes) != class_names(capture, settings.classes):
             raise NeecoError(f"--test {name}: {path} has other parts than {capture.root}; use --classes instrument")
@@ -422,9 +422,7 @@ def _check_models(settings: DownstreamSettings, capture: Capture, frame: tuple[i
             raise NeecoError(f"--models {name}: {missing}")
         width, height = settings.input_of(kind, frame)
         if kind.is_too_small((width, height)):
-            raise NeecoError(
-                f"--models {name}: it would see images of {width}x{height} px, too small for it; give a larger --size"
-            )
+            raise NeecoError(f"--models {name}: its input of {width}x{height} px is too small; give a larger --size")
         several = [str(data.path) for data in settings.sets if data.instruments() > 1]
         several += [str(capture.root)] if len(capture.instruments) > 1 else []
         if kind.predicts == "boxes" and several:
@@ -441,22 +439,22 @@ def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | 
     """
     file, jobs = plan.settings.output / FILE, plan.jobs
     with own_folder(plan.settings.output):
-        finished = {index: found for index, job in enumerate(jobs) if (found := job.stored()) is not None}
+        finished = {index: stored for index, job in enumerate(jobs) if (stored := job.stored()) is not None}
         captures = {plan.settings.capture: plan.capture}
-        written, known = 0.0, list[Mapping[str, Any]]()
+        written, recorded = 0.0, list[Mapping[str, Any]]()
 
         def record(results: Sequence[Mapping[str, Any]]) -> None:
             nonlocal written
-            known[:] = results
+            recorded[:] = results
             if time.monotonic() > written + plan.settings.write_every_s:
-                write_json(file, document(plan, known))
+                write_json(file, document(plan, recorded))
                 written = time.monotonic()
 
         try:
             results = run_jobs(jobs, plan.settings.workers, record, finished, progress, captures, light=True)
         except KeyboardInterrupt:
-            if known:
-                write_json(file, document(plan, known))
+            if recorded:
+                write_json(file, document(plan, recorded))
             raise
         result = document(plan, results) | {"complete": True}
         write_json(file, result)

@@ -54,16 +54,16 @@ class TorchModel(ABC):
 
     model: ClassVar[str]
     predicts: ClassVar[Literal["masks", "boxes"]]
-    image_size: ClassVar[int]  # px, the longer side of its input images unless --size is given
+    image_size: ClassVar[int]  # length in px of the longer side of its input images unless --size is given
     multiple: ClassVar[int]  # both sides are multiples of it
     steps: ClassVar[int]  # that suffice for a few hundred images
     batch: ClassVar[int]
     learning_rate: ClassVar[float]
     weight_decay: ClassVar[float] = 1e-4
-    gradient_clip: ClassVar[float] = 0.1  # norm, as in D-FINE
-    warmup: ClassVar[float] = 0.1  # of the steps: the learning rate rises
-    prediction_batch: ClassVar[int] = 16  # images
-    report_every: ClassVar[int] = 10  # steps
+    gradient_clip: ClassVar[float] = 0.1  # limit on the norm of the gradient, as in D-FINE
+    warmup: ClassVar[float] = 0.1  # share of the steps over which the learning rate rises
+    prediction_batch: ClassVar[int] = 16  # images per batch of predictions
+    report_every: ClassVar[int] = 10  # steps between two reports of progress
 
     @classmethod
     @abstractmethod
@@ -135,14 +135,14 @@ class TorchModel(ABC):
 
     @torch.inference_mode()
     def _predict(self, module: nn.Module, images: Sequence[np.ndarray], task: TrainingTask) -> list[Prediction]:
-        found: list[Prediction] = []
+        predictions: list[Prediction] = []
         for start in range(0, len(images), self.prediction_batch):
             some = images[start : start + self.prediction_batch]
             shrunk = np.stack([cv2.resize(image, task.size, interpolation=cv2.INTER_AREA) for image in some])
             batch = torch.from_numpy(shrunk).permute(0, 3, 1, 2).to(task.device, torch.float32) / 255
             batch = batch.contiguous(memory_format=torch.channels_last)
-            found += self.predictions(module, batch, [(image.shape[0], image.shape[1]) for image in some])
-        return found
+            predictions += self.predictions(module, batch, [(image.shape[0], image.shape[1]) for image in some])
+        return predictions
 
 
 def missing_packages(*packages: str) -> str | None:
@@ -160,12 +160,12 @@ def find_models() -> dict[str, type[TorchModel]]:
 
 def model_class(name: str) -> type[TorchModel]:
     """The model of that name. Raises NeecoError when there is none."""
-    known = find_models()
-    if name not in known:
+    models = find_models()
+    if name not in models:
         raise NeecoError(
-            f"--models: {name!r} is unknown; choose of {', '.join(known)}, or install the package that has it"
+            f"--models: {name!r} is unknown; choose of {', '.join(models)}, or install the package that has it"
         )
-    return known[name]
+    return models[name]
 
 
 def input_size(frame: tuple[int, int], longer_side: int, multiple: int) -> tuple[int, int]:

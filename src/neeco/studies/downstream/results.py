@@ -36,7 +36,7 @@ class IntervalSettings:
 
     confidence: float = 0.95
     resamples: int = 2000
-    blocks: int = 10  # a test's frames are resampled in so many blocks of neighbours, whose errors are correlated
+    blocks: int = 10  # blocks of neighbouring frames, whose errors are correlated, that are resampled
 
 
 INTERVALS = IntervalSettings()
@@ -93,7 +93,7 @@ def box_scores(
     for number, name in enumerate(classes, 1):
         true = [boxes[numbers == number] for boxes, numbers in labelled]
         if any(len(boxes) for boxes in true):
-            per_class[name] = _coco_ap([found.of_class(number) for found in predictions], true)
+            per_class[name] = _coco_ap([each.of_class(number) for each in predictions], true)
     if not per_class:
         return dict.fromkeys(BOX_SCORES)
     means = np.mean(list(per_class.values()), axis=0).tolist()
@@ -101,11 +101,11 @@ def box_scores(
     return scores | ({f"{name}.ap": row[0] for name, row in per_class.items()} if len(classes) > 1 else {})
 
 
-def box_iou(found: Detections, truth: Example) -> float:
+def box_iou(detections: Detections, truth: Example) -> float:
     """Mean IoU of every true box with the most confident box of its class; NaN where the truth has none."""
     values = []
     for box, number in zip(*truth.boxes(), strict=True):
-        boxes, scores = found.of_class(number)
+        boxes, scores = detections.of_class(number)
         best = boxes[scores.argmax()] if len(scores) else np.zeros(4)
         both = np.prod(np.clip(np.minimum(best[2:], box[2:]) - np.maximum(best[:2], box[:2]), 0, None))
         areas = [np.prod(corners[2:] - corners[:2]) for corners in (best, box)]
@@ -223,8 +223,8 @@ class Scores:
                 rows.append(frames if any(value is not None for value in frames) else [scores[metric]])
             values = np.array(rows, np.float64)  # [seeds, frames]; None is nan: a frame without the class
             seeds, frames_drawn = seed_weights(len(folds)), block_weights(values.shape[1])
-            known = ~np.isnan(values)
-            total, count = (((seeds @ part) * frames_drawn).sum(1) for part in (np.nan_to_num(values), known))
+            valid = ~np.isnan(values)
+            total, count = (((seeds @ part) * frames_drawn).sum(1) for part in (np.nan_to_num(values), valid))
             self._resampled[key] = total / np.where(count > 0, count, np.nan) if values.size > 1 else np.empty(0)
         return self._resampled[key]
 
@@ -267,8 +267,8 @@ def failed_jobs(experiment: Document) -> list[str]:
 
 def metrics_of(jobs: Sequence[Document], predicts: str) -> list[str]:
     """The scores that these jobs have, the main one first; of several classes that of each behind them."""
-    found = {key for job in jobs for split in job["splits"].values() for key in split}
-    classes = sorted(key for key in found if key.endswith(f".{MAIN[predicts]}"))
+    metrics = {key for job in jobs for split in job["splits"].values() for key in split}
+    classes = sorted(key for key in metrics if key.endswith(f".{MAIN[predicts]}"))
     return [*(MASK_SCORES if predicts == "masks" else BOX_SCORES), *classes]
 
 

@@ -56,13 +56,13 @@ class Example:
         """Each class with the corners [n, 2] (x, y, shares of the image's sides; float32) of the pixels at its border:
         what a box is about, wherever the image is moved."""
         height, width = self.classes.shape
-        found = []
+        outlines = []
         for number in self.shown.tolist():
             inside = (self.classes == number).astype(np.uint8)
             rows, columns = np.nonzero(inside - cv2.erode(inside, np.ones((3, 3), np.uint8), borderValue=0))
             corners = np.concatenate([np.stack([columns + x, rows + y], 1) for x in (0, 1) for y in (0, 1)])
-            found.append((number, corners.astype(np.float32) / np.array([width, height], np.float32)))
-        return found
+            outlines.append((number, corners.astype(np.float32) / np.array([width, height], np.float32)))
+        return outlines
 
 
 def class_names(capture: Capture, classes: ClassNames) -> tuple[str, ...]:
@@ -208,7 +208,7 @@ class ImageSet:
         info = require_like(read_json(file), {"ids": [{"id": int, "part": str}], "settings": dict}, str(file), ANEW)
         for entry in info["ids"]:
             if not 0 <= entry["id"] < 256:
-                raise NeecoError(f"{file}: ids: {entry['id']} is none from 0 to 255; {ANEW}")
+                raise NeecoError(f"{file}: ids: must be 0 to 255 (got {entry['id']}); {ANEW}")
         return info
 
     def instruments(self) -> int:

@@ -46,8 +46,8 @@ def parse_condition(name: str, sets: Collection[str]) -> Condition:
     words = name.split("+")
     for word in words:
         if word not in RESERVED and word not in sets:
-            known = ", ".join(RESERVED)
-            raise NeecoError(f"--conditions {name}: {word!r} is neither {known} nor a set; name it in --sets")
+            reserved = ", ".join(RESERVED)
+            raise NeecoError(f"--conditions {name}: {word!r} is neither {reserved} nor a set; name it in --sets")
     condition = Condition(name, tuple(word for word in words if word in sets))
     lacks_real = REAL not in condition and (PASTE in condition or not condition.sets)
     if len(set(words)) < len(words) or lacks_real or (PERMUTED in condition and not condition.sets):
@@ -95,13 +95,13 @@ class PasteSettings:
     """Images that are made, and how far instruments are moved in them."""
 
     images: int = 400
-    margin: float = 0.02  # of the image's longer side: what is about an instrument (shadow, blur) is filled in, too
-    fill_side: int = 160  # px, the longer side at which holes are filled: what is put there is smooth
-    edge_sd: float = 0.8  # px, of the soft edge
-    max_turn: float = 20.0  # degrees
-    max_zoom: float = 1.25  # larger or smaller
-    max_shift: float = 0.15  # of a side
-    max_gain: float = 0.2  # of the pasted instrument's brightness
+    margin: float = 0.02  # margin about an instrument (shadow, blur) that is filled in, as a share of the longer side
+    fill_side: int = 160  # length in px of the longer side at which holes are filled: the filling is smooth
+    edge_sd: float = 0.8  # standard deviation in px of the soft edge
+    max_turn: float = 20.0  # limit on the turn in degrees
+    max_zoom: float = 1.25  # limit on the zoom, as a ratio up or down
+    max_shift: float = 0.15  # limit on the shift, as a share of a side
+    max_gain: float = 0.2  # limit on the relative change of the pasted instrument's brightness
 
 
 @dataclass(frozen=True)
@@ -154,9 +154,9 @@ class Backgrounds:
         if len(poses) < 2 or not all(np.allclose(pose, poses[0], atol=1e-4) for pose in poses):
             return None
         examples = [CACHE.load(sample) for sample in self.samples[:: -(-len(self.samples) // 25)]]  # some are as good
-        shown = np.stack([np.where(self._covered(item)[..., None], np.nan, item.image) for item in examples])
-        shown[:, np.isnan(shown[..., 0]).all(0)] = 0
-        return np.nanmedian(shown, axis=0).round().astype(np.uint8)
+        tissue = np.stack([np.where(self._covered(item)[..., None], np.nan, item.image) for item in examples])
+        tissue[:, np.isnan(tissue[..., 0]).all(0)] = 0
+        return np.nanmedian(tissue, axis=0).round().astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -241,12 +241,12 @@ class Batch:
 
     def boxes(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return each image's boxes [n, 4] (centre x, y, width, height; shares of its sides) and their classes."""
-        found = []
+        boxes_and_classes = []
         for outlines in self.outlines:
             ends = np.array([(*points.min(0), *points.max(0)) for _, points in outlines], np.float64).reshape(-1, 4)
             boxes = np.concatenate([(ends[:, :2] + ends[:, 2:]) / 2, ends[:, 2:] - ends[:, :2]], 1)
-            found.append((boxes, np.array([number for number, _ in outlines], np.int64)))
-        return found
+            boxes_and_classes.append((boxes, np.array([number for number, _ in outlines], np.int64)))
+        return boxes_and_classes
 
 
 def training_image(sample: Sample, size: tuple[int, int], classes: int, outlines: bool = False) -> TrainingImage:
@@ -293,7 +293,7 @@ class BatchSampler:
     augmented: whether a batch is to be strongly augmented.
     """
 
-    real_alone_from = 0.6  # share of the steps after which recorded frames alone are learned
+    real_alone_from = 0.6  # share of the steps from which only recorded frames are drawn
 
     def __init__(
         self, real: Sequence[Sample], synthetic: Sequence[Sequence[Sample]] = (), *, seed: int, augmented: bool = False

@@ -62,8 +62,8 @@ class Bop(Writer):
 
 def _camera(record: Record) -> dict[str, Any]:
     """Intrinsics, where the world is from here, and mm per count of the depth image."""
-    given = record["intrinsics"]
-    matrix = [given["fl_x"], 0.0, given["cx"], 0.0, given["fl_y"], given["cy"], 0.0, 0.0, 1.0]
+    intrinsics = record["intrinsics"]
+    matrix = [intrinsics["fl_x"], 0.0, intrinsics["cx"], 0.0, intrinsics["fl_y"], intrinsics["cy"], 0.0, 0.0, 1.0]
     pose = np.linalg.inv(swap_camera_axes(np.array(record["camera"])))
     return {
         "cam_K": matrix,
@@ -85,11 +85,11 @@ def _masks(images: WrittenImages, folder: Path, record: Record) -> list[dict[str
     parts = read_labels(root / "parts" / f"{name}.png").numpy()
     bits = read_labels(root / "silhouettes" / f"{name}.png").numpy()
     depth = np.asarray(open_image(root / "depth" / f"{name}.png"))
-    given = {item["name"]: InstrumentState(item["pose"], item["joints"]) for item in record["instruments"]}
+    states = {item["name"]: InstrumentState(item["pose"], item["joints"]) for item in record["instruments"]}
     fx, fy, cx, cy = (record["intrinsics"][key] for key in INTRINSICS)
     pose = swap_camera_axes(np.array(record["camera"]))
     camera = Camera(pose, fx, fy, cx, cy, width=width, height=height)
-    extended = extended_silhouettes(images.scene, labeller, State(given, record["time"]), camera)
+    extended = extended_silhouettes(images.scene, labeller, State(states, record["time"]), camera)
     infos = []
     for place, label in enumerate(record["labels"]):
         ids = [k for k, (owner, _) in enumerate(labeller.names, 1) if owner == label["instrument"]]

@@ -54,11 +54,11 @@ class Coco(Writer):
             link(images.root / record["image"], folder / "images" / Path(record["image"]).name)
         for split in (None, *sorted({record["split"] for record in records})):
             chosen = [record for record in records if split in (None, record["split"])]
-            found = [(record, label) for record in chosen for label in record["labels"] if label["area"] > 0]
-            by_instrument = (_instrument(record, label, numbers, keypoints) for record, label in found)
+            visible = [(record, label) for record in chosen for label in record["labels"] if label["area"] > 0]
+            by_instrument = (_instrument(record, label, numbers, keypoints) for record, label in visible)
             by_part = (
                 _annotation(record, shape, part_numbers[label["name"], part])
-                for record, label in found
+                for record, label in visible
                 for part, shape in label["parts"].items()
             )
             for kind, categories, made in (("instances", instruments, by_instrument), ("parts", parts, by_part)):

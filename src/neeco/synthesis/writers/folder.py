@@ -123,8 +123,8 @@ def encoded_sample(
 
 def skipped_sample(index: int, refused: Mapping[str, int], facts: Mapping[str, Any] = MappingProxyType({})) -> Encoded:
     """The record that `index` has no image, and why; `facts` are added."""
-    found = {"index": index, "skipped": True, **facts, "refused": dict(sorted(refused.items())), "files": {}}
-    return Encoded(found, {})
+    record = {"index": index, "skipped": True, **facts, "refused": dict(sorted(refused.items())), "files": {}}
+    return Encoded(record, {})
 
 
 def _digest(record: Record) -> str:

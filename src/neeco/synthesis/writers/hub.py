@@ -50,20 +50,20 @@ class ImageFolder(Writer):
             planes = {plane.partition(".")[0]: kind for kind, plane in SHARDED.items()}  # mask, parts, ...
             for plane, kind in planes.items():
                 link(root / kind / f"{name}.png", folder / split / f"{name}_{plane}.png")
-            shown = [label for label in record["labels"] if label["area"] > 0]
+            visible = [label for label in record["labels"] if label["area"] > 0]
             line = {
                 "file_name": image,
                 **{f"{plane}_file_name": f"{name}_{plane}.png" for plane in planes},
                 "objects": {
-                    "bbox": [label["box"] for label in shown],
-                    "area": [label["area"] for label in shown],
-                    "category": [images.instruments.index(label["name"]) for label in shown],
-                    "name": [label["name"] for label in shown],
+                    "bbox": [label["box"] for label in visible],
+                    "area": [label["area"] for label in visible],
+                    "category": [images.instruments.index(label["name"]) for label in visible],
+                    "name": [label["name"] for label in visible],
                     "keypoints": [
                         [[float(value) for value in label["keypoints"].get(point, [0, 0, 0])] for point in points]
-                        for label in shown
+                        for label in visible
                     ],
-                    "pose": [label["camera_from_instrument"] for label in shown],
+                    "pose": [label["camera_from_instrument"] for label in visible],
                 },
             }
             lines.setdefault(split, []).append(json.dumps(line, allow_nan=False))

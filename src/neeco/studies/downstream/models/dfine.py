@@ -97,10 +97,10 @@ class DFine(TorchModel):
         output = module(pixel_values=images)
         scores = output.logits.sigmoid().float().cpu().numpy()  # [B, Q, C]
         boxes = output.pred_boxes.float().cpu().numpy()  # [B, Q, 4] centre and size in [0, 1]
-        found: list[Prediction] = []
+        detections: list[Prediction] = []
         for score, box, (height, width) in zip(scores, boxes, sizes, strict=True):
             corners = np.concatenate([box[:, :2] - box[:, 2:] / 2, box[:, :2] + box[:, 2:] / 2], 1)
             corners = corners.clip(0, 1) * np.array([width, height, width, height])
             queries, classes = np.unravel_index(np.argsort(-score, axis=None, kind="stable"), score.shape)
-            found.append(Detections(corners[queries].astype(np.float64), classes + 1, score[queries, classes]))
-        return found
+            detections.append(Detections(corners[queries].astype(np.float64), classes + 1, score[queries, classes]))
+        return detections

@@ -22,12 +22,12 @@ class ResidualUnit(nn.Module):
     last: the convolution alone, as the network's output needs it.
     """
 
-    def __init__(self, given: int, made: int, stride: int = 1, last: bool = False) -> None:
+    def __init__(self, inputs: int, outputs: int, stride: int = 1, last: bool = False) -> None:
         super().__init__()
-        self.convolution = nn.Conv2d(given, made, 3, stride, 1)
-        self.rest = nn.Identity() if last else nn.Sequential(nn.BatchNorm2d(made), nn.ReLU())
-        same = given == made and stride == 1
-        self.shortcut: nn.Module = nn.Identity() if same else nn.Conv2d(given, made, 3, stride, 1)
+        self.convolution = nn.Conv2d(inputs, outputs, 3, stride, 1)
+        self.rest = nn.Identity() if last else nn.Sequential(nn.BatchNorm2d(outputs), nn.ReLU())
+        same = inputs == outputs and stride == 1
+        self.shortcut: nn.Module = nn.Identity() if same else nn.Conv2d(inputs, outputs, 3, stride, 1)
 
     def forward(self, features: Tensor) -> Tensor:
         return self.rest(self.convolution(features)) + self.shortcut(features)
@@ -39,15 +39,15 @@ class ResidualUNet(nn.Module):
     def __init__(self, classes: int, channels: Sequence[int]) -> None:
         super().__init__()
         *levels, _ = channels
-        down = [ResidualUnit(given, made, 2) for given, made in pairwise([3, *levels])]
+        down = [ResidualUnit(inputs, outputs, 2) for inputs, outputs in pairwise([3, *levels])]
         self.down = nn.ModuleList([*down, ResidualUnit(channels[-2], channels[-1])])
         self.up = nn.ModuleList()
         below = channels[-1]
-        for k, made in enumerate([*reversed(levels[:-1]), classes], 1):
-            transposed = nn.ConvTranspose2d(below + levels[-k], made, 3, 2, 1, output_padding=1)
-            unit = ResidualUnit(made, made, last=k == len(levels))
-            self.up.append(nn.Sequential(transposed, nn.BatchNorm2d(made), nn.ReLU(), unit))
-            below = made
+        for k, outputs in enumerate([*reversed(levels[:-1]), classes], 1):
+            transposed = nn.ConvTranspose2d(below + levels[-k], outputs, 3, 2, 1, output_padding=1)
+            unit = ResidualUnit(outputs, outputs, last=k == len(levels))
+            self.up.append(nn.Sequential(transposed, nn.BatchNorm2d(outputs), nn.ReLU(), unit))
+            below = outputs
 
     def forward(self, images: Tensor) -> Tensor:
         features, skipped = images, []
@@ -67,7 +67,7 @@ class UNet(TorchModel):
     predicts = "masks"
     image_size = 160
     multiple = 16
-    steps = 1000  # strong augmentation needs them; without it 400 are enough
+    steps = 1000  # training steps; strong augmentation needs as many, without it 400 are enough
     batch = 8
     learning_rate = 3e-3
     channels = (16, 32, 64, 128, 256)  # of the levels, each but the last half as large as the one before
@@ -91,8 +91,8 @@ class UNet(TorchModel):
 
     def predictions(self, module: Any, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Prediction]:
         probabilities = module(images).softmax(1).float().cpu().numpy()  # [B, C + 1, h, w]
-        found: list[Prediction] = []
+        masks: list[Prediction] = []
         for shares, (height, width) in zip(probabilities, sizes, strict=True):
             whole = [cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR) for share in shares]
-            found.append(np.argmax(whole, axis=0).astype(np.uint8))
-        return found
+            masks.append(np.argmax(whole, axis=0).astype(np.uint8))
+        return masks
