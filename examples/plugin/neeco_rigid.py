@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
+from neeco.evidence.carving import CarvingSettings
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
-from neeco.methods.space_carving import CarvingSettings
 from neeco.methods.tissue_fit import carve_seeds
 from neeco.scene.canonical import join_bodies, seed_instrument
 from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Posed, state_of
