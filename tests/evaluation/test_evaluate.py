@@ -58,9 +58,7 @@ def test_labels_that_held_out_images_contradict_are_doubtful(world, tmp_path):
     evaluation = evaluated(run)
     numbers = evaluation["given"]["test"]
     assert numbers["mask_iou"] < 0.2
-    assert numbers["estimated_iou"] == pytest.approx(
-        numbers["mask_iou"], abs=0.15
-    )  # so small an image is mostly edges
+    assert numbers["estimated_iou"] == pytest.approx(numbers["mask_iou"], abs=0.15)  # so small an image is mostly edges
     first, second = evaluation["doubts"]
     assert first == "few frames"
     assert second.startswith("test: labels cover")
