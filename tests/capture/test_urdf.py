@@ -128,7 +128,7 @@ def test_without_the_package_the_extra_is_named(file: Path, monkeypatch: pytest.
 def test_xacro_is_not_read_as_if_it_were_processed(unprocessed, tmp_path):
     for name, command in (("tool.urdf.xacro", "tool.urdf.xacro > tool.urdf"), ("t.urdf", "t.urdf > t_processed.urdf")):
         (tmp_path / name).write_text(f'<robot name="tool">{unprocessed}</robot>')
-        with pytest.raises(NeecoError, match=f"{name}: is xacro; run `xacro {command}` and give that$"):
+        with pytest.raises(NeecoError, match=f"{name}: is xacro; run `xacro {command}` and give the result$"):
             read_urdf(tmp_path / name)
 
 

@@ -166,7 +166,7 @@ def test_frames_without_an_image_are_left_out_with_their_count(tmp_path):
         ),
         ({"ftheta_p0": 0.1}, "ftheta_p0: is 0.1; this lens model cannot be undistorted"),
         ({"distortion_params": [0.1, 0.2, 0.3]}, "distortion_params: expected 4, 5, 6 or 8 coefficients"),
-        ({"distortion_params": [0.1, 0, 0, 0], "k1": 0.2}, "k1: is 0.2, and distortion_params.0. is another"),
+        ({"distortion_params": [0.1, 0, 0, 0], "k1": 0.2}, "k1: is 0.2, but distortion_params.0. differs"),
         ({"k1": float("nan")}, "k1: is nan, not a finite number"),
         ({"k1": -5.0}, "folds the image over"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "a fisheye lens has coefficients k1 to k4 alone"),

@@ -276,7 +276,7 @@ def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, monkeypatc
     ("workers", "device", "reported"),
     [
         (3, "cuda", r"--workers: 3 for 2 GPU\(s\); give at most 2"),
-        (2, "cuda:1", "each has a GPU of its own"),
+        (2, "cuda:1", "each uses its own GPU"),
         (2, "cuda", ""),
     ],
 )

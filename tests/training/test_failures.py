@@ -236,7 +236,7 @@ def test_a_run_whose_capture_is_gone_says_where_to_write_its_new_place(capture, 
         assert main(words) == 1
         told = capsys.readouterr().err
         assert told.strip().splitlines() == [told.strip()]
-        assert f"{run / 'config.yaml'}: capture: {capture} no longer exists; put it back, or write there" in told
+        assert f"{run / 'config.yaml'}: capture: {capture} no longer exists; put it back, or write its" in told
     config = run / "config.yaml"
     config.write_text(config.read_text().replace(str(capture), str(moved)))
     assert main(["render", str(run), "--output", str(tmp_path / "drawn"), "--split", "train"]) == 0
