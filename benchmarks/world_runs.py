@@ -33,6 +33,7 @@ ROOT = Path(__file__).resolve().parents[1]
 METHOD = "import neeco.methods.kinematic.deformation as m; "
 SEARCH = "import neeco.methods.kinematic.discovery as m; "
 SESSION = "import neeco.training.session as m; "
+FINISH = "import neeco.methods.kinematic.finish as m; "
 NOTHING = "lambda *_, **__: None"
 
 
@@ -98,6 +99,7 @@ WITHOUT: dict[str, Mechanism] = {
     ),
     "judging-again": Mechanism(f"{METHOD}m.judge_again = {NOTHING}", mistaken),
     "carving-again": Mechanism(f"{METHOD}m.carve_again = {NOTHING}", mistaken),
+    "refuted-dropped": Mechanism(f"{FINISH}m.drop_refuted = lambda session: session.scene.canonical"),
     "wrists-placed": Mechanism(f"{METHOD}m.place_wrists = {NOTHING}", jointed),
     "wrists-again": _option("deformation.refine_wrists=false", jointed),
     "shadow": _option("deformation.shadow=false"),

@@ -82,7 +82,10 @@ def test_of_links_without_anything_visual_all_are_bodies(file: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (('type="prismatic"', 'type="floating"'), "joint 'insertion' is floating; fixed, revolute"),
+        (
+            ('type="prismatic"', 'type="floating"'),
+            "joint 'insertion' is floating; fixed, revolute, .*prismatic are supported",
+        ),
         (('"0 2 0"', '"0 0 0"'), "joint 'pitch': its axis is no direction"),
         (('mimic joint="open"', 'mimic joint="shut"'), "joint 'open_too' mimics 'shut'"),
         (('child link="wrist"', 'child link="hand"'), "joint 'pitch' joins 'hand', which is no link"),

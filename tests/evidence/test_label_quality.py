@@ -27,7 +27,8 @@ def view(label: slice, seed: int, *, dark: bool = False) -> Comparison:
     rendered = np.zeros((HEIGHT, WIDTH))
     rendered[:, label] = 1
     everywhere = np.ones((HEIGHT, WIDTH))
-    return Comparison(shade, residual, residual, everywhere, rendered, everywhere > 0)
+    depth = np.full((HEIGHT, WIDTH), 50.0)
+    return Comparison(shade, residual, residual, everywhere, depth, rendered, everywhere > 0)
 
 
 def iou(label: slice) -> float:

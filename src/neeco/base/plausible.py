@@ -19,9 +19,8 @@ class PlausibleLimits:
     min_focal: float = 0.1  # focal length of any lens, in lengths of the image's longer side
     max_focal: float = 50.0  # the same, at most
     max_anamorphic: float = 2.5  # ratio of the two focal lengths: single fields of interlaced video have 2
-    max_off_middle: float = (
-        0.08  # of the sides, distance of a principal point from the middle by a lens's own tolerances
-    )
+    # of the sides, distance of a principal point from the middle by a lens's own tolerances
+    max_off_middle: float = 0.08
     max_middle_error: float = 0.03  # of the sides, the same once intrinsics of another image size are scaled
     full_turn: float = 2 * math.pi  # rad; a joint without stated limits turns no farther
     max_slide_mm: float = 1000.0  # mm; nor slides farther

@@ -39,6 +39,7 @@ class CarvingLimits:
     seed_spread: float = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
     darkest_shadow: float = 0.66  # of the tissue's sRGB values: 40 % of its light
     min_level: float = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
+    behind: float = 1.02  # of the tissue's depth, from which on a point is behind the tissue
     brightness: float = 0.25  # mean of images, below which the evidence's floor falls as they are darker
     color_frames: int = 20  # the most frames whose images give seeds their colours
     color_slice: float = 0.25  # of the shaft's radius: along it, seeds within have the same colour
@@ -118,7 +119,7 @@ class Evidence:
         inside = (z > 0.01 * self.distance) & (u >= 0) & (u < own_width) & (v >= 0) & (v < own_height)
         column, row = u.nan_to_num().clamp(0, width - 1).long(), v.nan_to_num().clamp(0, height - 1).long()
         place = (torch.arange(len(self.frames), device=self.device)[:, None] * height + row) * width + column
-        inside &= z < 1.02 * self.depths.view(-1)[place]
+        inside &= z < CARVING.behind * self.depths.view(-1)[place]
         return self.hits.view(-1)[place], inside
 
 
@@ -165,7 +166,8 @@ def _exposure(views: TrainingViews, picked: Sequence[int]) -> float:
     means = []
     for index in picked:
         image, mask = views.target(index), views.mask(index)
-        means += [float(image.mean())] if mask is None else [float(image[mask].mean())] if bool(mask.any()) else []
+        counted = image if mask is None else image[mask]
+        means += [float(counted.mean())] if counted.numel() else []
     mean = sum(means) / max(len(means), 1)
     return min(1.0, max(mean, 1 / 255) / CARVING.brightness)
 

@@ -61,13 +61,14 @@ SETTINGS = ForegroundSettings()
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """An image beside a scene's tissue: shade and residual [H, W], the residual of each pixel alone `own` [H, W], the
-    share `covered` of each pixel by what differs from the tissue [H, W], the label [H, W] in [0, 1] as rendered, and
-    which pixels count, bool [H, W]."""
+    share `covered` of each pixel by what differs from the tissue [H, W], the tissue's depth [H, W] mm, infinite where
+    there is none, the label [H, W] in [0, 1] as rendered, and which pixels count, bool [H, W]."""
 
     shade: np.ndarray
     residual: np.ndarray
     own: np.ndarray
     covered: np.ndarray
+    depth: np.ndarray
     label: np.ndarray
     usable: np.ndarray
 
@@ -81,18 +82,24 @@ class Comparison:
         posed, instruments = scene.at(state), scene.canonical.of_instruments
         channels = rasterize(posed, camera, channels=instruments.float()[:, None]).channels
         assert channels is not None
-        tissue = rasterize(posed.select(~instruments), camera).color.clamp(0, 1).cpu().numpy()
+        surface = rasterize(posed.select(~instruments), camera)
+        tissue = surface.color.clamp(0, 1).cpu().numpy()
+        depth = torch.where(surface.alpha < 0.5, torch.inf, surface.depth).cpu().numpy()
         shown, window = image.cpu().numpy(), settings.window_px
         over, under = (uniform_filter((other * tissue).sum(-1), window) for other in (shown, tissue))
         shade = over / np.maximum(under, 1e-6)
         likely = np.clip(shade, *settings.shadow)
         off = np.abs(shown - likely[..., None] * tissue).mean(-1)
         # by both: a shadow may differ more than an instrument does, and a dark instrument is nearly a shade
-        covered = np.minimum(*(_coverage(each, settings) for each in (np.abs(shown - tissue).mean(-1), off)))
+        differences = np.stack([np.abs(shown - tissue).mean(-1), off], -1)
+        around = np.ones((2 * settings.outline_px + 1,) * 2, np.uint8)
+        most = cv2.dilate(uniform_filter(differences, (window, window, 1)), around)
+        covered = (differences / np.maximum(most, 1e-6)).min(-1)
         brightness = settings.dark + uniform_filter(likely * tissue.mean(-1), window)
         label = channels[..., 0].cpu().numpy()
         usable = np.ones(label.shape, bool) if mask is None else mask.cpu().numpy()
-        return Comparison(shade, uniform_filter(off, window) / brightness, off / brightness, covered, label, usable)
+        residual = uniform_filter(off, window) / brightness
+        return Comparison(shade, residual, off / brightness, covered, depth, label, usable)
 
     def near(self, share: float) -> np.ndarray:
         """bool [H, W]: pixels within `share` of the width of where an instrument may be rendered."""
@@ -138,8 +145,7 @@ class Foreground:
         instrument_alone, tissue_alone = self._claims(view.own, view.shade)  # averages reach beyond outlines
         covered = view.covered > self.settings.covered
         instrument = np.where(covered & view.near(near), np.minimum(instrument, instrument_alone), 0)
-        lit = view.shade > self.settings.lit
-        tissue = np.where(~covered & lit, np.maximum(tissue, tissue_alone), tissue)
+        tissue = np.where(~covered & (view.shade > self.settings.lit), np.maximum(tissue, tissue_alone), tissue)
         return np.asarray(np.where(view.usable, instrument - tissue, 0))
 
     def log_ratio(self, residuals: np.ndarray, shades: np.ndarray) -> np.ndarray:
@@ -154,12 +160,6 @@ class Foreground:
             for sign, (least, most) in ((1, self.settings.instrument), (-1, self.settings.tissue))
         )
         return instrument, tissue
-
-
-def _coverage(differences: np.ndarray, settings: ForegroundSettings) -> np.ndarray:
-    """Return differences from the tissue [H, W] as shares of the largest one within `outline_px`."""
-    around = np.ones((2 * settings.outline_px + 1,) * 2, np.uint8)
-    return differences / np.maximum(cv2.dilate(uniform_filter(differences, settings.window_px), around), 1e-6)
 
 
 def _bins(residuals: np.ndarray, shades: np.ndarray, settings: ForegroundSettings) -> tuple[np.ndarray, np.ndarray]:

@@ -285,7 +285,8 @@ def describe_contradictions(refinement: Refinement, names: Sequence[str]) -> str
     for verdict, outcome in outcomes.items():
         judged = sorted(names[index] for index in firsts if refinement.verdict(index) is verdict)
         more = f" and {len(judged) - JUDGE.max_named} more" if len(judged) > JUDGE.max_named else ""
-        parts += [f"{len(judged)} {outcome} ({', '.join(judged[: JUDGE.max_named])}{more})"] if judged else []
+        if judged:
+            parts.append(f"{len(judged)} {outcome} ({', '.join(judged[: JUDGE.max_named])}{more})")
     return f"of {len(firsts)} states, some contradict the others: {'; '.join(parts)}" if parts else ""
 
 

@@ -162,7 +162,6 @@ class PreviewSettings:
     tiles: int = 8
     columns: int = 2
     tile_width: int = 360
-    pair_width: int = 2 * tile_width + 4  # the plain image, and the same with its labels
     gap: int = 14
     caption_line: int = 17
     caption_fonts: tuple[int, int] = (13, 12)  # px
@@ -175,6 +174,11 @@ class PreviewSettings:
     rectangle: tuple[int, int, int] = (255, 209, 70)
     bone: tuple[int, int, int] = (20, 22, 26)
     hidden: tuple[int, int, int] = (150, 150, 150)
+
+    @property
+    def pair_width(self) -> int:
+        """Width of the plain image and the same with its labels."""
+        return 2 * self.tile_width + 4
 
 
 PREVIEW = PreviewSettings()

@@ -42,10 +42,8 @@ class MixingSettings:
 
     depth_scale: float = 0.25  # of the image's size, at which the depth of tissue is looked up
     n_recorded_frames: int = 24  # frames that the mixed scene has as if they had been recorded
-    gain_range: tuple[float, float] = (
-        0.6,
-        1.6,
-    )  # range of the change of colours: beyond that, the shafts differ in make
+    # range of the change of colours: beyond that, the shafts differ in make
+    gain_range: tuple[float, float] = (0.6, 1.6)
     min_shaft_opacity: float = 0.5  # least opacity of Gaussians from which a shaft's colour is estimated
 
 

@@ -19,9 +19,8 @@ class SilhouetteSettings:
     """Weight of the loss."""
 
     weight: float = 0.1  # of the loss, beside the photometric one
-    few: int = (
-        30  # frames, from which on it falls with their number: many frames show for themselves what is instrument
-    )
+    # frames, from which on it falls with their number: many frames show for themselves what is instrument
+    few: int = 30
     min_share: float = 1e-4  # of rendered labels, in logarithms
 
 

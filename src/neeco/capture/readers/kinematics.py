@@ -300,7 +300,7 @@ def _below(first: str, children: Mapping[str, list[Any]], path: Path) -> Iterato
 
 def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body: bool, path: Path) -> Link:
     if joint.type not in TYPES:
-        raise NeecoError(f"{path}: joint {joint.name!r} is {joint.type}; {', '.join(TYPES)}is supported")
+        raise NeecoError(f"{path}: joint {joint.name!r} is {joint.type}; {', '.join(TYPES)} are supported")
     kind, origin = TYPES[joint.type], np.eye(4)
     if joint.origin is not None:
         turn = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0]).as_matrix()

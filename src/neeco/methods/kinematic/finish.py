@@ -12,14 +12,13 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
+from neeco.evidence.carving import CARVING
 from neeco.evidence.foreground import Foreground
 from neeco.evidence.label_quality import QUALITY
-from neeco.geometry.camera import Camera
 from neeco.geometry.projection import in_image, project_world
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments, Articulation
 from neeco.methods.kinematic.wrist import WRIST, color_boundary, solid_extent, solid_gaussians
 from neeco.raster import rasterize
-from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
@@ -38,7 +37,6 @@ class FinishSettings:
     # show either for certain
     refuting_frames: int = 2
     refuting_share: float = 0.25
-    behind: float = 1.02  # of the tissue's depth, behind which a Gaussian is hidden
     # training frames that must observe a position of the shaft for it to be copied: share, and number (half at most)
     min_coverage: float = 0.08
     min_frames: int = 6
@@ -186,31 +184,22 @@ def drop_refuted(session: GaussianSession) -> CanonicalGaussians:
     refuting, confirming = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))  # frames [N]
     for index, view in zip(indices, views, strict=True):
         state, camera = session.corrected(index)
-        posed = session.scene.at(state)
-        shown, pixels = _in_front(posed, canonical.of_instruments, camera)
+        means = session.scene.at(state).means
+        pixels, depths = project_world(means, camera)
+        column, row = pixels.nan_to_num().long().unbind(-1)
+        place = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
+        surface = torch.from_numpy(view.depth).to(depths)
+        shown = canonical.of_instruments & in_image(means, camera) & (depths < CARVING.behind * surface[place])
         if not bool(shown.any()):
             continue
-        distance = float(project_world(posed.means[shown], camera)[1].median())
         deviation = float(refinement.pose_sd[refinement.instants[index], :, 3:].max())
-        margin = 2 * int(deviation * camera.fx / distance) + 1
+        margin = 2 * int(deviation * camera.fx / float(depths[shown].median())) + 1
         certainty = foreground.certainty(view, foreground.settings.reach)
         tissue = cv2.erode((certainty < -QUALITY.certain).astype(np.uint8), np.ones((margin, margin), np.uint8))
         for votes, where in ((refuting, tissue > 0), (confirming, certainty > QUALITY.certain)):
-            votes += shown & torch.from_numpy(where).to(shown.device)[pixels]
+            votes += shown & torch.from_numpy(where).to(shown.device)[place]
     refuted = (refuting >= FINISH.refuting_frames) & (refuting > FINISH.refuting_share * (refuting + confirming))
-    counts = tuple(int((~refuted[canonical.body(body)]).sum()) for body in range(len(canonical.counts)))
-    return canonical.map(lambda tensor: tensor[~refuted], counts)
-
-
-def _in_front(posed: Gaussians, instruments: Tensor, camera: Camera) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """Return which posed Gaussians are the instruments' and not behind the tissue in the image [N], and the rows and
-    columns [N] px of all."""
-    pixels, depths = project_world(posed.means, camera)
-    column, row = pixels.nan_to_num().long().unbind(-1)
-    places = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
-    tissue = rasterize(posed.select(~instruments), camera)
-    before = (depths < FINISH.behind * tissue.depth[places]) | (tissue.alpha[places] < 0.5)
-    return instruments & in_image(posed.means, camera) & before, places
+    return _selected(canonical, ~refuted)
 
 
 def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
@@ -230,8 +219,13 @@ def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
         for own in instruments:
             alone[own] += visible_pixels(posed.select(own), camera)
     stays = (canonical.bodies == 0) | (alone < FINISH.min_pixels_alone) | (visible >= FINISH.min_visible_share * alone)
-    counts = tuple(int(stays[canonical.body(body)].sum()) for body in range(len(canonical.counts)))
-    return canonical.map(lambda tensor: tensor[stays], counts)
+    return _selected(canonical, stays)
+
+
+def _selected(canonical: CanonicalGaussians, chosen: Tensor) -> CanonicalGaussians:
+    """Return the `chosen` [N] bool of the canonical Gaussians."""
+    counts = tuple(int(chosen[canonical.body(body)].sum()) for body in range(len(canonical.counts)))
+    return canonical.map(lambda tensor: tensor[chosen], counts)
 
 
 @torch.no_grad()
