@@ -28,7 +28,7 @@ def view(label: slice, seed: int, *, dark: bool = False) -> Comparison:
     rendered[:, label] = 1
     everywhere = np.ones((HEIGHT, WIDTH))
     depth = np.full((HEIGHT, WIDTH), 50.0)
-    return Comparison(shade, residual, residual, everywhere, depth, rendered, everywhere > 0)
+    return Comparison(shade, residual, residual, everywhere, depth, rendered, usable=everywhere > 0)
 
 
 def iou(label: slice) -> float:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -70,7 +70,7 @@ class Comparison:
     covered: np.ndarray
     depth: np.ndarray
     label: np.ndarray
-    usable: np.ndarray
+    usable: np.ndarray = field(kw_only=True)
 
     @staticmethod
     @torch.no_grad()
@@ -99,7 +99,7 @@ class Comparison:
         label = channels[..., 0].cpu().numpy()
         usable = np.ones(label.shape, bool) if mask is None else mask.cpu().numpy()
         residual = uniform_filter(off, window) / brightness
-        return Comparison(shade, residual, off / brightness, covered, depth, label, usable)
+        return Comparison(shade, residual, off / brightness, covered, depth, label, usable=usable)
 
     def near(self, share: float) -> np.ndarray:
         """bool [H, W]: pixels within `share` of the width of where an instrument may be rendered."""
