@@ -293,7 +293,7 @@ def _evaluated(build: Build, run: Path) -> dict[str, Any]:
     evaluation = read_json(run / "evaluation.json")
     aligned, given = evaluation["aligned"], evaluation["given"]
     keys = ("mask_iou", "mask_precision", "shaft_recall", "part_iou", "psnr", "psnr_instrument", "estimated_iou")
-    scores = {kind: {split: {key: rows[key] for key in keys} for split, rows in splits.items()}
+    scores = {kind: {split: {key: rows.get(key) for key in keys} for split, rows in splits.items()}
               for kind, splits in (("aligned", aligned), ("given", given))}  # fmt: skip
     ious = [rows["mask_iou"] for rows in aligned.values()]
     recalls = [rows["shaft_recall"] for rows in aligned.values() if rows["shaft_recall"] is not None]
