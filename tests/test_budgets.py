@@ -26,7 +26,7 @@ ROOMS = {
     "methods": (5070, 3500),
     "training": (2040, 1700),
     "states": (3370, 2600),
-    "evidence": (910, 1200),
+    "evidence": (940, 1200),
     "scene": (1997, 1800),
     "capture": (4980, 3900),
     "raster": (4060, 3800),

@@ -79,6 +79,18 @@ def test_images_tell_instrument_from_shadow_and_tissue_where_the_scene_is_wrong(
     assert int(middle[:, :33].max()) < 64
 
 
+def test_a_shadow_that_the_scene_takes_for_the_instrument_is_tissue_from_penumbra_to_umbra() -> None:
+    session = session_of(Scene(), noise=0.01)
+    image = session.views.target(0)
+    unshaded = image[:, 70:].mean((0, 1))
+    image[:, 44:70] = unshaded * torch.linspace(0.25, 1, 26)[:, None]  # the label reaches to column 62
+    image[:, 44:70] += 0.01 * torch.randn(SIDE, 26, 3, generator=torch.Generator().manual_seed(1))
+    observe_silhouettes(session)
+    (values,) = session.silhouettes.values
+    assert float((values[20:76, 46:68] < UNKNOWN // 2).float().mean()) > 0.9
+    assert bool((values[20:76, 38:42] == INSTRUMENT).all())
+
+
 def test_what_the_lens_mixes_at_an_outline_is_no_instrument_where_less_than_half_is() -> None:
     session = session_of(Scene())
     sharp = session.views.target(0).numpy()

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import gaussian_filter, gaussian_filter1d, uniform_filter
 from torch import Tensor
 
 from neeco.capture.model import State
@@ -37,6 +37,12 @@ class ForegroundSettings:
     residuals: tuple[float, float, int] = (-6.0, 1.0, 28)  # range of their logarithms, and bins
     shades: tuple[float, float, int] = (0.0, 1.5, 15)  # range, and bins
     smoothing: float = 1.0  # bins, standard deviation
+    # of the counts at the ridge of a shadow: most at the valley behind it, and most where there is none; rows by which
+    # it may lie above the bound of noise; shades without one, within it
+    valley: float = 0.6
+    foot: float = 0.1
+    ridge_rows: int = 2
+    ridge_gap: int = 1
     # share of a uniform density in each: what was not sampled is not impossible; instruments have parts that were not
     unsampled_tissue: float = 0.02
     unsampled_instrument: float = 0.2
@@ -130,7 +136,14 @@ class Foreground:
             return None
         lit = _counts(views, far, settings)
         shaded, bound = _shaded(lit.sum(1) / lit.sum(), settings)
-        instrument = _without_tissue(_counts(views, inside, settings), bound, settings)
+        about = _counts(views, [view.usable & view.near(settings.far) for view in views], settings)
+        within = _counts(views, inside, settings)
+        instrument = within.copy()
+        for column, row in _ridge(about, bound, settings).items():
+            instrument[:row, column], shaded[:, column] = 0, 0
+            shaded[:row, column] = about[:row, column] / max(1, about[:row, column].sum())
+        if instrument.sum() <= within.sum() / 4:  # it looks like tissue
+            instrument = within
         tissue = lit / lit.sum() + shaded / max(shaded.sum(), 1e-9)  # as often in a shadow as not
         of_tissue = np.concatenate([view.residual[mask] for view, mask in zip(views, far, strict=True)])
         noise = float(np.quantile(of_tissue, settings.noise_quantile))
@@ -196,16 +209,33 @@ def _shaded(lit: np.ndarray, settings: ForegroundSettings) -> tuple[np.ndarray, 
     return density, bound
 
 
-def _without_tissue(inside: np.ndarray, bound: np.ndarray, settings: ForegroundSettings) -> np.ndarray:
-    """Return the counts [R, S] inside of rendered instruments less the tissue among them, such as shadows that the
-    scene takes for an instrument. bound [R, S]: density of the tissue's residuals at each shade, at most. Where half of
-    all pixels of a shade lie below its median, or nearly, they are tissue, all that lie within it; unless little would
-    be left: then the instrument looks like tissue."""
-    share = np.cumsum(bound, 0) - bound  # up to each row
-    below = (inside * (share < 0.5)).sum(0)
-    tissue = (bound.sum(0) > 0) & (below > inside.sum(0) / 4)
-    left = np.where(tissue & (share < settings.noise_quantile), 0, inside)
-    return left if left.sum() > inside.sum() / 4 else inside
+def _ridge(about: np.ndarray, bound: np.ndarray, settings: ForegroundSettings) -> dict[int, int]:
+    """Return by shade (column) the row of residuals below which pixels near instruments are tissue in a shadow; {}
+    where no shadow is seen. about [R, S]: counts of these pixels; bound [R, S]: of `_shaded`.
+
+    Shadows darken by degrees: in the counts they are a ridge that begins at lit tissue, as high as noise has it, and a
+    valley parts it from an instrument. It is followed from light to dark, and ends where there is none.
+    """
+    share, smooth = np.cumsum(bound, 0) - bound, gaussian_filter1d(about, settings.smoothing, 0)  # share up to each row
+    rows: dict[int, int] = {}
+    missed = 0
+    for column in np.nonzero(bound.sum(0))[0][::-1].tolist():
+        counts = smooth[:, column]
+        median, most = (
+            (share[:, column] < part).sum() + settings.ridge_rows for part in (0.5, settings.noise_quantile)
+        )
+        peak = row = int(counts[:median].argmax())
+        last = min(int(most), len(counts) - 2)
+        while row < last and counts[row + 1] <= counts[row]:
+            row += 1
+        deep = settings.valley if row < last else settings.foot
+        if peak < row and counts[row] <= deep * counts[peak] and 4 * about[:, column].sum() >= settings.least_pixels:
+            rows[column], missed = row, 0
+        elif (missed := missed + 1) > settings.ridge_gap:
+            break
+    seen = sorted(rows)
+    between = range(seen[0], seen[-1] + 1) if seen else ()
+    return {column: round(float(np.interp(column, seen, [rows[k] for k in seen]))) for column in between}
 
 
 def _density(counts: np.ndarray, unsampled: float, smoothing: float) -> np.ndarray:

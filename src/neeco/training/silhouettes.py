@@ -16,12 +16,13 @@ UNKNOWN, INSTRUMENT = 128, 255  # of stored values; tissue is 0
 
 @dataclass(frozen=True, kw_only=True)
 class SilhouetteSettings:
-    """Weight of the loss."""
+    """Weight of the loss, and what silhouettes are learned from."""
 
     weight: float = 0.1  # of the loss, beside the photometric one
     # frames, from which on it falls with their number: many frames show for themselves what is instrument
     few: int = 30
     min_share: float = 1e-4  # of rendered labels, in logarithms
+    sampled: int = 20  # frames from which densities are learned
 
 
 SILHOUETTES = SilhouetteSettings()

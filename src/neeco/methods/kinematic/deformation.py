@@ -67,10 +67,9 @@ from neeco.states.refinement import Verdict
 from neeco.states.search import SEARCH, StateSearch
 from neeco.training.schedule import Event
 from neeco.training.session import GaussianSession
-from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
+from neeco.training.silhouettes import INSTRUMENT, SILHOUETTES, UNKNOWN, Silhouettes
 
 PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared standard deviations
-N_SAMPLED = 20  # frames from which densities of silhouettes are learned
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +126,7 @@ EVENTS = (
     Event(0.6, "refine_wrists"),
     Event(0.75, "fit_states"),
     Event(0.8, "find_shadow"),
+    Event(0.8, "observe_silhouettes"),  # of details, too: they are learned from full size on
     Event(0.8, "refine_wrists"),
     Event(0.9, "conclude_states"),
     # iterations, not shares: instruments have shape, and no shadow is learned yet as a part of them
@@ -390,7 +390,7 @@ def observe_silhouettes(session: GaussianSession) -> None:
     if not session.scene.instruments:
         return
     count = len(session.views.frames)
-    sampled = {index: session.compared(index) for index in evenly_spaced(count, N_SAMPLED)}
+    sampled = {index: session.compared(index) for index in evenly_spaced(count, SILHOUETTES.sampled)}
     foreground, known = Foreground.learned(list(sampled.values())), session.silhouettes
     if foreground is None or foreground.noise > SETTINGS.max_noise:
         return
