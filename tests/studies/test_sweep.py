@@ -300,9 +300,9 @@ def test_a_wrong_field_of_a_study_is_one_line_with_file_and_field(text, reported
         (["--methods", "4dgz", "--iterations", "5"], "4dgz"),
         (["--methods", "3dgs"], "no length of the runs is given; .*try --minutes 5"),
         (["--methods", "3dgs", "--minutes", "1", "--iterations", "5"], "iterations and minutes are given"),
-        (["--methods", "3dgs", "--minutes", "0"], "--minutes: must be above 0 .got 0.0."),
+        (["--methods", "3dgs", "--minutes", "0"], "--minutes must be above 0 .got 0.0."),
         (["--methods", "3dgs", "--iterations", "5", "--seeds", "0"], "error: --seeds must be at least 1 .got 0."),
-        (["--methods", "3dgs", "--cpu-minutes", "0"], "error: --cpu-minutes: must be above 0 .got 0.0."),
+        (["--methods", "3dgs", "--cpu-minutes", "0"], "error: --cpu-minutes must be above 0 .got 0.0."),
         (
             ["--methods", "3dgs", "--iterations", "5", "--set", "max_tissue_gaussians=-3"],
             "error: --set max_tissue_gaussians: -3 is too small",

@@ -159,5 +159,5 @@ def test_more_images_than_names_have_digits_for_are_refused_at_once(run, tmp_pat
     assert "--count: 9999999999999 is out of range; give 1 to 1,000,000" in capsys.readouterr().err
     words = ["render", str(run.path), "--video", str(tmp_path / "a.mp4"), "--frames", "9999999999999"]
     assert main(words) == 1
-    assert "--frames: must be 2 to 1,000,000 (got 9999999999999)" in capsys.readouterr().err
+    assert "--frames must be 2 to 1,000,000 (got 9999999999999)" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

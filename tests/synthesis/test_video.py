@@ -72,7 +72,7 @@ def test_a_missing_package_is_named(run: FakeRun, tmp_path: Path, monkeypatch: p
         (["--output", "a", "--video", "b.mp4"], "one of the two"),
         (["--video", "film.avi"], "--video: film.avi: wrong file name extension"),
         (["--output", "a", "--frames", "9"], "--frames: applies to --video only"),
-        (["--video", "b.mp4", "--frames", "1"], "--frames: must be 2 to 1,000,000 (got 1)"),
+        (["--video", "b.mp4", "--frames", "1"], "--frames must be 2 to 1,000,000 (got 1)"),
     ],
 )
 def test_what_does_not_go_together_is_refused(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -132,8 +132,8 @@ def test_without_viser_it_says_what_to_install(made_run: Path, monkeypatch: pyte
     ("arguments", "told"),
     [
         (["nowhere"], "nowhere: neither a run folder nor a capture"),
-        (["RUN", "--port", "70000"], "--port: must be 1 to 65535 (got 70000)"),
-        (["RUN", "--export", "x.html", "--sh", "4"], "--sh: must be 0 to 3 (got 4)"),
+        (["RUN", "--port", "70000"], "--port must be 1 to 65535 (got 70000)"),
+        (["RUN", "--export", "x.html", "--sh", "4"], "--sh must be 0 to 3 (got 4)"),
     ],
 )
 def test_what_cannot_be_is_told_in_one_line(arguments: list[str], told: str, made_run: Path, capsys) -> None:

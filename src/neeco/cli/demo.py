@@ -38,7 +38,7 @@ def run(args: Arguments) -> int:
     from neeco.training.run import open_run
 
     if not args.minutes > 0:
-        raise NeecoError(f"--minutes: must be above 0 (got {args.minutes})")
+        raise NeecoError(f"--minutes must be above 0 (got {args.minutes})")
     if args.output.exists() and (not args.output.is_dir() or any(args.output.iterdir())):
         raise NeecoError(f"{args.output}: exists already; give another --output, or remove it")
     device = device_of(args.device)

@@ -61,7 +61,7 @@ def run(arguments: Arguments) -> int:
     elif arguments.frames is not None:
         raise NeecoError("--frames: applies to --video only; leave it out")
     if arguments.frames is not None and not 2 <= arguments.frames <= MAX_IMAGES:
-        raise NeecoError(f"--frames: must be 2 to {MAX_IMAGES:,} (got {arguments.frames})")
+        raise NeecoError(f"--frames must be 2 to {MAX_IMAGES:,} (got {arguments.frames})")
     with open_run(arguments.run, device_of(arguments.device), force=arguments.force) as trained:
         if arguments.states is not None:
             views, folder = state_views(trained.scene, arguments.states), STATES_FOLDER

@@ -229,8 +229,8 @@ def single_length(lengths: Mapping[str, float | None], place: str) -> tuple[str,
         raise NeecoError(f"{what}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
     ((key, value),) = values.items()
     if not 0 < value < math.inf:
-        field = key.replace("_", "-") if place == "--" else key
-        raise NeecoError(f"{place}{field}: must be above 0 (got {value})")
+        field = f"--{key.replace('_', '-')}" if place == "--" else f"{place}{key}:"
+        raise NeecoError(f"{field} must be above 0 (got {value})")
     return key, value
 
 

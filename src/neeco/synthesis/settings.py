@@ -49,7 +49,7 @@ class SizeSettings:
         if self.size is not None and not SIZE.fullmatch(self.size):
             raise NeecoError(f"--size: {self.size!r} is not WIDTHxHEIGHT; give both in px, such as 640x512")
         if self.scale is not None and not (0 < self.scale < math.inf):
-            raise NeecoError(f"--scale: must be a number above 0, such as 2 (got {self.scale})")
+            raise NeecoError(f"--scale must be a number above 0, such as 2 (got {self.scale})")
 
     def of(self, width: int, height: int) -> tuple[int, int]:
         """Width and height, px, of images that were recorded `width` x `height` px large. Raises NeecoError where these
@@ -88,7 +88,7 @@ class ImageSettings(SizeSettings):
         """Raises NeecoError naming the option that makes no sense."""
         super().check()
         if not 1 <= self.quality <= 100:
-            raise NeecoError(f"--quality: must be 1 to 100 (got {self.quality})")
+            raise NeecoError(f"--quality must be 1 to 100 (got {self.quality})")
         if self.image_format == "png" and self.quality != JPEG_QUALITY:
             raise NeecoError("--quality: applies to JPEG only, and images would be PNG; add --image-format jpg")
 

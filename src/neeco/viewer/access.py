@@ -152,7 +152,7 @@ def _page_headers(page: bytes, host: str) -> dict[str, str]:
 def _free_port(host: str, port: int) -> int:
     """`port`, or the next one that is free on `host`. Raises NeecoError for a host or port that cannot be."""
     if not 0 < port < 65536:
-        raise NeecoError(f"--port: must be 1 to 65535 (got {port})")
+        raise NeecoError(f"--port must be 1 to 65535 (got {port})")
     last: Exception = OSError()
     for candidate in range(port, min(port + MAX_PORTS, 65536)):
         try:

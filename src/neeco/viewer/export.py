@@ -68,7 +68,7 @@ def export_page(run: Path, output: Path, sh_degree: int, device: torch.device) -
     method asks a network for every state, and where the file cannot be written.
     """
     if not 0 <= sh_degree <= MAX_DEGREE:
-        raise NeecoError(f"--sh: must be 0 to {MAX_DEGREE} (got {sh_degree})")
+        raise NeecoError(f"--sh must be 0 to {MAX_DEGREE} (got {sh_degree})")
     trained = load_run(run, device)
     page = page_of_run(trained, sh_degree)
     write_text(Path(output), page)
