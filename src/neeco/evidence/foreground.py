@@ -54,7 +54,6 @@ class ForegroundSettings:
     inside_px: int = 2  # from the outline of a rendered instrument: certainly one
     least_pixels: int = 200  # of each kind, below which nothing is said
     noise_quantile: float = 0.98  # of the tissue's residuals: its noise
-    max_noise: float = 0.12  # above which the tissue is not learned well enough to train labels by it
     covered: float = 0.5  # share of a pixel that an instrument covers, from which on it may be one, or else tissue
     lit: float = 0.6  # shade of a pixel that is tissue by itself: a darker one may be mixed with a black instrument
     outline_px: int = 2  # about a pixel, within which the largest difference from the tissue is one wholly covered

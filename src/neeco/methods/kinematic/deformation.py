@@ -386,15 +386,13 @@ def articulation_of(instrument: Instrument) -> Articulation:
 @torch.no_grad()
 def observe_silhouettes(session: GaussianSession) -> None:
     """Set the session's silhouettes from its scene as learned so far, where its tissue explains the images better than
-    when they were last observed, and well enough to tell anything."""
+    when they were last observed."""
     if not session.scene.instruments:
         return
     count = len(session.views.frames)
     sampled = {index: session.compared(index) for index in evenly_spaced(count, SILHOUETTES.sampled)}
     foreground, known = Foreground.learned(list(sampled.values())), session.silhouettes
-    if foreground is None or foreground.noise > SETTINGS.max_noise:
-        return
-    if known is not None and foreground.noise >= known.noise:
+    if foreground is None or (known is not None and foreground.noise >= known.noise):
         return
     values = []
     for index in range(count):

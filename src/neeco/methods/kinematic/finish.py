@@ -179,7 +179,7 @@ def drop_refuted(session: GaussianSession) -> CanonicalGaussians:
     indices = [k for k in session.frames_along_poses(FINISH.max_occlusion_frames) if refinement.counts(k)]
     views = [session.compared(index) for index in indices]
     foreground = Foreground.learned(views)
-    if foreground is None or foreground.noise > foreground.settings.max_noise:
+    if foreground is None:
         return canonical
     refuting, confirming = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))  # frames [N]
     for index, view in zip(indices, views, strict=True):
