@@ -126,7 +126,6 @@ EVENTS = (
     Event(0.6, "refine_wrists"),
     Event(0.75, "fit_states"),
     Event(0.8, "find_shadow"),
-    Event(0.8, "observe_silhouettes"),  # of details, too: they are learned from full size on
     Event(0.8, "refine_wrists"),
     Event(0.9, "conclude_states"),
     # iterations, not shares: instruments have shape, and no shadow is learned yet as a part of them
