@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import evenly_spaced
-from neeco.ingest.readers.logs import PoseLog, ReadingLog
+from neeco.ingest.readers.logs import PoseLog, ReadingLog, SampleLog
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ def reading_smoothing(log: ReadingLog) -> float:
 class _Series:
     """Samples [T, D] of a log, in stretches without gaps: vectors, or what else has differences (`relative`)."""
 
-    def __init__(self, log: PoseLog | ReadingLog, values: np.ndarray) -> None:
+    def __init__(self, log: SampleLog, values: np.ndarray) -> None:
         self.times, self.values = log.times, values
         starts = np.searchsorted(self.times, [end for _, end in log.gaps])
         stretch = np.zeros(len(self.times), dtype=np.int64)

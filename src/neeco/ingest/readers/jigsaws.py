@@ -16,7 +16,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
-from neeco.ingest.readers import POSES, RecordingFormat, Stream, Table, choose_stream, file_state, parse_number
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, file_state, parse_number
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.delimited import read_cells
 from neeco.ingest.readers.frame_names import NamedFrame
@@ -45,7 +45,7 @@ class JigsawsKinematics(RecordingFormat):
         count = len(_lines(path, file_state(path))[0])
         return tuple(
             Stream(
-                arm, POSES, "tool tip in the arm's base", count, RATE_HZ, offered=arm.startswith("slave"),
+                arm, Kind.POSES, "tool tip in the arm's base", count, RATE_HZ, offered=arm.startswith("slave"),
                 body=arm.replace(" ", "_"), joints=(("gripper_angle", GRIPPER),), clock=VIDEO_CLOCK,
                 hints=("poses are stated in the frame of this arm's own base",),
             )
@@ -53,7 +53,7 @@ class JigsawsKinematics(RecordingFormat):
         )  # fmt: skip
 
     def read(self, path: Path, stream: str | None = None) -> Table:
-        arm = choose_stream(path, self.streams(path), stream, (POSES,)).name
+        arm = self.choose(path, stream, Kind.POSES).name
         values, lines = _lines(path, file_state(path))
         bad = np.isnan(values).any(axis=1)
         if bad.any():

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from io import BytesIO
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +26,14 @@ from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
 from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import (
-    IMAGES,
-    OTHER,
-    POSES,
-    READINGS,
+    Kind,
     RecordingFormat,
     Stream,
     Table,
     VideoSource,
-    choose_stream,
+    camera_order,
     compare_counts,
+    naming_damage,
 )
 from neeco.ingest.readers.columns import (
     QUATERNION_WXYZ,
@@ -78,14 +77,31 @@ class LeRobot(RecordingFormat):
     def streams(self, path: Path) -> tuple[Stream, ...]:
         """Return those of the first episode that was downloaded; all others have the same."""
         data = self._data_set(path)
-        streams = self._episode_streams(data, data.first_present())
+        episode, images, tables = data.first_present(), list[Stream](), list[Stream]()
+        there = {*data.films, *parquet_names(episode.data, self.limits)}
+        for key, feature in data.features.items():
+            kind, title = _kind(feature), f"{feature.dtype} of {'x'.join(map(str, feature.shape))}"
+            stream = Stream(f"episode {episode.number}/{key}", kind, title, episode.length, data.fps)
+            if kind != Kind.OTHER and (key in episode.absent or key not in there):
+                missing = f"{episode.data}: has no column {printable(key)}; download the data set again"
+                tables.append(replace(stream, problem=episode.absent.get(key, missing)))
+            elif kind == Kind.IMAGES:
+                images.append(stream)
+            elif kind == Kind.READINGS:
+                try:
+                    tables += self._bodies(data, episode, feature, stream)
+                except NeecoError as error:
+                    tables.append(replace(stream, problem=str(error)))
+            elif key not in FIXED:
+                tables.append(stream)
+        images.sort(key=lambda stream: camera_order(stream.name))
         if len(data.records) > 1:
-            streams = (*streams, Stream(data.range_words, OTHER, "episodes with the same streams", len(data.records)))
-        return streams
+            tables.append(Stream(data.range_words, Kind.OTHER, "episodes with the same streams", len(data.records)))
+        return (*images, *tables)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         data = self._data_set(path)
-        episode, key = self._chosen(data, stream, (POSES, READINGS))
+        episode, key = self._chosen(data, stream, Kind.POSES, Kind.READINGS)
         names, name = data.features[key].names, f"episode {episode.number}/{key}"
         times, order, _, notes = _times(data, episode)
         rows = np.column_stack([times, data.columns(episode, {key: len(names)})[key][order]])
@@ -96,7 +112,7 @@ class LeRobot(RecordingFormat):
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         data = self._data_set(path)
-        episode, key = self._chosen(data, stream, (IMAGES,))
+        episode, key = self._chosen(data, stream, Kind.IMAGES)
         times, order, places, notes = _times(data, episode)
         if data.features[key].dtype == "image":
             stored = _Stored(
@@ -143,7 +159,7 @@ class LeRobot(RecordingFormat):
         self.require_package(path)
         return read_data_set(path, self.limits)
 
-    def _chosen(self, data: DataSet, stream: str | None, kinds: Sequence[str]) -> tuple[Episode, str]:
+    def _chosen(self, data: DataSet, stream: str | None, *kinds: Kind) -> tuple[Episode, str]:
         """Return the episode and the feature that a stream names; the only ones there are where none is named."""
         match = None if stream is None else _NAME.fullmatch(stream)
         number = int(match[1]) if match else min(data.records)
@@ -153,37 +169,12 @@ class LeRobot(RecordingFormat):
             examples = ", ".join(candidate.name for candidate in named if candidate.kind in kinds)[:300]
             what = f"missing, and there are {data.range_words}; name one, as in {examples}"
             raise NeecoError(f"{data.path}: stream: {what}")
-        key = choose_stream(data.path, named, wanted, kinds).name.partition("/")[2]
+        key = self.choose(data.path, wanted, *kinds, streams=named).name.partition("/")[2]
         return data.episode(number), key
 
-    def _episode_streams(self, data: DataSet, episode: Episode) -> tuple[Stream, ...]:
-        streams = []
-        absent = dict(episode.absent)
-        for key in set(data.features) - set(data.films) - set(parquet_names(episode.data, self.limits)):
-            absent[key] = f"{episode.data}: has no column {printable(key)}; download the data set again"
-        for key in sorted(data.features, key=_camera_order):
-            feature, name = data.features[key], f"episode {episode.number}/{key}"
-            if _kind(feature) == IMAGES:
-                title = f"{feature.dtype} {'x'.join(map(str, feature.shape))}"
-                streams.append(Stream(name, IMAGES, title, episode.length, data.fps, problem=absent.get(key)))
-        for key, feature in data.features.items():
-            name, kind = f"episode {episode.number}/{key}", _kind(feature)
-            if kind == READINGS:
-                try:
-                    if key in absent:
-                        raise NeecoError(absent[key])
-                    streams += self._table_streams(data, feature, name, episode)
-                except NeecoError as error:
-                    title = f"{feature.dtype} of {len(feature.names)}"
-                    streams.append(Stream(name, READINGS, title, episode.length, data.fps, problem=str(error)))
-            elif kind == OTHER and key not in FIXED:
-                streams.append(Stream(name, OTHER, f"{feature.dtype} {list(feature.shape)}", episode.length, data.fps))
-        return tuple(streams)
-
-    def _table_streams(self, data: DataSet, feature: Feature, name: str, episode: Episode) -> list[Stream]:
+    def _bodies(self, data: DataSet, episode: Episode, feature: Feature, stream: Stream) -> list[Stream]:
         """Return a stream for every body that the names of a feature's columns distinguish."""
-        title = f"{feature.dtype} of {len(feature.names)}"
-        plain = Stream(name, READINGS, title, episode.length, data.fps, offered=False)
+        plain = replace(stream, offered=False)
         if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
             return [plain]
         bodies = pose_bodies(feature.names)
@@ -198,13 +189,13 @@ class LeRobot(RecordingFormat):
             meaning = _meaning(feature.key, columns)
             streams.append(
                 replace(
-                    plain, kind=POSES, offered=True, body=body or UNNAMED, columns=columns, hints=meaning.hints,
+                    plain, kind=Kind.POSES, offered=True, body=body or UNNAMED, columns=columns, hints=meaning.hints,
                     joints=tuple((_joint_name(name, body), name) for name in of_body), asks=(*meaning.asks, *asks),
                 )
             )  # fmt: skip
         if not streams and (asks := _rotation_asks(data, episode, feature, feature.names)):
             meaning = _meaning(feature.key, feature.names)
-            asked = replace(plain, kind=POSES, offered=True, body=UNNAMED, joints=(), columns=())
+            asked = replace(plain, kind=Kind.POSES, offered=True, body=UNNAMED, joints=(), columns=())
             streams = [replace(asked, hints=meaning.hints, asks=(*meaning.asks, *asks))]
         return streams or [plain]
 
@@ -220,14 +211,11 @@ class _Stored(VideoSource):
     rows: tuple[int, ...]
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        wanted = {self.rows[int(index)]: int(index) for index in indices}
-        row = 0
+        wanted, rows = {self.rows[int(index)]: int(index) for index in indices}, count()
         with ThreadPoolExecutor(DECODERS) as pool:  # zlib lets other threads run
             for cells in self._cells():
-                chosen = [number for number in range(row, row + len(cells)) if number in wanted]
-                contents = [cells[number - row] for number in chosen]
-                row += len(cells)
-                for number, pixels in zip(chosen, pool.map(self._decoded, chosen, contents), strict=True):
+                chosen = {row: cell for cell, row in zip(cells, rows, strict=False) if row in wanted}
+                for number, pixels in zip(chosen, pool.map(self._decoded, chosen, chosen.values()), strict=True):
                     yield wanted.pop(number), pixels
                 if not wanted:
                     return
@@ -251,15 +239,8 @@ class _Stored(VideoSource):
         where = f"{self.path}: {self.key}: row {row} of episode {self.episode}"
         if cell is None:
             raise NeecoError(f"{where}: has no image in it; write the data set with its images")
-        try:
-            with Image.open(BytesIO(cell), formats=FORMATS) as image:
-                if image.size[0] * image.size[1] > self.limits.pixels:
-                    raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
-                pixels = np.array(image.convert("RGB"))
-        except NeecoError:
-            raise
-        except Exception as error:  # Pillow's decoders raise nearly anything
-            raise NeecoError(f"{where}: cannot be decoded; download the episode again") from error
+        with naming_damage(where, "cannot be decoded", "download the episode again"):
+            pixels = np.array(Image.open(BytesIO(cell), formats=FORMATS).convert("RGB"))
         if self.size not in ((0, 0), pixels.shape[1::-1]):
             height, width = pixels.shape[:2]
             raise NeecoError(f"{where}: is {width}x{height}, the first {self.size[0]}x{self.size[1]}; repair it")
@@ -287,10 +268,10 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.
     return stamps - stamps[0], order, rows, (f"{title} name no images; state i is taken to be of image i",)
 
 
-def _kind(feature: Feature) -> str:
+def _kind(feature: Feature) -> Kind:
     if feature.dtype in ("video", "image") and not feature.is_depth:
-        return IMAGES
-    return READINGS if feature.names and feature.key not in FIXED else OTHER
+        return Kind.IMAGES
+    return Kind.READINGS if feature.names and feature.key not in FIXED else Kind.OTHER
 
 
 def _meaning(key: str, columns: Sequence[str]) -> NamedFrame:
@@ -341,9 +322,3 @@ def _joint_name(column: str, body: str) -> str:
     """Return `jaw` of `psm1_jaw`, without the unit."""
     words = [word for word in re.split(r"[_.\-/]+", split_unit(column, "angle")[0]) if word and word != body]
     return "_".join(words) or column
-
-
-def _camera_order(key: str) -> tuple[bool, bool, bool, str]:
-    """Return a sort key: endoscopes before cameras at the wrist, the left one first, the right one last."""
-    name = key.lower()
-    return "wrist" in name or "psm" in name, "right" in name, "left" not in name, key

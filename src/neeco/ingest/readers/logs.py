@@ -44,40 +44,38 @@ SETTINGS = LogSettings()
 
 
 @dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
-class PoseLog:
-    """Poses tracker_from_sensor over time, on the log's own clock: t_log = t_video + offset.
-
-    times [T] s, increasing; positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; gaps: (last time before,
-    first time after) where samples are missing; notes: what was dropped or repaired, in words; frame: what the poses
-    are stated in, CAMERA (OpenCV's axes) or BASE; stated_in: what the file calls it, None where it does not, or the
-    recording says; image_hz: as in `Table`.
-    """
+class SampleLog:
+    """Samples over time, on the log's own clock: t_log = t_video + offset. times [T] s, increasing; gaps: (last time
+    before, first time after) where samples are missing; notes: what was dropped or repaired, in words; image_hz: as in
+    `Table`."""
 
     path: Path
     clock: str
     times: np.ndarray
+    _: KW_ONLY
+    gaps: tuple[tuple[float, float], ...] = ()
+    notes: tuple[str, ...] = ()
+    image_hz: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PoseLog(SampleLog):
+    """Poses tracker_from_sensor: positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; frame: what they are
+    stated in, CAMERA (OpenCV's axes) or BASE; stated_in: what the file calls it, None where it does not, or the
+    recording says."""
+
     positions: np.ndarray
     quats: np.ndarray
     _: KW_ONLY
-    gaps: tuple[tuple[float, float], ...] = ()
-    notes: tuple[str, ...] = ()
     frame: str = named.BASE
     stated_in: str | None = None
-    image_hz: float | None = None
 
 
-@dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
-class ReadingLog:
-    """Readings of a joint, rad, over time; fields as in PoseLog."""
+@dataclass(frozen=True, eq=False)
+class ReadingLog(SampleLog):
+    """Readings of a joint: values [T] rad."""
 
-    path: Path
-    clock: str
-    times: np.ndarray
     values: np.ndarray
-    _: KW_ONLY
-    gaps: tuple[tuple[float, float], ...] = ()
-    notes: tuple[str, ...] = ()
-    image_hz: float | None = None
 
 
 def read_pose_log(source: PoseColumns) -> PoseLog:

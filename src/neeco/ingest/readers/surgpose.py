@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +21,7 @@ from neeco.base.files import FastYamlLoader, parse_yaml, read_text, visible_entr
 from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.stereo import read_stereo
-from neeco.ingest.readers import (
-    IMAGES,
-    OTHER,
-    POSES,
-    READINGS,
-    RecordingFormat,
-    Stream,
-    Table,
-    VideoSource,
-    choose_stream,
-    compare_lengths,
-    file_state,
-)
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_lengths, file_state
 from neeco.ingest.readers.rosbag import DVRK_HINT
 from neeco.ingest.readers.rows import SETTINGS as ROWS
 from neeco.ingest.readers.video import open_images, open_video
@@ -67,34 +55,34 @@ class SurgPose(RecordingFormat):
     def streams(self, path: Path) -> tuple[Stream, ...]:
         arms = _read(path)
         count = max(len(frames) for frames, _ in arms.poses.values())
+        stream = partial(Stream, rate_hz=FRAMES_PER_SECOND)
         # the left camera's are the frames; others are listed
         streams = [
-            Stream(name, IMAGES, "video", count, FRAMES_PER_SECOND, offered=number == 0)
-            for number, name in enumerate(_videos(path))
+            stream(name, Kind.IMAGES, "video", count, offered=number == 0) for number, name in enumerate(_videos(path))
         ]
         for name, (frames, _) in sorted(arms.poses.items()):
-            streams.append(Stream(name, POSES, "poses", len(frames), FRAMES_PER_SECOND, body=name, hints=(DVRK_HINT,)))
+            streams.append(stream(name, Kind.POSES, "poses", len(frames), body=name, hints=(DVRK_HINT,)))
         for name, (frames, values) in sorted(arms.joints.items()):
             wrist = tuple(joint for joint in WRIST if joint[1] in JOINT_NAMES[: values.shape[1]])
             title = f"{name}{JOINTS_BEHIND}"
-            streams.append(Stream(title, READINGS, "joints", len(frames), FRAMES_PER_SECOND, body=name, joints=wrist))
+            streams.append(stream(title, Kind.READINGS, "joints", len(frames), body=name, joints=wrist))
         labels = sorted(file.name for file in path.glob("keypoints_*.yaml"))
-        return (*streams, *(Stream(name, OTHER, "labels", count) for name in labels))
+        return (*streams, *(Stream(name, Kind.OTHER, "labels", count) for name in labels))
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         arms = _read(path)
-        chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS))
-        if chosen.kind == POSES:
+        chosen = self.choose(path, stream, Kind.POSES, Kind.READINGS)
+        if chosen.kind == Kind.POSES:
             (frames, values), header = arms.poses[chosen.name], POSE_HEADER
         else:
             frames, values = arms.joints[chosen.name.removesuffix(JOINTS_BEHIND)]
             header = ("t_s", *JOINT_NAMES[: values.shape[1]])
         rows = np.column_stack([frames / FRAMES_PER_SECOND, values])
-        stated_in = f"{chosen.name}_base" if chosen.kind == POSES else None
+        stated_in = f"{chosen.name}_base" if chosen.kind == Kind.POSES else None
         return Table(path, header, rows, frames, stream=chosen.name, record="frame", stated_in=stated_in)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
-        name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        name = self.choose(path, stream, Kind.IMAGES).name
         file = path / name
         video = open_images(file, FRAMES_PER_SECOND) if file.is_dir() else open_video(file)
         states = max(int(frames[-1]) + 1 for frames, _ in _read(path).poses.values())
@@ -102,7 +90,7 @@ class SurgPose(RecordingFormat):
         return replace(video, notes=(*video.notes, *notes))
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
-        name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        name = self.choose(path, stream, Kind.IMAGES).name
         lenses = self.stereo(path, None, None)
         return None if lenses is None else lenses[:2]["right" in Path(name).name]
 
