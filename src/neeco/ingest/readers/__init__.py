@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import importlib.util
 from abc import ABC
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from enum import StrEnum
-from functools import cache
+from functools import cache, lru_cache, wraps
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 
@@ -32,6 +32,7 @@ HUGE = 1e20
 MAX_LISTED = 3  # lines named in a message
 MAX_UNLIKE = 0.1  # share by which a video may differ in length from the states of its images
 DELIMITED = (".csv", ".tsv", ".txt")
+_Read = TypeVar("_Read", bound=Callable[..., Any])
 ENTRY_POINTS = "neeco.readers"  # the group in which installed packages name their formats
 
 
@@ -251,6 +252,13 @@ def file_state(*files: Path) -> tuple[tuple[str, int, int], ...]:
         raise NeecoError(f"{error.filename}: cannot read: {error.strerror or error}; correct the path") from None
 
 
+def kept(read: _Read) -> _Read:
+    """Keep what a function reads of a file, its first argument, until that changes. Raises NeecoError where it is not
+    there."""
+    read_once = lru_cache(maxsize=4)(lambda state, *given: read(*given))
+    return cast(_Read, wraps(read)(lambda path, *more: read_once(file_state(path), path, *more)))
+
+
 def reason_of(error: BaseException) -> str:
     """What a library says of a damaged file, in a few words of one line."""
     text = visible(str(getattr(error, "strerror", None) or error)).strip(" .")
@@ -258,7 +266,7 @@ def reason_of(error: BaseException) -> str:
 
 
 @contextmanager
-def naming_damage(where: Path | str, problem: str, remedy: str) -> Iterator[None]:
+def one_line(where: Path | str, problem: str, remedy: str) -> Iterator[None]:
     """Turn what libraries raise of damaged files, which is nearly anything, into a NeecoError with their reason."""
     try:
         yield
@@ -266,14 +274,6 @@ def naming_damage(where: Path | str, problem: str, remedy: str) -> Iterator[None
         raise
     except Exception as error:
         raise NeecoError(f"{where}: {problem} ({reason_of(error)}); {remedy}") from error
-
-
-def camera_order(name: str) -> tuple[bool | str, ...]:
-    """Return a sort key of cameras by name: those at a wrist last; the left one first, the right one last; raw images
-    before compressed ones."""
-    lower = name.lower()
-    at_wrist = "wrist" in lower or "psm" in lower
-    return at_wrist, "right" in lower, "left" not in lower, lower.endswith("/compressed"), name
 
 
 def compare_counts(

@@ -12,7 +12,7 @@ import re
 import sys
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cache, lru_cache, partial
@@ -37,7 +37,7 @@ from neeco.base.files import require_content, visible_entries
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
-from neeco.ingest.readers import Kind, Stream, Table, VideoSource, naming_damage, rate_of
+from neeco.ingest.readers import Kind, Stream, Table, VideoSource, one_line, rate_of
 from neeco.ingest.readers.rows import restarts
 
 if sys.version_info >= (3, 14):
@@ -236,7 +236,7 @@ def _check_size(size: int, max_bytes: int) -> None:
 def _naming_damage(path: Path) -> AbstractContextManager[None]:
     repair = _REPAIRS.get("" if path.is_dir() else path.suffix.lower())
     remedy = f"repair it with {repair}, or copy it again" if repair else "copy it again"
-    return naming_damage(path, "is cut short or damaged, or no bag", remedy)
+    return one_line(path, "is cut short or damaged, or no bag", remedy)
 
 
 @dataclass
@@ -271,22 +271,16 @@ class Samples:
         except _UnusableError as error:
             self.bad[str(error)] += 1
             return
-        count = len(self.stamps)
-        for name, value in values:
-            column = self.columns.get(name)
-            if column is None:
-                if self.type == JOINTS and len(self.columns) >= self.limits.joints:
-                    continue
-                column = self.columns[name] = array("d")
-            if len(column) < count:
-                column.extend([np.nan] * (count - len(column)))
-            if len(column) == count:  # of a joint named twice, the first
-                column.append(value)
+        for name in values:
+            if name not in self.columns and (self.type != JOINTS or len(self.columns) < self.limits.joints):
+                self.columns[name] = array("d", [np.nan]) * len(self.stamps)
+        for name, column in self.columns.items():
+            column.append(values.get(name, np.nan))
         self.stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
         self.received.append(received)
         self.frames.add(plain(message.header.frame_id).lstrip("/"))
 
-    def _values(self, message: Any) -> Iterable[tuple[str, float]]:
+    def _values(self, message: Any) -> dict[str, float]:
         """Return numbers by column; of images none. Raises _UnusableError."""
         if message is None:
             raise _UnusableError("is damaged")
@@ -297,25 +291,26 @@ class Samples:
                 raise _UnusableError(f"has {size[0]}x{size[1]} pixels")
             self.sizes[size] = self.encodings[encoding] = None
             self.numbers.append(len(self.arrived) - 1)
-            return ()
+            return {}
         if self.type == JOINTS:
             values = message.position.tolist()
             names = [plain(name) for name in message.name] or [f"joint_{n + 1}" for n in range(len(values))]
             if len(names) != len(values):
                 raise _UnusableError("is damaged")
-            return zip(names, values, strict=True)
+            numbers: dict[str, float] = {}
+            for name, value in zip(names, values, strict=True):
+                numbers.setdefault(name, value)  # of a joint named twice, the first
+            return numbers
         if hasattr(message, "pose"):
             place, turn = message.pose.position, message.pose.orientation
         else:
             place, turn = message.transform.translation, message.transform.rotation
-        return zip(POSE_COLUMNS, (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w), strict=True)
+        pose = place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
+        return dict(zip(POSE_COLUMNS, pose, strict=True))
 
     def table(self) -> np.ndarray:
         """[N, C]"""
-        values = np.full((len(self.stamps), len(self.columns)), np.nan)
-        for index, column in enumerate(self.columns.values()):
-            values[: len(column), index] = column
-        return values
+        return np.array([*self.columns.values()]).reshape(len(self.columns), len(self.stamps)).T
 
     @property
     def problem(self) -> str | None:
@@ -486,7 +481,7 @@ class BagImages(VideoSource):
                 for number, (_, _, message) in zip(passed, messages, strict=False):
                     if number in numbers:
                         where = f"{self.path}: {self.topic}: message {number + 1}"
-                        with naming_damage(where, "cannot be decoded", "cut it out with `rosbag filter`"):
+                        with one_line(where, "cannot be decoded", "cut it out with `rosbag filter`"):
                             pixels = decode(message)
                         yield numbers.pop(number), pixels
                 if numbers:

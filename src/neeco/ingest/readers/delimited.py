@@ -19,7 +19,7 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes
 from neeco.capture.documents import printable
-from neeco.ingest.readers import DELIMITED, MISSING, Body, RecordingFormat, Table, naming_damage, parse_number
+from neeco.ingest.readers import DELIMITED, MISSING, Body, RecordingFormat, Table, one_line, parse_number
 from neeco.ingest.readers.columns import UNITS, PoseColumns, canonical_unit
 
 EXPECTED = "CSV with a header line"
@@ -106,7 +106,7 @@ def read_cells(path: Path) -> Cells:
     if len(columns) * len(lines) > LIMITS.padding * int(counts.sum()) + 10**6:
         raise NeecoError(f"{path}: most lines are much shorter than the longest one; expected the rows of one table")
     is_open = any(line.count('"') % 2 for line in lines)  # a quote left open must not swallow the rest of the file
-    with naming_damage(path, "not readable as CSV", "repair it"):
+    with one_line(path, "not readable as CSV", "repair it"):
         frame = pandas.read_csv(
             StringIO("\n".join(lines)), sep=r"\s+" if sign == " " else sign, header=None, names=columns,
             index_col=False, dtype=str, na_filter=False, skip_blank_lines=False, low_memory=False,

@@ -18,19 +18,9 @@ from neeco.base.files import read_json, visible_entries
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import open_image
-from neeco.ingest.readers import (
-    Kind,
-    RecordingFormat,
-    Stream,
-    Table,
-    VideoSource,
-    camera_order,
-    compare_counts,
-    numbers,
-    rate_of,
-)
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, numbers, rate_of
 from neeco.ingest.readers.delimited import DelimitedText, unique_names
-from neeco.ingest.readers.frame_names import meaning_of
+from neeco.ingest.readers.frame_names import camera_order, meaning_of
 from neeco.ingest.readers.rosbag import DVRK_HINT, POSE_HEADER, RosBag, joint_column, wrist_joints
 from neeco.ingest.readers.video import ChosenFrames, ImageFiles, open_video
 
@@ -244,7 +234,7 @@ def _topic_of(file: Path) -> str | None:
     return "/" + line.removeprefix(TOPIC).strip() if line.startswith(TOPIC) else None
 
 
-def _topic(file: Path) -> tuple[str, list[str], Table]:
+def _topic(file: Path) -> tuple[Kind, list[str], Table]:
     """Kind.POSES, Kind.READINGS or Kind.OTHER, the columns that hold them, and the table of a topic's CSV file."""
     table = DelimitedText().read(file)
     for position, rotation in _POSE_PARTS:

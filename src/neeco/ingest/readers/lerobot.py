@@ -7,6 +7,7 @@ a quaternion or the frame that poses are stated in; where the columns' names do 
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -25,16 +26,7 @@ from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
 from neeco.geometry.rotations import rotation_error
-from neeco.ingest.readers import (
-    Kind,
-    RecordingFormat,
-    Stream,
-    Table,
-    VideoSource,
-    camera_order,
-    compare_counts,
-    naming_damage,
-)
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, one_line
 from neeco.ingest.readers.columns import (
     QUATERNION_WXYZ,
     ROTATION_MATRIX,
@@ -43,7 +35,7 @@ from neeco.ingest.readers.columns import (
     recognise_pose,
     split_unit,
 )
-from neeco.ingest.readers.frame_names import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
+from neeco.ingest.readers.frame_names import NamedFrame, camera_order, meaning_in, of_dvrk, unsaid, without_frame
 from neeco.ingest.readers.lerobot_files import (
     FIXED,
     DataSet,
@@ -148,8 +140,8 @@ class LeRobot(RecordingFormat):
         )  # fmt: skip
 
     def clock(self, path: Path, stream: str | None) -> str:
-        match = None if stream is None else _NAME.fullmatch(stream)
-        return "" if match is None else f"episode {int(match[1])}"
+        match = _NAME.fullmatch(stream or "")
+        return f"episode {int(match[1])}" if match else ""
 
     def of_episode(self, stream: str, episode: int) -> str | None:
         match = _NAME.fullmatch(stream)
@@ -161,7 +153,7 @@ class LeRobot(RecordingFormat):
 
     def _chosen(self, data: DataSet, stream: str | None, *kinds: Kind) -> tuple[Episode, str]:
         """Return the episode and the feature that a stream names; the only ones there are where none is named."""
-        match = None if stream is None else _NAME.fullmatch(stream)
+        match = _NAME.fullmatch(stream or "")
         number = int(match[1]) if match else min(data.records)
         wanted = f"episode {number}/{match[2]}" if match else stream
         named = [Stream(f"episode {number}/{key}", _kind(each), each.dtype, 0) for key, each in data.features.items()]
@@ -228,18 +220,16 @@ class _Stored(VideoSource):
         columns = ["episode_index", self.key]
         for part in batches(self.path, columns, self.limits, self.episode, self.limits.images_at_once):
             column = part.column(self.key)
-            if pyarrow.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0:
-                column = column.field("bytes")
-            if not (pyarrow.types.is_binary(column.type) or pyarrow.types.is_large_binary(column.type)):
-                kind = printable(str(column.type))
-                raise NeecoError(f"{self.path}: {self.key}: holds {kind}, no images; name another feature")
-            yield column.to_pylist()
+            with one_line(f"{self.path}: {self.key}", "holds no images", "name another feature"):
+                column = column.field("bytes") if pyarrow.types.is_struct(column.type) else column
+                cells = column.cast(pyarrow.large_binary()).to_pylist()
+            yield cells
 
     def _decoded(self, row: int, cell: bytes | None) -> np.ndarray:
         where = f"{self.path}: {self.key}: row {row} of episode {self.episode}"
         if cell is None:
             raise NeecoError(f"{where}: has no image in it; write the data set with its images")
-        with naming_damage(where, "cannot be decoded", "download the episode again"):
+        with one_line(where, "cannot be decoded", "download the episode again"):
             pixels = np.array(Image.open(BytesIO(cell), formats=FORMATS).convert("RGB"))
         if self.size not in ((0, 0), pixels.shape[1::-1]):
             height, width = pixels.shape[:2]
@@ -309,13 +299,9 @@ def _rotation_asks(data: DataSet, episode: Episode, feature: Feature, columns: S
         if kind == ROTATION_MATRIX:
             size, why = 9, "or column by column: list them so that they stand row by row"
         if place >= 3:
-            asks.append(f"  position: {_flow(columns[place - 3 : place])}   # stands before the rotation")
-        asks.append(f"  {kind}: {_flow(columns[place : place + size])}   # {why}")
+            asks.append(f"  position: {json.dumps(columns[place - 3 : place])}   # stands before the rotation")
+        asks.append(f"  {kind}: {json.dumps(columns[place : place + size])}   # {why}")
     return tuple(asks)
-
-
-def _flow(columns: Sequence[str]) -> str:
-    return "[" + ", ".join(f'"{column}"' for column in columns) + "]"
 
 
 def _joint_name(column: str, body: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_json, read_text, require_content, require_inside, visible_entries
 from neeco.capture.documents import as_float, printable
-from neeco.ingest.readers import file_state, naming_damage
+from neeco.ingest.readers import file_state, one_line
 
 INFO = "meta/info.json"
 EPISODES_2, EPISODES_3 = "meta/episodes.jsonl", "meta/episodes"
@@ -284,7 +284,7 @@ def batches(
             listed = printable(", ".join(file.physical_schema.names), 300).strip("'")
             raise NeecoError(f"{path}: has no column {printable(name)}; its columns are {listed}")
     wanted = None if episode is None else pyarrow.dataset.field("episode_index") == episode
-    with naming_damage(path, *_DAMAGE):
+    with one_line(path, *_DAMAGE):
         part = file if wanted is None else file.subset(filter=wanted)  # by the statistics of its row groups
         leaves = tuple(f"{name}." for name in columns)
         for group in part.row_groups:
@@ -302,7 +302,7 @@ def _fragment(path: Path, limits: LeRobotLimits) -> Any:
     import pyarrow.fs
 
     require_content(path)
-    with naming_damage(path, *_DAMAGE):
+    with one_line(path, *_DAMAGE):
         # a buffer: else all of a column is taken into memory, and images can stand in it
         options = pyarrow.dataset.ParquetFragmentScanOptions(use_buffered_stream=True, buffer_size=limits.buffer_bytes)
         kind = pyarrow.dataset.ParquetFileFormat(default_fragment_scan_options=options)

@@ -96,18 +96,14 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     quats, flips = continuous(quats[order])
     if flips:
         rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
-    gaps, gap_notes = find_gaps(table, times)
-    notes = (*rows.notes(), *gap_notes)
-    stated_in = table.stated_in if source.frame is None else None
-    positions = positions[order]
-    if frame != named.BASE:
-        positions, quats = in_opencv(frame, positions, quats)
-        frame = named.CAMERA
-        if source.frame is None and table.meaning is not None:
-            notes = (*notes, f"{table.title}: poses are stated in {table.meaning.why}")
+    gaps = find_gaps(rows, times)
+    if frame != named.BASE and source.frame is None and table.meaning is not None:
+        rows.repairs.append(f"poses are stated in {table.meaning.why}")
+    positions, quats = in_opencv(frame, positions[order], quats)
     return PoseLog(
-        table.path, source.clock, times, positions, quats, gaps=gaps, notes=notes, frame=frame, stated_in=stated_in,
-        image_hz=table.image_hz,
+        table.path, source.clock, times, positions, quats, gaps=gaps, notes=rows.notes(), image_hz=table.image_hz,
+        frame=named.BASE if frame == named.BASE else named.CAMERA,
+        stated_in=table.stated_in if source.frame is None else None,
     )  # fmt: skip
 
 
@@ -177,9 +173,8 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     rows = Rows(table)
     times = read_times(rows, source, when)
     values = read_cells(rows, (value,))[:, 0]
-    clamped: tuple[str, ...] = ()
     if source.calibration is not None:
-        values, clamped = _calibrated(rows, value, values, source)
+        values = _calibrated(rows, value, values, source.calibration, source.units.angle)
     else:
         hint = " Counts need a calibration table, `calibration`."
         values = values * named.scale_of(table.where, (value,), "angle", source.units.angle, None, hint)
@@ -187,9 +182,8 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
         rows.drop_wrong(impossible, reason)
     times, order = in_order(rows, times, source.rate_hz)
-    gaps, gap_notes = find_gaps(table, times)
-    notes = (*rows.notes(), *clamped, *gap_notes)
-    return ReadingLog(table.path, source.clock, times, values[order], gaps=gaps, notes=notes, image_hz=table.image_hz)
+    gaps, image_hz = find_gaps(rows, times), table.image_hz
+    return ReadingLog(table.path, source.clock, times, values[order], gaps=gaps, notes=rows.notes(), image_hz=image_hz)
 
 
 def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
@@ -332,25 +326,20 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     return counts, angles
 
 
-def _calibrated(
-    rows: Rows, name: str, readings: np.ndarray, source: JointColumns
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _calibrated(rows: Rows, name: str, readings: np.ndarray, path: Path, angle_unit: str | None) -> np.ndarray:
     """Angles [R] rad of a column of counts, by PCHIP through the table (Fritsch & Carlson 1980), which is as monotone
     as its points. Just outside the table, its end is taken, with a note; rows farther outside are dropped."""
-    table, path = rows.table, source.calibration
-    assert path is not None
-    counts, angles = read_calibration(path, source.units.angle)
+    counts, angles = read_calibration(path, angle_unit)
     low, high = counts[0], counts[-1]
     readings = np.where(rows.keep, readings, low)
     excess = np.maximum(low - readings, readings - high)
     outside = excess > SETTINGS.clamped_share * (high - low)
     values = PchipInterpolator(counts, angles)(np.clip(readings, low, high))
     clamped = (excess > 0) & ~outside
-    notes: tuple[str, ...] = ()
     if clamped.any():
         by = f"{low:g} to {high:g}, by at most {excess[clamped].max():g}"
         what = f"{counted(int(clamped.sum()), 'row')} with {name} just outside the table {path.name} ({by})"
-        notes = (f"{table.title}: {what}: read as its end ({table.list_rows(table.lines[clamped])})",)
+        rows.repairs.append(f"{what}: read as its end ({rows.table.list_rows(rows.table.lines[clamped])})")
     reason = f"{name} lies far outside the calibration table {path.name}"
     rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
-    return values, notes
+    return np.asarray(values)

@@ -10,7 +10,7 @@ import re
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,16 +19,7 @@ import numpy as np
 from neeco.base.errors import NeecoError, counted
 from neeco.base.files import open_file, require_content
 from neeco.capture.documents import printable
-from neeco.ingest.readers import (
-    Kind,
-    RecordingFormat,
-    Stream,
-    Table,
-    VideoSource,
-    file_state,
-    naming_damage,
-    parse_number,
-)
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, kept, one_line, parse_number
 from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_of, of_dvrk
 
@@ -130,13 +121,13 @@ class FrameSequence:
         return {frame: stated.get(frame, GOOD) for frame in self.fields[name + TRANSFORM]}
 
 
-@lru_cache(maxsize=4)
-def read_sequence(path: Path, state: tuple[object, ...]) -> FrameSequence:
-    """The header of a sequence; `state` of the file distinguishes it from another of its name. Raises NeecoError where
-    it is none, is damaged, or says what the file does not hold."""
+@kept
+def read_sequence(path: Path) -> FrameSequence:
+    """Read the header of a sequence. Raises NeecoError where it is none, is damaged, or says what the file does not
+    hold."""
     require_content(path)
     is_nrrd = path.suffix.lower() in NRRD
-    with naming_damage(path, "cannot read", "correct the path"), open_file(path, "a sequence") as stream:
+    with one_line(path, "cannot read", "correct the path"), open_file(path, "a sequence") as stream:
         plain, frames, start = _read_header(path, stream, is_nrrd)
     if not frames:
         what = "holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence"
@@ -237,7 +228,7 @@ class SequenceImages(VideoSource):
         sequence, wanted = self.sequence, {self.frames[int(index)]: int(index) for index in indices}
         (file, start), length = sequence.data, sequence.frame_bytes
         shape = (sequence.size[1], sequence.size[0], sequence.channels)
-        with naming_damage(file, "its images are damaged", "copy or export the sequence again"):
+        with one_line(file, "its images are damaged", "copy or export the sequence again"):
             for number, content in _frames(file, start, length, None if sequence.packed else sorted(wanted)):
                 if number == sequence.count:
                     raise _fault(file, "holds more images than its header says")
@@ -289,20 +280,17 @@ class PlusSequence(RecordingFormat):
     suffixes = (*META, *NRRD)
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        sequence = _sequence_of(path)
-        span = np.ptp([*sequence.times.values()])
-
-        def rate(count: int) -> float | None:
-            return (count - 1) / span if span > 0 and count > 1 else None
-
-        streams = []
+        sequence = read_sequence(path)
+        span, streams = float(np.ptp([*sequence.times.values()])), list[Stream]()
         if sequence.has_images:
             frames, notes = sequence.images
             title = f"{'grey' if sequence.channels == 1 else 'RGB'} images of {sequence.size[0]}x{sequence.size[1]}"
             why = f" ({notes[0].partition(': ')[2]})" if notes else ""
             few = f"{len(frames)} of {sequence.count} images can be used{why}; record again"
             problem = few if len(frames) < LIMITS.min_images else None
-            streams.append(Stream(IMAGE_STREAM, Kind.IMAGES, title, len(frames), rate(sequence.count), problem=problem))
+            streams.append(
+                Stream(IMAGE_STREAM, Kind.IMAGES, title, len(frames), _rate(sequence.count, span), problem=problem)
+            )
         for name in sequence.transforms:
             texts, (body, _, meaning) = sequence.fields[name + TRANSFORM], _ends(name)
             # what is the same in every frame is a calibration (ImageToProbe), no motion
@@ -310,16 +298,12 @@ class PlusSequence(RecordingFormat):
             statuses = [status.lower() for status in sequence.statuses(name).values()]
             problem = None if GOOD in statuses else _unusable(_status_words(name, statuses[0]))
             kind, title = (Kind.OTHER, "fixed transform") if fixed else (Kind.POSES, "transform")
-            streams.append(
-                Stream(
-                    name, kind, title, len(texts), rate(len(texts)), body=body, hints=meaning.hints, asks=meaning.asks,
-                    problem=problem,
-                )
-            )  # fmt: skip
+            stream = Stream(name, kind, title, len(texts), _rate(len(texts), span), body=body, problem=problem)
+            streams.append(replace(stream, hints=meaning.hints, asks=meaning.asks))
         return tuple(streams)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
-        sequence = _sequence_of(path)
+        sequence = read_sequence(path)
         if not sequence.transforms:
             what = "holds no transforms (Seq_Frame0000_StylusToTrackerTransform)"
             raise NeecoError(f"{path}: {what}; name a log of poses")
@@ -349,15 +333,15 @@ class PlusSequence(RecordingFormat):
         return replace(table, notes=tuple(notes))
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
-        sequence = _sequence_of(path)
+        sequence = read_sequence(path)
         self.choose(path, stream, Kind.IMAGES)
         frames, notes = sequence.images
         seconds = np.array([sequence.times[frame] for frame in frames])
         return SequenceImages(path, sequence.size, notes, seconds, sequence=sequence, frames=tuple(frames))
 
 
-def _sequence_of(path: Path) -> FrameSequence:
-    return read_sequence(path, file_state(path))
+def _rate(count: int, span: float) -> float | None:
+    return (count - 1) / span if span > 0 and count > 1 else None
 
 
 def _status_words(name: str, status: str) -> str:
