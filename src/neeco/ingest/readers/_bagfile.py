@@ -355,8 +355,7 @@ def _inspect_compressed(message: Any) -> tuple[str, tuple[int, int]]:
 def decode(message: Any) -> np.ndarray:
     """Return uint8 [H, W, 3] RGB of a usable Image or CompressedImage."""
     if not hasattr(message, "encoding"):
-        with Image.open(BytesIO(message.data), formats=FORMATS) as image:
-            return np.array(image.convert("RGB"))
+        return np.array(Image.open(BytesIO(message.data), formats=FORMATS).convert("RGB"))
     channels, conversion = ENCODINGS[message.encoding]
     rows = message.data[: message.step * message.height].reshape(message.height, message.step)
     pixels = np.ascontiguousarray(rows[:, : message.width * channels]).reshape(message.height, message.width, channels)

@@ -239,12 +239,9 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
 
 def _lagrange(samples: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Weights [N, K] of values at samples [N, K] s in the polynomial through them, at times [N] s."""
-    weights = np.ones_like(samples)
-    for one in range(samples.shape[1]):
-        for other in range(samples.shape[1]):
-            if other != one:
-                weights[:, one] *= (times - samples[:, other]) / (samples[:, one] - samples[:, other])
-    return weights
+    others = ~np.eye(samples.shape[1], dtype=bool)
+    steps = np.where(others, samples[:, :, None] - samples[:, None], 1)
+    return np.asarray(np.where(others, (times[:, None] - samples)[:, None] / steps, 1).prod(axis=-1))
 
 
 def _noise(values: np.ndarray) -> float:

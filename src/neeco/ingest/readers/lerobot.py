@@ -243,12 +243,10 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.
     table = data.columns(episode, {"timestamp": 1, "frame_index": 1})
     order = np.argsort(table["frame_index"][:, 0], kind="stable")
     frames, stamps = table["frame_index"][order, 0], table["timestamp"][order, 0]
-    if len(frames) != episode.length:
-        what = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}"
-        raise NeecoError(f"{episode.data}: {what}; download the data set again")
-    rows = np.arange(len(frames))
+    rows = np.arange(episode.length)
     if not np.array_equal(frames, rows):
-        raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")
+        what = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}, counted by frame_index"
+        raise NeecoError(f"{episode.data}: {what} from 0; download the data set again")
     title = f"{data.path.name}: episode {episode.number}: its timestamps"
     if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
         return frames / data.fps, order, rows, (f"{title} do not increase; taken as {data.fps:g} a second",)

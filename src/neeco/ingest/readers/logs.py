@@ -244,12 +244,9 @@ def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: 
     """
     quats, good = np.full((len(cells), 4), np.nan), np.isfinite(cells).all(axis=1)
     if form in (named.QUATERNION_WXYZ, named.QUATERNION_XYZW):
-        norms = np.linalg.norm(cells, axis=1)
-        good &= np.abs(norms - 1) <= SETTINGS.norm_tolerance
-        wxyz = cells if form == named.QUATERNION_WXYZ else cells[:, [3, 0, 1, 2]]
-        quats[good] = wxyz[good] / norms[good, None]
-        return quats, good
-    if form in (EULER, ROTATION_VECTOR):
+        good &= np.abs(np.linalg.norm(cells, axis=1) - 1) <= SETTINGS.norm_tolerance
+        turns = Rotation.from_quat(cells[good], scalar_first=form == named.QUATERNION_WXYZ)
+    elif form in (EULER, ROTATION_VECTOR):
         good &= (np.abs(cells * scale) < 1e4).all(axis=1)  # beyond, they are no angles, or their sine is noise
         angles = cells[good] * scale
         turns = Rotation.from_euler(convention or "", angles) if form == EULER else Rotation.from_rotvec(angles)

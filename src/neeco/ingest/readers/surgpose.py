@@ -96,14 +96,10 @@ class SurgPose(RecordingFormat):
 
 def _videos(path: Path) -> list[str]:
     """Videos, or folders of their frames, the left one in usual light first."""
-    videos = []
-    for light in LIGHTS:
-        for side in ("left", "right"):
-            for name in (f"{side}_video.mp4", f"{side}_video", f"{side}_frames"):
-                if (path / light / name).exists():
-                    videos.append((Path(light) / name).as_posix())
-                    break
-    return videos
+    names = ("video.mp4", "video", "frames")
+    places = [[Path(light) / f"{side}_{name}" for name in names] for light in LIGHTS for side in ("left", "right")]
+    found = (next((place for place in group if (path / place).exists()), None) for group in places)
+    return [place.as_posix() for place in found if place is not None]
 
 
 def _read(path: Path) -> tuple[_ByArm, _ByArm]:
