@@ -23,29 +23,12 @@ from PIL import Image
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
-from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
 from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, one_line
-from neeco.ingest.readers.columns import (
-    QUATERNION_WXYZ,
-    ROTATION_MATRIX,
-    joint_columns,
-    pose_bodies,
-    recognise_pose,
-    split_unit,
-)
+from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.frame_names import NamedFrame, camera_order, meaning_in, of_dvrk, unsaid, without_frame
-from neeco.ingest.readers.lerobot_files import (
-    FIXED,
-    DataSet,
-    Episode,
-    Feature,
-    LeRobotLimits,
-    batches,
-    parquet_names,
-    read_data_set,
-)
+from neeco.ingest.readers.lerobot_files import FIXED, DataSet, Episode, Feature, LeRobotLimits, batches, read_data_set
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
 TIME = "timestamp_s"
@@ -70,13 +53,12 @@ class LeRobot(RecordingFormat):
         """Return those of the first episode that was downloaded; all others have the same."""
         data = self._data_set(path)
         episode, images, tables = data.first_present(), list[Stream](), list[Stream]()
-        there = {*data.films, *parquet_names(episode.data, self.limits)}
+        absent = data.absent(episode)
         for key, feature in data.features.items():
             kind, title = _kind(feature), f"{feature.dtype} of {'x'.join(map(str, feature.shape))}"
             stream = Stream(f"episode {episode.number}/{key}", kind, title, episode.length, data.fps)
-            if kind != Kind.OTHER and (key in episode.absent or key not in there):
-                missing = f"{episode.data}: has no column {printable(key)}; download the data set again"
-                tables.append(replace(stream, problem=episode.absent.get(key, missing)))
+            if kind != Kind.OTHER and key in absent:
+                tables.append(replace(stream, problem=absent[key]))
             elif kind == Kind.IMAGES:
                 images.append(stream)
             elif kind == Kind.READINGS:
@@ -156,12 +138,12 @@ class LeRobot(RecordingFormat):
         match = _NAME.fullmatch(stream or "")
         number = int(match[1]) if match else min(data.records)
         wanted = f"episode {number}/{match[2]}" if match else stream
-        named = [Stream(f"episode {number}/{key}", _kind(each), each.dtype, 0) for key, each in data.features.items()]
+        streams = [Stream(f"episode {number}/{key}", _kind(each), each.dtype, 0) for key, each in data.features.items()]
         if stream is None and len(data.records) > 1:
-            examples = ", ".join(candidate.name for candidate in named if candidate.kind in kinds)[:300]
+            examples = ", ".join(candidate.name for candidate in streams if candidate.kind in kinds)[:300]
             what = f"missing, and there are {data.range_words}; name one, as in {examples}"
             raise NeecoError(f"{data.path}: stream: {what}")
-        key = self.choose(data.path, wanted, *kinds, streams=named).name.partition("/")[2]
+        key = self.choose(data.path, wanted, *kinds, streams=streams).name.partition("/")[2]
         return data.episode(number), key
 
     def _bodies(self, data: DataSet, episode: Episode, feature: Feature, stream: Stream) -> list[Stream]:
@@ -169,26 +151,24 @@ class LeRobot(RecordingFormat):
         plain = replace(stream, offered=False)
         if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
             return [plain]
-        bodies = pose_bodies(feature.names)
-        readings, streams = joint_columns(feature.names, bodies), []
+        bodies = named.pose_bodies(feature.names)
+        readings, found = named.joint_columns(feature.names, bodies), []
         for prefix, columns in bodies.items():
-            body, poses = without_frame(prefix), recognise_pose(columns)
+            body, poses = without_frame(prefix), named.recognise_pose(columns)
             if poses.position is None:
                 continue
             of_body = [name for name in readings if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
+            joints = tuple((_joint_name(name, body), name) for name in of_body)
             columns = tuple(name for name in columns if name not in readings)
             asks = () if poses.rotation else _rotation_asks(data, episode, feature, columns)
-            meaning = _meaning(feature.key, columns)
-            streams.append(
-                replace(
-                    plain, kind=Kind.POSES, offered=True, body=body or UNNAMED, columns=columns, hints=meaning.hints,
-                    joints=tuple((_joint_name(name, body), name) for name in of_body), asks=(*meaning.asks, *asks),
-                )
-            )  # fmt: skip
-        if not streams and (asks := _rotation_asks(data, episode, feature, feature.names)):
-            meaning = _meaning(feature.key, feature.names)
-            asked = replace(plain, kind=Kind.POSES, offered=True, body=UNNAMED, joints=(), columns=())
-            streams = [replace(asked, hints=meaning.hints, asks=(*meaning.asks, *asks))]
+            found.append((body or UNNAMED, columns, joints, asks))
+        if not found and (asks := _rotation_asks(data, episode, feature, feature.names)):
+            found.append((UNNAMED, (), (), asks))
+        streams = []
+        for body, columns, joints, asks in found:
+            meaning = _meaning(feature.key, columns or feature.names)
+            posed = replace(plain, kind=Kind.POSES, offered=True, body=body, columns=columns, joints=joints)
+            streams.append(replace(posed, hints=meaning.hints, asks=(*meaning.asks, *asks)))
         return streams or [plain]
 
 
@@ -278,10 +258,10 @@ def find_rotations(values: np.ndarray, tolerance: float) -> list[tuple[int, str]
         four, nine = values[:, place : place + 4], values[:, place : place + 9]
         matrices = nine.reshape(-1, 3, 3) if nine.shape[1] == 9 else np.zeros((1, 3, 3))
         if rotation_error(matrices).max() < tolerance and (np.linalg.det(matrices) > 0).all():
-            rotations.append((place, ROTATION_MATRIX))
+            rotations.append((place, named.ROTATION_MATRIX))
             place += 9
         elif np.abs(np.linalg.norm(four, axis=1) - 1).max() < tolerance and (np.ptp(four, axis=0) > 0).sum() > 1:
-            rotations.append((place, QUATERNION_WXYZ))
+            rotations.append((place, named.QUATERNION_WXYZ))
             place += 4
         else:
             place += 1
@@ -294,7 +274,7 @@ def _rotation_asks(data: DataSet, episode: Episode, feature: Feature, columns: S
     values, asks = values[:, [feature.names.index(column) for column in columns]], []
     for place, kind in find_rotations(values, data.limits.unit_tolerance):
         size, why = 4, "or quaternion_xyzw: their length is 1, nothing says their order"
-        if kind == ROTATION_MATRIX:
+        if kind == named.ROTATION_MATRIX:
             size, why = 9, "or column by column: list them so that they stand row by row"
         if place >= 3:
             asks.append(f"  position: {json.dumps(columns[place - 3 : place])}   # stands before the rotation")
@@ -304,5 +284,5 @@ def _rotation_asks(data: DataSet, episode: Episode, feature: Feature, columns: S
 
 def _joint_name(column: str, body: str) -> str:
     """Return `jaw` of `psm1_jaw`, without the unit."""
-    words = [word for word in re.split(r"[_.\-/]+", split_unit(column, "angle")[0]) if word and word != body]
+    words = [word for word in re.split(r"[_.\-/]+", named.split_unit(column, "angle")[0]) if word and word != body]
     return "_".join(words) or column

@@ -130,6 +130,12 @@ class DataSet:
             raise _NotThere(f"{self.path / EPISODES_3}: states no images of {printable(key)}; download it again")
         return self._file("video_path", {**of_film, "video_key": key}), (start, end)
 
+    def absent(self, episode: Episode) -> dict[str, str]:
+        """Return why features of an episode cannot be read, by key: their column or their camera's file is missing."""
+        there, where = {*self.films, *parquet_names(episode.data, self.limits)}, f"{episode.data}: has no column"
+        columns = [key for key in self.features if key not in there]
+        return {key: f"{where} {printable(key)}; download the data set again" for key in columns} | {**episode.absent}
+
     def columns(self, episode: Episode, widths: Mapping[str, int]) -> dict[str, np.ndarray]:
         """Return columns of an episode as `read_columns` does."""
         return read_columns(episode.data, {"episode_index": 1, **widths}, self.limits, episode.number)
