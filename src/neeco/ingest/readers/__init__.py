@@ -260,7 +260,7 @@ def kept(read: _Read) -> _Read:
 
 
 def reason_of(error: BaseException) -> str:
-    """What a library says of a damaged file, in a few words of one line."""
+    """Return what a library says of a damaged file, in a few words of one line."""
     text = visible(str(getattr(error, "strerror", None) or error)).strip(" .")
     return text[:100] or "its parts do not fit together"
 
