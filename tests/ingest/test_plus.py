@@ -11,7 +11,7 @@ from damaged_files import refusals
 from pluswriter import frame_fields, write_sequence
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers import IMAGES, OTHER, POSES, format_of
+from neeco.ingest.readers import Kind, format_of
 from neeco.ingest.readers.columns import PoseColumns
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.recording.file import read_recording
@@ -63,7 +63,7 @@ def test_poses_and_images_come_back_from_every_layout(world, transforms, name, c
     path = write(world.folder, name, frame_fields(TIMES, transforms), images)
     known = format_of(path)
     kinds = {stream.name: (stream.kind, stream.count) for stream in known.streams(path)}
-    assert kinds == {"images": (IMAGES, 30), "StylusToTracker": (POSES, 30), "ImageToProbe": (OTHER, 30)}
+    assert kinds == {"images": (Kind.IMAGES, 30), "StylusToTracker": (Kind.POSES, 30), "ImageToProbe": (Kind.OTHER, 30)}
     assert all(stream.rate_hz == pytest.approx(25) for stream in known.streams(path))
 
     log = read_pose_log(PoseColumns(path))
@@ -278,6 +278,6 @@ def test_a_transform_without_to_is_read_and_its_frame_asked_for(tmp_path, world)
     poses = world.poses(TIMES - START)
     path = sequence(tmp_path / "slicer.seq.mha", frame_fields(TIMES, {"LinearTransform_3": poses}))
     (stream,) = format_of(path).streams(path)
-    assert (stream.name, stream.kind, stream.count) == ("LinearTransform_3", POSES, COUNT)
+    assert (stream.name, stream.kind, stream.count) == ("LinearTransform_3", Kind.POSES, COUNT)
     assert "LinearTransform_3" in stream.asks[0]
     assert len(format_of(path).read(path).rows) == COUNT

@@ -13,10 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import (
-    IMAGES,
-    OTHER,
-    POSES,
-    READINGS,
+    Kind,
     VideoSource,
     _bagfile,
     read_table,
@@ -122,8 +119,8 @@ def test_streams_say_what_there_is(tmp_path: Path, kind: str) -> None:
     found = {stream.name: stream for stream in known(bag.path).streams(bag.path)}
     told = {name: (stream.kind, stream.count) for name, stream in found.items()}
     assert told == {
-        LEFT: (IMAGES, 20), ARM: (POSES, 40), JAW: (READINGS, 40), "/PSM1/measured_js": (READINGS, 40),
-        "tf:camera": (OTHER, 1), "/chatter": (OTHER, 1),
+        LEFT: (Kind.IMAGES, 20), ARM: (Kind.POSES, 40), JAW: (Kind.READINGS, 40),
+        "/PSM1/measured_js": (Kind.READINGS, 40), "tf:camera": (Kind.OTHER, 1), "/chatter": (Kind.OTHER, 1),
     }  # fmt: skip
     assert found[ARM].type == "geometry_msgs/PoseStamped in ECM"
     assert found[LEFT].type == "sensor_msgs/Image (rgb8, 24x16)"
@@ -470,7 +467,7 @@ def test_an_mcap_file_need_not_name_a_profile_and_other_messages_are_called_what
     path.write_bytes(content)
     if change is without_profile:
         (stream,) = known(path).streams(path)
-        assert (stream.name, stream.kind, stream.count) == ("/psm1", POSES, 5)
+        assert (stream.name, stream.kind, stream.count) == ("/psm1", Kind.POSES, 5)
     else:
         said = refusal(lambda: known(path).streams(path))
         assert "/psm1 (geometry_msgs/PoseStamped) is written as own, not as cdr" in said

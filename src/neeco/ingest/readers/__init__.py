@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import importlib.util
 from abc import ABC
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
-from functools import cache
+from enum import StrEnum
+from functools import cache, lru_cache, wraps
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 
-from neeco.base.errors import NeecoError, install_hint
+from neeco.base.errors import NeecoError, install_hint, visible
 from neeco.base.registry import plugins
 from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
@@ -30,6 +32,7 @@ HUGE = 1e20
 MAX_LISTED = 3  # lines named in a message
 MAX_UNLIKE = 0.1  # share by which a video may differ in length from the states of its images
 DELIMITED = (".csv", ".tsv", ".txt")
+_Read = TypeVar("_Read", bound=Callable[..., Any])
 ENTRY_POINTS = "neeco.readers"  # the group in which installed packages name their formats
 
 
@@ -89,10 +92,16 @@ class Table:
         return f"{self.record}{'' if len(lines) == 1 else 's'} {names}{', ...' if len(lines) > MAX_LISTED else ''}"
 
 
+class Kind(StrEnum):
+    """Kinds of streams."""
+
+    POSES, READINGS, IMAGES, OTHER = "poses", "readings", "images", "other"
+
+
 @dataclass(frozen=True)
 class Stream:
-    """A stream of a file. name: as a recording states it (`stream: NAME`); kind: POSES, READINGS, IMAGES or OTHER;
-    type: the format's own word for it; count: of its samples; rate_hz: None where nobody knows.
+    """A stream of a file. name: as a recording states it (`stream: NAME`); type: the format's own word for it;
+    count: of its samples; rate_hz: None where nobody knows.
 
     For a template: offered: is it what is recorded most likely, or only there, too? body: what it is of, where the
     format tells; joints: (name, column) of the readings worth having, None: all angles; hints: remarks on the body;
@@ -102,7 +111,7 @@ class Stream:
     """
 
     name: str
-    kind: str
+    kind: Kind
     type: str
     count: int
     rate_hz: float | None = None
@@ -166,6 +175,28 @@ class RecordingFormat(ABC):
         """Return what the file holds; () where it is one table."""
         return ()
 
+    def choose(self, path: Path, wanted: str | None, *kinds: Kind, streams: Sequence[Stream] | None = None) -> Stream:
+        """Return the stream that is wanted, or the only one of these kinds. streams: all that there are. Raises
+        NeecoError listing them."""
+        streams = self.streams(path) if streams is None else streams
+        of_kind = [stream for stream in streams if stream.kind in kinds]
+        fitting = [stream for stream in of_kind if stream.problem is None]
+        named = [stream for stream in streams if stream.name == wanted][:1]
+        candidates = named if wanted is not None else fitting or of_kind[:1]
+        if len(candidates) == 1 and (found := candidates[0]).problem is not None:
+            raise NeecoError(f"{path}: {found.name}: {found.problem}")
+        if len(candidates) == 1 and candidates[0] in fitting:
+            return candidates[0]
+        listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
+        sought = " or ".join(kinds)
+        if wanted is None:
+            what = f"holds {len(fitting)} streams of {sought}; name one as `stream` in the recording: {listed}"
+            raise NeecoError(f"{path}: {what}")
+        what = f"holds no {printable(wanted)}"
+        if candidates:
+            what = f"{printable(wanted)} is {candidates[0].type}, not {sought}"
+        raise NeecoError(f"{path}: stream: {what}; name one of {listed}")
+
     def read(self, path: Path, stream: str | None = None) -> Table:
         """Return poses or readings as a table. stream: the name of one, where there are several."""
         raise NeecoError(f"{path}: {self.format} holds no poses and no readings; name a log")
@@ -190,9 +221,6 @@ class RecordingFormat(ABC):
         """Return the lenses of two streams of images, of this file or another one, and right_from_left [4, 4] mm
         (OpenCV axes); None where the format does not state them."""
         return None
-
-
-POSES, READINGS, IMAGES, OTHER = "poses", "readings", "images", "other"  # kinds of streams
 
 
 @cache
@@ -224,24 +252,28 @@ def file_state(*files: Path) -> tuple[tuple[str, int, int], ...]:
         raise NeecoError(f"{error.filename}: cannot read: {error.strerror or error}; correct the path") from None
 
 
-def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kinds: Sequence[str]) -> Stream:
-    """The stream that is wanted, or the only one of these kinds. Raises NeecoError listing what there is."""
-    of_kind = [stream for stream in streams if stream.kind in kinds]
-    fitting = [stream for stream in of_kind if stream.problem is None]
-    listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
-    named = [stream for stream in streams if stream.name == wanted][:1]
-    candidates = named if wanted is not None else fitting or of_kind[:1]
-    if len(candidates) == 1 and candidates[0].problem is not None:
-        raise NeecoError(f"{path}: {candidates[0].name}: {candidates[0].problem}")
-    if len(candidates) == 1 and candidates[0] in fitting:
-        return candidates[0]
-    if wanted is None:
-        what = f"holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream` in the recording: {listed}"
-        raise NeecoError(f"{path}: {what}")
-    what = f"holds no {printable(wanted)}"
-    if candidates:
-        what = f"{printable(wanted)} is {candidates[0].type}, not {' or '.join(kinds)}"
-    raise NeecoError(f"{path}: stream: {what}; name one of {listed}")
+def kept(read: _Read) -> _Read:
+    """Keep what a function reads of a file, its first argument, until that changes. Raises NeecoError where it is not
+    there."""
+    read_once = lru_cache(maxsize=4)(lambda state, *given: read(*given))
+    return cast(_Read, wraps(read)(lambda path, *more: read_once(file_state(path), path, *more)))
+
+
+def reason_of(error: BaseException) -> str:
+    """Return what a library says of a damaged file, in a few words of one line."""
+    text = visible(str(getattr(error, "strerror", None) or error)).strip(" .")
+    return text[:100] or "its parts do not fit together"
+
+
+@contextmanager
+def one_line(where: Path | str, problem: str, remedy: str) -> Iterator[None]:
+    """Turn what libraries raise of damaged files, which is nearly anything, into a NeecoError with their reason."""
+    try:
+        yield
+    except NeecoError:
+        raise
+    except Exception as error:
+        raise NeecoError(f"{where}: {problem} ({reason_of(error)}); {remedy}") from error
 
 
 def compare_counts(

@@ -12,8 +12,8 @@ import re
 import sys
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cache, lru_cache, partial
 from io import BytesIO
@@ -37,7 +37,7 @@ from neeco.base.files import require_content, visible_entries
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
-from neeco.ingest.readers import OTHER, Stream, VideoSource
+from neeco.ingest.readers import Kind, Stream, Table, VideoSource, one_line, rate_of
 from neeco.ingest.readers.rows import restarts
 
 if sys.version_info >= (3, 14):
@@ -47,7 +47,7 @@ else:
 
 MCAP_HEADER_AT, MCAP_SCHEMA = 17, 3  # byte where the header's content begins, and the opcode of schemas
 _DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
-_REMEDIES = {".bag": "`rosbag reindex`", ".mcap": "`mcap recover`", "": "`ros2 bag reindex`"}  # by suffix
+_REPAIRS = {".bag": "`rosbag reindex`", ".mcap": "`mcap recover`", "": "`ros2 bag reindex`"}  # by suffix
 POSE = {"geometry_msgs/PoseStamped", "geometry_msgs/TransformStamped"}
 TRANSFORMS = {"tf2_msgs/TFMessage", "tf/tfMessage"}
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -71,7 +71,6 @@ class BagLimits:
     """Limits on what is read of a bag."""
 
     chunk_bytes: int = 256 << 20  # limit on the unpacked bytes of a chunk; recorders write some MiB
-    metadata_bytes: int = 16 << 20
     joints: int = 400  # limit on the joints of one topic
     bodies: int = 2000  # limit on the bodies of all transforms
     pixels: int = 90_000_000  # limit on the pixels of an image, as for files of images
@@ -153,7 +152,7 @@ class Bag:
         Raises NeecoError."""
         deserialize = _store(True).deserialize_ros1 if self.is_ros1 else _store(False).deserialize_cdr
         packed = not self.is_ros1 and self.reader.metadata.compression_mode == "message"
-        with _damage_named(self.path):
+        with _naming_damage(self.path):
             for source in self.sources:
                 wanted = [connection for connection in source.connections if connection.topic in topics]
                 for connection, received, data in source.messages(wanted, start, stop) if wanted else ():
@@ -185,15 +184,12 @@ def open_bag(path: Path, limits: BagLimits) -> Iterator[Bag]:
     it cannot be read, as `Bag.messages` does."""
     for file in visible_entries(path) if path.is_dir() else [path]:
         require_content(file)
-    suffix, metadata = "" if path.is_dir() else path.suffix.lower(), path / "metadata.yaml"
-    if metadata.is_file() and metadata.stat().st_size > limits.metadata_bytes:
-        raise NeecoError(f"{metadata}: is too large; write it anew with `ros2 bag reindex`")
-    if path.is_dir() and re.search(rb"compression_mode: [\"']?file", read_head(metadata, 1 << 20), re.I):
+    if re.search(rb"compression_mode: [\"']?file", read_head(path / "metadata.yaml", 1 << 20), re.I):
         raise NeecoError(f"{path}: its files are packed as a whole; unpack one with `zstd -d` and give that")
     kinds = {"": DirectoryReader, ".bag": Ros1Reader, ".mcap": _McapReader, ".db3": Sqlite3Reader}
     with ExitStack() as stack:
-        with _damage_named(path):
-            reader: Any = kinds[suffix](path)
+        with _naming_damage(path):
+            reader: Any = kinds["" if path.is_dir() else path.suffix.lower()](path)
             reader.open()
             stack.callback(reader.close)
             sources = reader.storages if path.is_dir() else [reader]
@@ -237,18 +233,10 @@ def _check_size(size: int, max_bytes: int) -> None:
         raise ReaderError(f"a chunk of its messages has over {max_bytes >> 20} MiB")
 
 
-@contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except NeecoError:
-        raise
-    # damaged bags make rosbags raise nearly anything: struct.error, KeyError, AssertionError, OverflowError ...
-    except Exception as error:
-        reason = plain(" ".join(str(error).split())).rstrip(".") or "its records do not fit together"
-        repair = _REMEDIES.get("" if path.is_dir() else path.suffix.lower())
-        remedy = f"repair it with {repair}, or copy it again" if repair else "copy it again"
-        raise NeecoError(f"{path}: is cut short or damaged, or no bag ({reason}); {remedy}") from error
+def _naming_damage(path: Path) -> AbstractContextManager[None]:
+    repair = _REPAIRS.get("" if path.is_dir() else path.suffix.lower())
+    remedy = f"repair it with {repair}, or copy it again" if repair else "copy it again"
+    return one_line(path, "is cut short or damaged, or no bag", remedy)
 
 
 @dataclass
@@ -283,22 +271,16 @@ class Samples:
         except _UnusableError as error:
             self.bad[str(error)] += 1
             return
-        count = len(self.stamps)
-        for name, value in values:
-            column = self.columns.get(name)
-            if column is None:
-                if self.type == JOINTS and len(self.columns) >= self.limits.joints:
-                    continue
-                column = self.columns[name] = array("d")
-            if len(column) < count:
-                column.extend([np.nan] * (count - len(column)))
-            if len(column) == count:  # of a joint named twice, the first
-                column.append(value)
+        for name in values:
+            if name not in self.columns and (self.type != JOINTS or len(self.columns) < self.limits.joints):
+                self.columns[name] = array("d", [np.nan]) * len(self.stamps)
+        for name, column in self.columns.items():
+            column.append(values.get(name, np.nan))
         self.stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
         self.received.append(received)
         self.frames.add(plain(message.header.frame_id).lstrip("/"))
 
-    def _values(self, message: Any) -> Iterable[tuple[str, float]]:
+    def _values(self, message: Any) -> dict[str, float]:
         """Return numbers by column; of images none. Raises _UnusableError."""
         if message is None:
             raise _UnusableError("is damaged")
@@ -309,25 +291,26 @@ class Samples:
                 raise _UnusableError(f"has {size[0]}x{size[1]} pixels")
             self.sizes[size] = self.encodings[encoding] = None
             self.numbers.append(len(self.arrived) - 1)
-            return ()
+            return {}
         if self.type == JOINTS:
             values = message.position.tolist()
             names = [plain(name) for name in message.name] or [f"joint_{n + 1}" for n in range(len(values))]
             if len(names) != len(values):
                 raise _UnusableError("is damaged")
-            return zip(names, values, strict=True)
+            numbers: dict[str, float] = {}
+            for name, value in zip(names, values, strict=True):
+                numbers.setdefault(name, value)  # of a joint named twice, the first
+            return numbers
         if hasattr(message, "pose"):
             place, turn = message.pose.position, message.pose.orientation
         else:
             place, turn = message.transform.translation, message.transform.rotation
-        return zip(POSE_COLUMNS, (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w), strict=True)
+        pose = place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
+        return dict(zip(POSE_COLUMNS, pose, strict=True))
 
     def table(self) -> np.ndarray:
         """[N, C]"""
-        values = np.full((len(self.stamps), len(self.columns)), np.nan)
-        for index, column in enumerate(self.columns.values()):
-            values[: len(column), index] = column
-        return values
+        return np.array([*self.columns.values()]).reshape(len(self.columns), len(self.stamps)).T
 
     @property
     def problem(self) -> str | None:
@@ -372,8 +355,7 @@ def _inspect_compressed(message: Any) -> tuple[str, tuple[int, int]]:
 def decode(message: Any) -> np.ndarray:
     """Return uint8 [H, W, 3] RGB of a usable Image or CompressedImage."""
     if not hasattr(message, "encoding"):
-        with Image.open(BytesIO(message.data), formats=FORMATS) as image:
-            return np.array(image.convert("RGB"))
+        return np.array(Image.open(BytesIO(message.data), formats=FORMATS).convert("RGB"))
     channels, conversion = ENCODINGS[message.encoding]
     rows = message.data[: message.step * message.height].reshape(message.height, message.step)
     pixels = np.ascontiguousarray(rows[:, : message.width * channels]).reshape(message.height, message.width, channels)
@@ -419,6 +401,31 @@ class Survey:
         stamps, received = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
         return (np.where(stamps == 0, received, stamps) - self.origin) * 1e-9
 
+    def stream(self, name: str, log: Samples, kind: Kind, more: str = "") -> Stream:
+        """Return a stream by what was counted. more: of its title."""
+        count, rate = max(len(log.stamps), len(log.arrived)), rate_of(self.seconds(log))
+        return Stream(name, kind, log.title + more, count, rate, problem=log.problem)
+
+    def table(self, name: str, log: Samples, header: tuple[str, ...], values: np.ndarray) -> Table:
+        """Return a table of numbers, one row a message."""
+        rows, lines = np.column_stack([self.seconds(log), values]), np.arange(1, len(values) + 1)
+        notes = self.notes(name, log, "message")
+        return Table(self.path, header, rows, lines, stream=name, record="message", notes=notes)
+
+    def notes(self, name: str, log: Samples, noun: str) -> tuple[str, ...]:
+        """Return notes on missing stamps, on stamps of another clock, and on messages (`noun`) that are left out."""
+        stamps, received = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
+        none, notes = stamps == 0, []
+        if none.any():
+            what = "its headers have no times" if none.all() else f"{int(none.sum())} headers have no time"
+            notes.append(f"{what}; those of receipt are taken")
+        late = 0.0 if none.all() else float(np.median((received - stamps)[~none])) * 1e-9
+        if abs(late) > self.limits.other_clock_s:
+            why = f"its headers' times are {late:.2f} s before those of receipt, on another clock"
+            notes.append(f"{why}; where the streams do not share one, name its `clock` and give `sync`")
+        notes += [f"{counted(count, noun)} left out: one {why}" for why, count in log.bad.items()]
+        return tuple(f"{self.path.name}: {name}: {note}" for note in notes)
+
 
 @lru_cache(maxsize=4)
 def survey_of(path: Path, state: tuple[object, ...], limits: BagLimits) -> Survey:
@@ -439,7 +446,7 @@ def survey_of(path: Path, state: tuple[object, ...], limits: BagLimits) -> Surve
                 continue
             unread += [] if problem is None else [f"{plain(topic)} ({types[0]}) {problem}"]
             words = types[0] if problem is None else f"{types[0]}, which {problem}"
-            survey.others.append(Stream(plain(topic), OTHER, words, sum(one.msgcount for one in of_topic)))
+            survey.others.append(Stream(plain(topic), Kind.OTHER, words, sum(one.msgcount for one in of_topic)))
         if unread and len(unread) == len(topics):
             raise NeecoError(f"{path}: no topic can be read: {', '.join(unread)}; record or convert to ROS 2's cdr")
         for name, received, message in bag.messages(set(kinds)):
@@ -472,26 +479,18 @@ class BagImages(VideoSource):
                 messages = bag.messages([self.topic], start, stop)
                 for number, (_, _, message) in zip(passed, messages, strict=False):
                     if number in numbers:
-                        yield numbers.pop(number), self._decoded(number, message)
+                        where = f"{self.path}: {self.topic}: message {number + 1}"
+                        with one_line(where, "cannot be decoded", "cut it out with `rosbag filter`"):
+                            pixels = decode(message)
+                        yield numbers.pop(number), pixels
                 if numbers:
                     raise NeecoError(f"{self.path}: {self.topic}: is shorter than before; do not change the bag")
 
-    def _decoded(self, number: int, message: Any) -> np.ndarray:
-        try:
-            pixels = decode(message)
-        except Exception as error:  # Pillow's decoders raise nearly anything
-            remedy = "record again, or cut it out with `rosbag filter`"
-            problem = f"message {number + 1} cannot be decoded; {remedy}"
-            raise NeecoError(f"{self.path}: {self.topic}: {problem}") from error
-        if pixels.shape[1::-1] != self.size:
-            raise NeecoError(f"{self.path}: {self.topic}: message {number + 1} has another size than it had")
-        return pixels
 
-
-def open_topic(survey: Survey, topic: str, notes: Sequence[str]) -> BagImages:
+def open_topic(survey: Survey, topic: str) -> BagImages:
     """Return the images of a topic, sorted by time. Raises NeecoError."""
-    log, where, title = survey.images[topic], f"{survey.path}: {topic}", f"{survey.path.name}: {topic}"
-    seconds = survey.seconds(log)
+    log, where = survey.images[topic], f"{survey.path}: {topic}"
+    seconds, notes = survey.seconds(log), survey.notes(topic, log, "image")
     times, order = np.unique(seconds, return_index=True)
     if len(times) < survey.limits.min_images:
         why, count = log.bad.most_common(1)[0] if log.bad else ("", 0)
@@ -503,12 +502,11 @@ def open_topic(survey: Survey, topic: str, notes: Sequence[str]) -> BagImages:
     for place in restarts(seconds)[1]:
         jump = f"{seconds[place]:.6g} s, then {seconds[place + 1]:.6g} s"
         raise NeecoError(f"{where}: image {place + 2}: time begins anew ({jump}); keep the images of one run in a bag")
-    left_out = dict(log.bad)
-    if len(times) < len(seconds):
-        left_out["shares its time with another"] = len(seconds) - len(times)
-    notes = [*notes, *(f"{title}: {counted(count, 'image')} left out: one {why}" for why, count in left_out.items())]
+    if doubled := len(seconds) - len(times):
+        left_out = f"{counted(doubled, 'image')} left out: one shares its time with another"
+        notes = (*notes, f"{survey.path.name}: {topic}: {left_out}")
     numbers, arrived = np.array(log.numbers, np.int64)[order], np.array(log.arrived, np.int64)
     return BagImages(
-        survey.path, next(iter(log.sizes)), tuple(notes), times, topic=topic, limits=survey.limits, arrived=arrived,
+        survey.path, next(iter(log.sizes)), notes, times, topic=topic, limits=survey.limits, arrived=arrived,
         numbers=numbers,
     )  # fmt: skip

@@ -18,22 +18,9 @@ from neeco.base.files import read_json, visible_entries
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import open_image
-from neeco.ingest.readers import (
-    IMAGES,
-    OTHER,
-    POSES,
-    READINGS,
-    RecordingFormat,
-    Stream,
-    Table,
-    VideoSource,
-    choose_stream,
-    compare_counts,
-    numbers,
-    rate_of,
-)
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, numbers, rate_of
 from neeco.ingest.readers.delimited import DelimitedText, unique_names
-from neeco.ingest.readers.frame_names import meaning_of
+from neeco.ingest.readers.frame_names import camera_order, meaning_of
 from neeco.ingest.readers.rosbag import DVRK_HINT, POSE_HEADER, RosBag, joint_column, wrist_joints
 from neeco.ingest.readers.video import ChosenFrames, ImageFiles, open_video
 
@@ -72,33 +59,33 @@ class DvrkSession(RecordingFormat):
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         films, absent = _films(path)
-        streams = [Stream(name, IMAGES, "video", 0, problem=why) for name, why in absent.items()]
+        streams = [Stream(name, Kind.IMAGES, "video", 0, problem=why) for name, why in absent.items()]
         if not films and not absent and visible_entries(path, "*.mp4"):
             raise NeecoError(f"{path}: nothing says the times of its videos' frames; give the session's own folder")
         # the left camera's are the frames; others are listed
-        for number, name in enumerate(sorted(films, key=lambda name: ("right" in name, "left" not in name, name))):
+        for number, name in enumerate(sorted(films, key=camera_order)):
             times = films[name].times
-            streams.append(Stream(name, IMAGES, "video", len(times), rate_of(times), offered=number == 0))
+            streams.append(Stream(name, Kind.IMAGES, "video", len(times), rate_of(times), offered=number == 0))
         bag = _bag(path)
         if bag is not None:
             RosBag().require_package(bag)
             try:
                 return (*streams, *RosBag().streams(bag))
             except NeecoError as error:
-                return (*streams, Stream(bag.name, OTHER, "bag", 0, problem=str(error)))
+                return (*streams, Stream(bag.name, Kind.OTHER, "bag", 0, problem=str(error)))
         for topic, file in _topics(path).items():
             try:
                 kind, columns, table = _topic(file)
             except NeecoError as error:
-                streams.append(Stream(topic, OTHER, "table", 0, problem=str(error)))
+                streams.append(Stream(topic, Kind.OTHER, "table", 0, problem=str(error)))
                 continue
-            match = (_POSES if kind == POSES else _JOINTS).fullmatch(topic)
+            match = (_POSES if kind == Kind.POSES else _JOINTS).fullmatch(topic)
             stream = Stream(topic, kind, kind, len(table.rows), offered=match is not None, body=match and match[1])
-            if kind == POSES:
+            if kind == Kind.POSES:
                 frames = _frames(table)
                 meaning = meaning_of(frames[0] if len(frames) == 1 else "", dvrk=True)
                 streams.append(replace(stream, hints=(*meaning.hints, DVRK_HINT), asks=meaning.asks))
-            elif kind == READINGS:
+            elif kind == Kind.READINGS:
                 streams.append(replace(stream, joints=wrist_joints(_joint_names(table, columns), "/jaw/" in topic)))
         return tuple(streams)
 
@@ -109,21 +96,21 @@ class DvrkSession(RecordingFormat):
             rows = np.array(table.rows, np.float64)
             rows[:, 0] += RosBag().origin_s(bag) - start
             return replace(table, path=path, rows=rows)
-        name = choose_stream(path, self.streams(path), stream, (POSES, READINGS)).name
+        name = self.choose(path, stream, Kind.POSES, Kind.READINGS).name
         kind, columns, table = _topic(_topics(path)[name])
         stamps = ["header.stamp.sec", "header.stamp.nanosec"]
         times = numbers(table, ["timestamp"])[0][:, 0] * 1e-9  # of receipt
         if set(stamps) <= set(table.header):
             stated = numbers(table, stamps)[0] @ [1.0, 1e-9]
             times = np.where(stated == 0, times, stated)
-        frames = _frames(table) if kind == POSES else []
+        frames = _frames(table) if kind == Kind.POSES else []
         if len(frames) > 1:
             listed = ", ".join(frames[:4])
             raise NeecoError(f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame")
         joints = (joint_column(name) for name in _joint_names(table, columns))
         values, _, bad = numbers(table, columns)
         return Table(
-            path, POSE_HEADER if kind == POSES else unique_names(["t_s", *joints]),
+            path, POSE_HEADER if kind == Kind.POSES else unique_names(["t_s", *joints]),
             np.column_stack([times - start, values]), table.lines, stream=name,
             notes=(f"{path.name}: {name}: {len(bad)} rows cannot be read; left out",) if bad else (),
             stated_in=frames[0] if frames else None, meaning=meaning_of(frames[0], dvrk=True) if frames else None,
@@ -133,7 +120,7 @@ class DvrkSession(RecordingFormat):
         films, absent = _films(path)
         if (why := absent.get(re.sub(r"\.(left|right)$", "", stream or ""))) is not None:
             raise NeecoError(why)
-        name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        name = self.choose(path, stream, Kind.IMAGES).name
         if name not in films:
             raise NeecoError(f"{path}: stream: {printable(name)} is in the bag; name the bag as the video's file")
         film, times = films[name], films[name].times - _start(path)
@@ -247,17 +234,17 @@ def _topic_of(file: Path) -> str | None:
     return "/" + line.removeprefix(TOPIC).strip() if line.startswith(TOPIC) else None
 
 
-def _topic(file: Path) -> tuple[str, list[str], Table]:
-    """POSES, READINGS or OTHER, the columns that hold them, and the table of a topic's CSV file."""
+def _topic(file: Path) -> tuple[Kind, list[str], Table]:
+    """Kind.POSES, Kind.READINGS or Kind.OTHER, the columns that hold them, and the table of a topic's CSV file."""
     table = DelimitedText().read(file)
     for position, rotation in _POSE_PARTS:
         wanted = [*(position + axis for axis in "xyz"), *(rotation + axis for axis in "xyzw")]
         if set(wanted) <= set(table.header):
-            return POSES, wanted, table
+            return Kind.POSES, wanted, table
     joints: list[str] = []
     while f"position.{len(joints)}" in table.header:
         joints.append(f"position.{len(joints)}")
-    return READINGS if joints else OTHER, joints, table
+    return Kind.READINGS if joints else Kind.OTHER, joints, table
 
 
 def _joint_names(table: Table, columns: list[str]) -> list[str]:

@@ -1,7 +1,7 @@
 """The meaning of a frame's name: a camera's with known axes, a robot's base or a tracker's, or nothing certain.
 
 A frame's name is not its axes: the dVRK's ECM and the optical frame of ROS have one origin and are half a turn apart. A
-name that fits several conventions is asked for, never guessed.
+name that fits several conventions is asked for, never guessed. What a camera is called also says which comes first.
 """
 
 from __future__ import annotations
@@ -136,3 +136,11 @@ def unsaid(*, dvrk: bool = False) -> NamedFrame:
 def of_dvrk(*names: str) -> bool:
     """Return whether any of some names of topics, columns or files is a dVRK's."""
     return any(_DVRK.search(name) for name in names)
+
+
+def camera_order(name: str) -> tuple[bool | str, ...]:
+    """Return a sort key of cameras by name: those at a wrist last; the left one first, the right one last; raw images
+    before compressed ones."""
+    lower = name.lower()
+    at_wrist = "wrist" in lower or "psm" in lower
+    return at_wrist, "right" in lower, "left" not in lower, lower.endswith("/compressed"), name

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import evenly_spaced
-from neeco.ingest.readers.logs import PoseLog, ReadingLog
+from neeco.ingest.readers.logs import PoseLog, ReadingLog, SampleLog
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ def reading_smoothing(log: ReadingLog) -> float:
 class _Series:
     """Samples [T, D] of a log, in stretches without gaps: vectors, or what else has differences (`relative`)."""
 
-    def __init__(self, log: PoseLog | ReadingLog, values: np.ndarray) -> None:
+    def __init__(self, log: SampleLog, values: np.ndarray) -> None:
         self.times, self.values = log.times, values
         starts = np.searchsorted(self.times, [end for _, end in log.gaps])
         stretch = np.zeros(len(self.times), dtype=np.int64)
@@ -239,12 +239,9 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
 
 def _lagrange(samples: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Weights [N, K] of values at samples [N, K] s in the polynomial through them, at times [N] s."""
-    weights = np.ones_like(samples)
-    for one in range(samples.shape[1]):
-        for other in range(samples.shape[1]):
-            if other != one:
-                weights[:, one] *= (times - samples[:, other]) / (samples[:, one] - samples[:, other])
-    return weights
+    others = ~np.eye(samples.shape[1], dtype=bool)
+    steps = np.where(others, samples[:, :, None] - samples[:, None], 1)
+    return np.asarray(np.where(others, (times[:, None] - samples)[:, None] / steps, 1).prod(axis=-1))
 
 
 def _noise(values: np.ndarray) -> float:

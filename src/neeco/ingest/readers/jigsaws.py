@@ -9,14 +9,13 @@ The layout is that of the data set's readme (Gao et al. 2014, "The JHU-ISI Gestu
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
-from neeco.ingest.readers import POSES, RecordingFormat, Stream, Table, choose_stream, file_state, parse_number
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, kept, parse_number
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.delimited import read_cells
 from neeco.ingest.readers.frame_names import NamedFrame
@@ -42,10 +41,10 @@ class JigsawsKinematics(RecordingFormat):
         )
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        count = len(_lines(path, file_state(path))[0])
+        count = len(_lines(path)[0])
         return tuple(
             Stream(
-                arm, POSES, "tool tip in the arm's base", count, RATE_HZ, offered=arm.startswith("slave"),
+                arm, Kind.POSES, "tool tip in the arm's base", count, RATE_HZ, offered=arm.startswith("slave"),
                 body=arm.replace(" ", "_"), joints=(("gripper_angle", GRIPPER),), clock=VIDEO_CLOCK,
                 hints=("poses are stated in the frame of this arm's own base",),
             )
@@ -53,8 +52,8 @@ class JigsawsKinematics(RecordingFormat):
         )  # fmt: skip
 
     def read(self, path: Path, stream: str | None = None) -> Table:
-        arm = choose_stream(path, self.streams(path), stream, (POSES,)).name
-        values, lines = _lines(path, file_state(path))
+        arm = self.choose(path, stream, Kind.POSES).name
+        values, lines = _lines(path)
         bad = np.isnan(values).any(axis=1)
         if bad.any():
             problem = f"has not {COLUMNS * len(ARMS)} numbers"
@@ -64,8 +63,8 @@ class JigsawsKinematics(RecordingFormat):
         return Table(path, HEADER, rows, lines, stream=arm, meaning=NamedFrame(BASE), image_hz=RATE_HZ)
 
 
-@lru_cache(maxsize=2)
-def _lines(path: Path, state: tuple[object, ...]) -> tuple[np.ndarray, np.ndarray]:
+@kept
+def _lines(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return numbers [R, 76], NaN in lines that have not as many, and the lines [R] that they stand in."""
     text, count = read_cells(path), COLUMNS * len(ARMS)
     cells = text.cells[:, :count].tolist()

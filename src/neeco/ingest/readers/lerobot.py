@@ -7,12 +7,14 @@ a quaternion or the frame that poses are stated in; where the columns' names do 
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from io import BytesIO
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -21,40 +23,12 @@ from PIL import Image
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
-from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
 from neeco.geometry.rotations import rotation_error
-from neeco.ingest.readers import (
-    IMAGES,
-    OTHER,
-    POSES,
-    READINGS,
-    RecordingFormat,
-    Stream,
-    Table,
-    VideoSource,
-    choose_stream,
-    compare_counts,
-)
-from neeco.ingest.readers.columns import (
-    QUATERNION_WXYZ,
-    ROTATION_MATRIX,
-    joint_columns,
-    pose_bodies,
-    recognise_pose,
-    split_unit,
-)
-from neeco.ingest.readers.frame_names import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
-from neeco.ingest.readers.lerobot_files import (
-    FIXED,
-    DataSet,
-    Episode,
-    Feature,
-    LeRobotLimits,
-    batches,
-    parquet_names,
-    read_data_set,
-)
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, one_line
+from neeco.ingest.readers import columns as named
+from neeco.ingest.readers.frame_names import NamedFrame, camera_order, meaning_in, of_dvrk, unsaid, without_frame
+from neeco.ingest.readers.lerobot_files import FIXED, DataSet, Episode, Feature, LeRobotLimits, batches, read_data_set
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
 TIME = "timestamp_s"
@@ -78,14 +52,30 @@ class LeRobot(RecordingFormat):
     def streams(self, path: Path) -> tuple[Stream, ...]:
         """Return those of the first episode that was downloaded; all others have the same."""
         data = self._data_set(path)
-        streams = self._episode_streams(data, data.first_present())
+        episode, images, tables = data.first_present(), list[Stream](), list[Stream]()
+        absent = data.absent(episode)
+        for key, feature in data.features.items():
+            kind, title = _kind(feature), f"{feature.dtype} of {'x'.join(map(str, feature.shape))}"
+            stream = Stream(f"episode {episode.number}/{key}", kind, title, episode.length, data.fps)
+            if kind != Kind.OTHER and key in absent:
+                tables.append(replace(stream, problem=absent[key]))
+            elif kind == Kind.IMAGES:
+                images.append(stream)
+            elif kind == Kind.READINGS:
+                try:
+                    tables += self._bodies(data, episode, feature, stream)
+                except NeecoError as error:
+                    tables.append(replace(stream, problem=str(error)))
+            elif key not in FIXED:
+                tables.append(stream)
+        images.sort(key=lambda stream: camera_order(stream.name))
         if len(data.records) > 1:
-            streams = (*streams, Stream(data.range_words, OTHER, "episodes with the same streams", len(data.records)))
-        return streams
+            tables.append(Stream(data.range_words, Kind.OTHER, "episodes with the same streams", len(data.records)))
+        return (*images, *tables)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         data = self._data_set(path)
-        episode, key = self._chosen(data, stream, (POSES, READINGS))
+        episode, key = self._chosen(data, stream, Kind.POSES, Kind.READINGS)
         names, name = data.features[key].names, f"episode {episode.number}/{key}"
         times, order, _, notes = _times(data, episode)
         rows = np.column_stack([times, data.columns(episode, {key: len(names)})[key][order]])
@@ -96,7 +86,7 @@ class LeRobot(RecordingFormat):
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         data = self._data_set(path)
-        episode, key = self._chosen(data, stream, (IMAGES,))
+        episode, key = self._chosen(data, stream, Kind.IMAGES)
         times, order, places, notes = _times(data, episode)
         if data.features[key].dtype == "image":
             stored = _Stored(
@@ -132,8 +122,8 @@ class LeRobot(RecordingFormat):
         )  # fmt: skip
 
     def clock(self, path: Path, stream: str | None) -> str:
-        match = None if stream is None else _NAME.fullmatch(stream)
-        return "" if match is None else f"episode {int(match[1])}"
+        match = _NAME.fullmatch(stream or "")
+        return f"episode {int(match[1])}" if match else ""
 
     def of_episode(self, stream: str, episode: int) -> str | None:
         match = _NAME.fullmatch(stream)
@@ -143,69 +133,42 @@ class LeRobot(RecordingFormat):
         self.require_package(path)
         return read_data_set(path, self.limits)
 
-    def _chosen(self, data: DataSet, stream: str | None, kinds: Sequence[str]) -> tuple[Episode, str]:
+    def _chosen(self, data: DataSet, stream: str | None, *kinds: Kind) -> tuple[Episode, str]:
         """Return the episode and the feature that a stream names; the only ones there are where none is named."""
-        match = None if stream is None else _NAME.fullmatch(stream)
+        match = _NAME.fullmatch(stream or "")
         number = int(match[1]) if match else min(data.records)
         wanted = f"episode {number}/{match[2]}" if match else stream
-        named = [Stream(f"episode {number}/{key}", _kind(each), each.dtype, 0) for key, each in data.features.items()]
+        streams = [Stream(f"episode {number}/{key}", _kind(each), each.dtype, 0) for key, each in data.features.items()]
         if stream is None and len(data.records) > 1:
-            examples = ", ".join(candidate.name for candidate in named if candidate.kind in kinds)[:300]
+            examples = ", ".join(candidate.name for candidate in streams if candidate.kind in kinds)[:300]
             what = f"missing, and there are {data.range_words}; name one, as in {examples}"
             raise NeecoError(f"{data.path}: stream: {what}")
-        key = choose_stream(data.path, named, wanted, kinds).name.partition("/")[2]
+        key = self.choose(data.path, wanted, *kinds, streams=streams).name.partition("/")[2]
         return data.episode(number), key
 
-    def _episode_streams(self, data: DataSet, episode: Episode) -> tuple[Stream, ...]:
-        streams = []
-        absent = dict(episode.absent)
-        for key in set(data.features) - set(data.films) - set(parquet_names(episode.data, self.limits)):
-            absent[key] = f"{episode.data}: has no column {printable(key)}; download the data set again"
-        for key in sorted(data.features, key=_camera_order):
-            feature, name = data.features[key], f"episode {episode.number}/{key}"
-            if _kind(feature) == IMAGES:
-                title = f"{feature.dtype} {'x'.join(map(str, feature.shape))}"
-                streams.append(Stream(name, IMAGES, title, episode.length, data.fps, problem=absent.get(key)))
-        for key, feature in data.features.items():
-            name, kind = f"episode {episode.number}/{key}", _kind(feature)
-            if kind == READINGS:
-                try:
-                    if key in absent:
-                        raise NeecoError(absent[key])
-                    streams += self._table_streams(data, feature, name, episode)
-                except NeecoError as error:
-                    title = f"{feature.dtype} of {len(feature.names)}"
-                    streams.append(Stream(name, READINGS, title, episode.length, data.fps, problem=str(error)))
-            elif kind == OTHER and key not in FIXED:
-                streams.append(Stream(name, OTHER, f"{feature.dtype} {list(feature.shape)}", episode.length, data.fps))
-        return tuple(streams)
-
-    def _table_streams(self, data: DataSet, feature: Feature, name: str, episode: Episode) -> list[Stream]:
+    def _bodies(self, data: DataSet, episode: Episode, feature: Feature, stream: Stream) -> list[Stream]:
         """Return a stream for every body that the names of a feature's columns distinguish."""
-        title = f"{feature.dtype} of {len(feature.names)}"
-        plain = Stream(name, READINGS, title, episode.length, data.fps, offered=False)
+        plain = replace(stream, offered=False)
         if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
             return [plain]
-        bodies = pose_bodies(feature.names)
-        readings, streams = joint_columns(feature.names, bodies), []
+        bodies = named.pose_bodies(feature.names)
+        readings, found = named.joint_columns(feature.names, bodies), []
         for prefix, columns in bodies.items():
-            body, poses = without_frame(prefix), recognise_pose(columns)
+            body, poses = without_frame(prefix), named.recognise_pose(columns)
             if poses.position is None:
                 continue
             of_body = [name for name in readings if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
+            joints = tuple((_joint_name(name, body), name) for name in of_body)
             columns = tuple(name for name in columns if name not in readings)
             asks = () if poses.rotation else _rotation_asks(data, episode, feature, columns)
-            meaning = _meaning(feature.key, columns)
-            streams.append(
-                replace(
-                    plain, kind=POSES, offered=True, body=body or UNNAMED, columns=columns, hints=meaning.hints,
-                    joints=tuple((_joint_name(name, body), name) for name in of_body), asks=(*meaning.asks, *asks),
-                )
-            )  # fmt: skip
-        if not streams and (asks := _rotation_asks(data, episode, feature, feature.names)):
-            meaning = _meaning(feature.key, feature.names)
-            asked = replace(plain, kind=POSES, offered=True, body=UNNAMED, joints=(), columns=())
-            streams = [replace(asked, hints=meaning.hints, asks=(*meaning.asks, *asks))]
+            found.append((body or UNNAMED, columns, joints, asks))
+        if not found and (asks := _rotation_asks(data, episode, feature, feature.names)):
+            found.append((UNNAMED, (), (), asks))
+        streams = []
+        for body, columns, joints, asks in found:
+            meaning = _meaning(feature.key, columns or feature.names)
+            posed = replace(plain, kind=Kind.POSES, offered=True, body=body, columns=columns, joints=joints)
+            streams.append(replace(posed, hints=meaning.hints, asks=(*meaning.asks, *asks)))
         return streams or [plain]
 
 
@@ -220,14 +183,11 @@ class _Stored(VideoSource):
     rows: tuple[int, ...]
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        wanted = {self.rows[int(index)]: int(index) for index in indices}
-        row = 0
+        wanted, rows = {self.rows[int(index)]: int(index) for index in indices}, count()
         with ThreadPoolExecutor(DECODERS) as pool:  # zlib lets other threads run
             for cells in self._cells():
-                chosen = [number for number in range(row, row + len(cells)) if number in wanted]
-                contents = [cells[number - row] for number in chosen]
-                row += len(cells)
-                for number, pixels in zip(chosen, pool.map(self._decoded, chosen, contents), strict=True):
+                chosen = {row: cell for cell, row in zip(cells, rows, strict=False) if row in wanted}
+                for number, pixels in zip(chosen, pool.map(self._decoded, chosen, chosen.values()), strict=True):
                     yield wanted.pop(number), pixels
                 if not wanted:
                     return
@@ -240,26 +200,17 @@ class _Stored(VideoSource):
         columns = ["episode_index", self.key]
         for part in batches(self.path, columns, self.limits, self.episode, self.limits.images_at_once):
             column = part.column(self.key)
-            if pyarrow.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0:
-                column = column.field("bytes")
-            if not (pyarrow.types.is_binary(column.type) or pyarrow.types.is_large_binary(column.type)):
-                kind = printable(str(column.type))
-                raise NeecoError(f"{self.path}: {self.key}: holds {kind}, no images; name another feature")
-            yield column.to_pylist()
+            with one_line(f"{self.path}: {self.key}", "holds no images", "name another feature"):
+                column = column.field("bytes") if pyarrow.types.is_struct(column.type) else column
+                cells = column.cast(pyarrow.large_binary()).to_pylist()
+            yield cells
 
     def _decoded(self, row: int, cell: bytes | None) -> np.ndarray:
         where = f"{self.path}: {self.key}: row {row} of episode {self.episode}"
         if cell is None:
             raise NeecoError(f"{where}: has no image in it; write the data set with its images")
-        try:
-            with Image.open(BytesIO(cell), formats=FORMATS) as image:
-                if image.size[0] * image.size[1] > self.limits.pixels:
-                    raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
-                pixels = np.array(image.convert("RGB"))
-        except NeecoError:
-            raise
-        except Exception as error:  # Pillow's decoders raise nearly anything
-            raise NeecoError(f"{where}: cannot be decoded; download the episode again") from error
+        with one_line(where, "cannot be decoded", "download the episode again"):
+            pixels = np.array(Image.open(BytesIO(cell), formats=FORMATS).convert("RGB"))
         if self.size not in ((0, 0), pixels.shape[1::-1]):
             height, width = pixels.shape[:2]
             raise NeecoError(f"{where}: is {width}x{height}, the first {self.size[0]}x{self.size[1]}; repair it")
@@ -272,12 +223,10 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.
     table = data.columns(episode, {"timestamp": 1, "frame_index": 1})
     order = np.argsort(table["frame_index"][:, 0], kind="stable")
     frames, stamps = table["frame_index"][order, 0], table["timestamp"][order, 0]
-    if len(frames) != episode.length:
-        what = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}"
-        raise NeecoError(f"{episode.data}: {what}; download the data set again")
-    rows = np.arange(len(frames))
+    rows = np.arange(episode.length)
     if not np.array_equal(frames, rows):
-        raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")
+        what = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}, counted by frame_index"
+        raise NeecoError(f"{episode.data}: {what} from 0; download the data set again")
     title = f"{data.path.name}: episode {episode.number}: its timestamps"
     if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
         return frames / data.fps, order, rows, (f"{title} do not increase; taken as {data.fps:g} a second",)
@@ -287,10 +236,10 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.
     return stamps - stamps[0], order, rows, (f"{title} name no images; state i is taken to be of image i",)
 
 
-def _kind(feature: Feature) -> str:
+def _kind(feature: Feature) -> Kind:
     if feature.dtype in ("video", "image") and not feature.is_depth:
-        return IMAGES
-    return READINGS if feature.names and feature.key not in FIXED else OTHER
+        return Kind.IMAGES
+    return Kind.READINGS if feature.names and feature.key not in FIXED else Kind.OTHER
 
 
 def _meaning(key: str, columns: Sequence[str]) -> NamedFrame:
@@ -309,10 +258,10 @@ def find_rotations(values: np.ndarray, tolerance: float) -> list[tuple[int, str]
         four, nine = values[:, place : place + 4], values[:, place : place + 9]
         matrices = nine.reshape(-1, 3, 3) if nine.shape[1] == 9 else np.zeros((1, 3, 3))
         if rotation_error(matrices).max() < tolerance and (np.linalg.det(matrices) > 0).all():
-            rotations.append((place, ROTATION_MATRIX))
+            rotations.append((place, named.ROTATION_MATRIX))
             place += 9
         elif np.abs(np.linalg.norm(four, axis=1) - 1).max() < tolerance and (np.ptp(four, axis=0) > 0).sum() > 1:
-            rotations.append((place, QUATERNION_WXYZ))
+            rotations.append((place, named.QUATERNION_WXYZ))
             place += 4
         else:
             place += 1
@@ -325,25 +274,15 @@ def _rotation_asks(data: DataSet, episode: Episode, feature: Feature, columns: S
     values, asks = values[:, [feature.names.index(column) for column in columns]], []
     for place, kind in find_rotations(values, data.limits.unit_tolerance):
         size, why = 4, "or quaternion_xyzw: their length is 1, nothing says their order"
-        if kind == ROTATION_MATRIX:
+        if kind == named.ROTATION_MATRIX:
             size, why = 9, "or column by column: list them so that they stand row by row"
         if place >= 3:
-            asks.append(f"  position: {_flow(columns[place - 3 : place])}   # stands before the rotation")
-        asks.append(f"  {kind}: {_flow(columns[place : place + size])}   # {why}")
+            asks.append(f"  position: {json.dumps(columns[place - 3 : place])}   # stands before the rotation")
+        asks.append(f"  {kind}: {json.dumps(columns[place : place + size])}   # {why}")
     return tuple(asks)
-
-
-def _flow(columns: Sequence[str]) -> str:
-    return "[" + ", ".join(f'"{column}"' for column in columns) + "]"
 
 
 def _joint_name(column: str, body: str) -> str:
     """Return `jaw` of `psm1_jaw`, without the unit."""
-    words = [word for word in re.split(r"[_.\-/]+", split_unit(column, "angle")[0]) if word and word != body]
+    words = [word for word in re.split(r"[_.\-/]+", named.split_unit(column, "angle")[0]) if word and word != body]
     return "_".join(words) or column
-
-
-def _camera_order(key: str) -> tuple[bool, bool, bool, str]:
-    """Return a sort key: endoscopes before cameras at the wrist, the left one first, the right one last."""
-    name = key.lower()
-    return "wrist" in name or "psm" in name, "right" in name, "left" not in name, key

@@ -6,7 +6,6 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -17,7 +16,7 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_json, read_text, require_content, require_inside, visible_entries
 from neeco.capture.documents import as_float, printable
-from neeco.ingest.readers import file_state
+from neeco.ingest.readers import file_state, one_line
 
 INFO = "meta/info.json"
 EPISODES_2, EPISODES_3 = "meta/episodes.jsonl", "meta/episodes"
@@ -25,6 +24,7 @@ VERSIONS = re.compile(r"v?(2)\.[01]|v?(3)\.0")
 FILM_COLUMNS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")  # of each camera, version 3
 FIXED = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns that every data set has
 _FIELD = re.compile(r"\{(\w+)(?::(0?\d{1,2}d))?\}")
+_DAMAGE = "cannot be read as Parquet", "download it again"
 Record = dict[str, int | float]
 
 
@@ -35,7 +35,6 @@ class LeRobotLimits:
     numbers: int = 4096  # limit on the numbers of one feature in a row; more are an image or a point cloud
     group_bytes: int = 1 << 30  # limit on the unpacked bytes of the columns read of a row group
     buffer_bytes: int = 1 << 20  # bytes of a column read at a time
-    pixels: int = 90_000_000  # limit on the pixels of an image, as for files of images
     images_at_once: int = 16  # images decoded at once, where Parquet holds them
     film_images: int = 10**7  # limit on the images of a video; larger timestamps are a clock's
     unit_tolerance: float = 1e-3  # tolerance of a quaternion's length and of R^T R - I: rounding of float32 and text
@@ -125,13 +124,17 @@ class DataSet:
         one."""
         if self.version == 2:
             return self._file("video_path", {**place, "video_key": key}), None
-        of_film = {name: record.get(f"videos/{key}/{name}") for name in FILM_COLUMNS}
+        of_film = {name: record.get(f"videos/{key}/{name}", np.nan) for name in FILM_COLUMNS}
         start, end = of_film["from_timestamp"], of_film["to_timestamp"]
-        if None in of_film.values() or start is None or end is None:
-            raise _NotThere(f"{self.path / EPISODES_3}: states no images of {printable(key)}; download it again")
         if not 0 <= start < end < 1e9:  # NaN compares false
-            raise NeecoError(f"{self.path}: {key}: from {start:g} to {end:g} s is no part of a video; correct meta")
+            raise _NotThere(f"{self.path / EPISODES_3}: states no images of {printable(key)}; download it again")
         return self._file("video_path", {**of_film, "video_key": key}), (start, end)
+
+    def absent(self, episode: Episode) -> dict[str, str]:
+        """Return why features of an episode cannot be read, by key: their column or their camera's file is missing."""
+        there, where = {*self.films, *parquet_names(episode.data, self.limits)}, f"{episode.data}: has no column"
+        columns = [key for key in self.features if key not in there]
+        return {key: f"{where} {printable(key)}; download the data set again" for key in columns} | {**episode.absent}
 
     def columns(self, episode: Episode, widths: Mapping[str, int]) -> dict[str, np.ndarray]:
         """Return columns of an episode as `read_columns` does."""
@@ -287,15 +290,14 @@ def batches(
             listed = printable(", ".join(file.physical_schema.names), 300).strip("'")
             raise NeecoError(f"{path}: has no column {printable(name)}; its columns are {listed}")
     wanted = None if episode is None else pyarrow.dataset.field("episode_index") == episode
-    with _damage_named(path):
+    with one_line(path, *_DAMAGE):
         part = file if wanted is None else file.subset(filter=wanted)  # by the statistics of its row groups
+        leaves = tuple(f"{name}." for name in columns)
         for group in part.row_groups:
-            data, leaves = file.metadata.row_group(group.id), tuple(f"{name}." for name in columns)
-            chunks = [data.column(index) for index in range(data.num_columns)]
-            read = [chunk for chunk in chunks if f"{chunk.path_in_schema}.".startswith(leaves)]
-            if sum(chunk.total_uncompressed_size for chunk in read) > limits.group_bytes:
-                size = f"{limits.group_bytes >> 20} MiB"
-                raise NeecoError(f"{path}: unpacks to over {size} at once; write smaller row groups")
+            data = file.metadata.row_group(group.id).to_dict()["columns"]
+            read = [chunk for chunk in data if f"{chunk['path_in_schema']}.".startswith(leaves)]
+            if sum(chunk["total_uncompressed_size"] for chunk in read) > limits.group_bytes:
+                raise NeecoError(f"{path}: unpacks to over {limits.group_bytes} bytes; write smaller row groups")
         yield from part.to_batches(
             columns=list(columns), filter=wanted, batch_size=rows, batch_readahead=0, use_threads=False
         )
@@ -306,27 +308,13 @@ def _fragment(path: Path, limits: LeRobotLimits) -> Any:
     import pyarrow.fs
 
     require_content(path)
-    with _damage_named(path):
+    with one_line(path, *_DAMAGE):
         # a buffer: else all of a column is taken into memory, and images can stand in it
         options = pyarrow.dataset.ParquetFragmentScanOptions(use_buffered_stream=True, buffer_size=limits.buffer_bytes)
         kind = pyarrow.dataset.ParquetFileFormat(default_fragment_scan_options=options)
         fragment = kind.make_fragment(str(path), pyarrow.fs.LocalFileSystem())
         fragment.physical_schema  # noqa: B018  # which reads the file's own description
         return fragment
-
-
-@contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    """Turn what pyarrow raises into one line."""
-    import pyarrow
-
-    try:
-        yield
-    except NeecoError:
-        raise
-    except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, MemoryError) as error:
-        reason = " ".join(str(error).split())[:100] or type(error).__name__
-        raise NeecoError(f"{path}: cannot be read as Parquet ({reason}); download it again") from None
 
 
 def _boundary(path: Path) -> Path:

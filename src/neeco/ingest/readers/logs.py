@@ -44,40 +44,38 @@ SETTINGS = LogSettings()
 
 
 @dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
-class PoseLog:
-    """Poses tracker_from_sensor over time, on the log's own clock: t_log = t_video + offset.
-
-    times [T] s, increasing; positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; gaps: (last time before,
-    first time after) where samples are missing; notes: what was dropped or repaired, in words; frame: what the poses
-    are stated in, CAMERA (OpenCV's axes) or BASE; stated_in: what the file calls it, None where it does not, or the
-    recording says; image_hz: as in `Table`.
-    """
+class SampleLog:
+    """Samples over time, on the log's own clock: t_log = t_video + offset. times [T] s, increasing; gaps: (last time
+    before, first time after) where samples are missing; notes: what was dropped or repaired, in words; image_hz: as in
+    `Table`."""
 
     path: Path
     clock: str
     times: np.ndarray
+    _: KW_ONLY
+    gaps: tuple[tuple[float, float], ...] = ()
+    notes: tuple[str, ...] = ()
+    image_hz: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PoseLog(SampleLog):
+    """Poses tracker_from_sensor: positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; frame: what they are
+    stated in, CAMERA (OpenCV's axes) or BASE; stated_in: what the file calls it, None where it does not, or the
+    recording says."""
+
     positions: np.ndarray
     quats: np.ndarray
     _: KW_ONLY
-    gaps: tuple[tuple[float, float], ...] = ()
-    notes: tuple[str, ...] = ()
     frame: str = named.BASE
     stated_in: str | None = None
-    image_hz: float | None = None
 
 
-@dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
-class ReadingLog:
-    """Readings of a joint, rad, over time; fields as in PoseLog."""
+@dataclass(frozen=True, eq=False)
+class ReadingLog(SampleLog):
+    """Readings of a joint: values [T] rad."""
 
-    path: Path
-    clock: str
-    times: np.ndarray
     values: np.ndarray
-    _: KW_ONLY
-    gaps: tuple[tuple[float, float], ...] = ()
-    notes: tuple[str, ...] = ()
-    image_hz: float | None = None
 
 
 def read_pose_log(source: PoseColumns) -> PoseLog:
@@ -98,18 +96,14 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     quats, flips = continuous(quats[order])
     if flips:
         rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
-    gaps, gap_notes = find_gaps(table, times)
-    notes = (*rows.notes(), *gap_notes)
-    stated_in = table.stated_in if source.frame is None else None
-    positions = positions[order]
-    if frame != named.BASE:
-        positions, quats = in_opencv(frame, positions, quats)
-        frame = named.CAMERA
-        if source.frame is None and table.meaning is not None:
-            notes = (*notes, f"{table.title}: poses are stated in {table.meaning.why}")
+    gaps = find_gaps(rows, times)
+    if frame != named.BASE and source.frame is None and table.meaning is not None:
+        rows.repairs.append(f"poses are stated in {table.meaning.why}")
+    positions, quats = in_opencv(frame, positions[order], quats)
     return PoseLog(
-        table.path, source.clock, times, positions, quats, gaps=gaps, notes=notes, frame=frame, stated_in=stated_in,
-        image_hz=table.image_hz,
+        table.path, source.clock, times, positions, quats, gaps=gaps, notes=rows.notes(), image_hz=table.image_hz,
+        frame=named.BASE if frame == named.BASE else named.CAMERA,
+        stated_in=table.stated_in if source.frame is None else None,
     )  # fmt: skip
 
 
@@ -179,9 +173,8 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     rows = Rows(table)
     times = read_times(rows, source, when)
     values = read_cells(rows, (value,))[:, 0]
-    clamped: tuple[str, ...] = ()
     if source.calibration is not None:
-        values, clamped = _calibrated(rows, value, values, source)
+        values = _calibrated(rows, value, values, source.calibration, source.units.angle)
     else:
         hint = " Counts need a calibration table, `calibration`."
         values = values * named.scale_of(table.where, (value,), "angle", source.units.angle, None, hint)
@@ -189,9 +182,8 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
         rows.drop_wrong(impossible, reason)
     times, order = in_order(rows, times, source.rate_hz)
-    gaps, gap_notes = find_gaps(table, times)
-    notes = (*rows.notes(), *clamped, *gap_notes)
-    return ReadingLog(table.path, source.clock, times, values[order], gaps=gaps, notes=notes, image_hz=table.image_hz)
+    gaps, image_hz = find_gaps(rows, times), table.image_hz
+    return ReadingLog(table.path, source.clock, times, values[order], gaps=gaps, notes=rows.notes(), image_hz=image_hz)
 
 
 def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
@@ -252,12 +244,9 @@ def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: 
     """
     quats, good = np.full((len(cells), 4), np.nan), np.isfinite(cells).all(axis=1)
     if form in (named.QUATERNION_WXYZ, named.QUATERNION_XYZW):
-        norms = np.linalg.norm(cells, axis=1)
-        good &= np.abs(norms - 1) <= SETTINGS.norm_tolerance
-        wxyz = cells if form == named.QUATERNION_WXYZ else cells[:, [3, 0, 1, 2]]
-        quats[good] = wxyz[good] / norms[good, None]
-        return quats, good
-    if form in (EULER, ROTATION_VECTOR):
+        good &= np.abs(np.linalg.norm(cells, axis=1) - 1) <= SETTINGS.norm_tolerance
+        turns = Rotation.from_quat(cells[good], scalar_first=form == named.QUATERNION_WXYZ)
+    elif form in (EULER, ROTATION_VECTOR):
         good &= (np.abs(cells * scale) < 1e4).all(axis=1)  # beyond, they are no angles, or their sine is noise
         angles = cells[good] * scale
         turns = Rotation.from_euler(convention or "", angles) if form == EULER else Rotation.from_rotvec(angles)
@@ -334,25 +323,20 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     return counts, angles
 
 
-def _calibrated(
-    rows: Rows, name: str, readings: np.ndarray, source: JointColumns
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _calibrated(rows: Rows, name: str, readings: np.ndarray, path: Path, angle_unit: str | None) -> np.ndarray:
     """Angles [R] rad of a column of counts, by PCHIP through the table (Fritsch & Carlson 1980), which is as monotone
     as its points. Just outside the table, its end is taken, with a note; rows farther outside are dropped."""
-    table, path = rows.table, source.calibration
-    assert path is not None
-    counts, angles = read_calibration(path, source.units.angle)
+    counts, angles = read_calibration(path, angle_unit)
     low, high = counts[0], counts[-1]
     readings = np.where(rows.keep, readings, low)
     excess = np.maximum(low - readings, readings - high)
     outside = excess > SETTINGS.clamped_share * (high - low)
     values = PchipInterpolator(counts, angles)(np.clip(readings, low, high))
     clamped = (excess > 0) & ~outside
-    notes: tuple[str, ...] = ()
     if clamped.any():
         by = f"{low:g} to {high:g}, by at most {excess[clamped].max():g}"
         what = f"{counted(int(clamped.sum()), 'row')} with {name} just outside the table {path.name} ({by})"
-        notes = (f"{table.title}: {what}: read as its end ({table.list_rows(table.lines[clamped])})",)
+        rows.repairs.append(f"{what}: read as its end ({rows.table.list_rows(rows.table.lines[clamped])})")
     reason = f"{name} lies far outside the calibration table {path.name}"
     rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
-    return values, notes
+    return np.asarray(values)

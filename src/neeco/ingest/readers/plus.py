@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,18 +19,7 @@ import numpy as np
 from neeco.base.errors import NeecoError, counted
 from neeco.base.files import open_file, require_content
 from neeco.capture.documents import printable
-from neeco.ingest.readers import (
-    IMAGES,
-    OTHER,
-    POSES,
-    RecordingFormat,
-    Stream,
-    Table,
-    VideoSource,
-    choose_stream,
-    file_state,
-    parse_number,
-)
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, kept, one_line, parse_number
 from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_of, of_dvrk
 
@@ -132,51 +121,30 @@ class FrameSequence:
         return {frame: stated.get(frame, GOOD) for frame in self.fields[name + TRANSFORM]}
 
 
-@dataclass
-class _Header:
-    """Fields of the file, in small letters, and of its frames; end: the byte where the data begins."""
-
-    path: Path
-    plain: dict[str, str] = field(default_factory=dict)
-    frames: dict[str, dict[int, str]] = field(default_factory=dict)
-    end: int = 0
-
-    def integers(self, name: str) -> list[int]:
-        words = self.plain.get(name.lower(), "").split()
-        if not words or not all(re.fullmatch(r"\d{1,12}", word) for word in words):
-            raise self.fault(f"{name}: expected whole numbers, found {printable(' '.join(words) or 'nothing')}")
-        return [int(word) for word in words]
-
-    def fault(self, what: str, file: Path | None = None) -> NeecoError:
-        return NeecoError(f"{file or self.path}: {what}; copy or export the sequence again")
-
-
-@lru_cache(maxsize=4)
-def read_sequence(path: Path, state: tuple[object, ...]) -> FrameSequence:
-    """The header of a sequence; `state` of the file distinguishes it from another of its name. Raises NeecoError where
-    it is none, is damaged, or says what the file does not hold."""
+@kept
+def read_sequence(path: Path) -> FrameSequence:
+    """Read the header of a sequence. Raises NeecoError where it is none, is damaged, or says what the file does not
+    hold."""
+    require_content(path)
     is_nrrd = path.suffix.lower() in NRRD
-    try:
-        with open_file(path, "a sequence") as stream:
-            header = _read_header(path, stream, is_nrrd)
-    except OSError as error:
-        raise NeecoError(f"{path}: cannot read: {error.strerror or error}; correct the path") from None
-    if not header.frames:
+    with one_line(path, "cannot read", "correct the path"), open_file(path, "a sequence") as stream:
+        plain, frames, start = _read_header(path, stream, is_nrrd)
+    if not frames:
         what = "holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence"
         raise NeecoError(f"{path}: {what}; give one, or another file")
-    plain, sizes = header.plain, header.integers("sizes" if is_nrrd else "DimSize")
+    sizes = _integers(path, plain, "sizes" if is_nrrd else "DimSize")
     usual = "" if is_nrrd else " ".join(["domain"] * (len(sizes) - 1) + ["list"])
-    size, count, channels = _dimensions(header, sizes, plain.get("kinds", usual).lower().split())
+    size, count, channels = _dimensions(path, sizes, plain.get("kinds", usual).lower().split())
     if "elementnumberofchannels" in plain:
-        channels = header.integers("ElementNumberOfChannels")[0]
+        channels = _integers(path, plain, "ElementNumberOfChannels")[0]
     if min(size) > 1:
         for name, allowed in (_NRRD_READ if is_nrrd else _META_READ).items():
             if (value := plain.get(name.lower(), "")).lower() not in allowed:
-                raise header.fault(f"{name}: is {printable(value or 'nothing')}, and {allowed[-1]} is read")
+                raise _fault(path, f"{name}: is {printable(value or 'nothing')}, and {allowed[-1]} is read")
         if channels not in (1, 3):
-            raise header.fault(f"has {channels} channels, and grey or RGB is read")
+            raise _fault(path, f"has {channels} channels, and grey or RGB is read")
     name = plain.get("data file", plain.get("datafile", plain.get("elementdatafile", "LOCAL")))
-    file, start = path, header.end
+    file = path
     if name.upper() != "LOCAL":
         file, start = path.parent / name, 0
         if Path(name).name != name or not file.is_file():
@@ -184,58 +152,68 @@ def read_sequence(path: Path, state: tuple[object, ...]) -> FrameSequence:
             raise NeecoError(f"{path}: {what}; put there what was written with it")
     packed = plain.get("encoding", "raw").lower() != "raw" or plain.get("compresseddata", "").lower() == "true"
     sequence = FrameSequence(
-        path=path, size=size, count=count, channels=channels, fields=header.frames, data=(file, start), packed=packed
+        path=path, size=size, count=count, channels=channels, fields=frames, data=(file, start), packed=packed
     )
     if sequence.has_images:
         require_content(file)
         available, promised = file.stat().st_size - start, sequence.frame_bytes * count
         stored = plain.get("compresseddatasize", "")
         if not packed and available != promised:
-            raise header.fault(f"holds {available / sequence.frame_bytes:.4g} images, its header states {count}", file)
+            raise _fault(file, f"holds {available / sequence.frame_bytes:.4g} images, its header states {count}")
         if packed and re.fullmatch(r"\d{1,18}", stored) and available < int(stored):
-            raise header.fault(f"holds {available} bytes of compressed images, its header states {stored}", file)
+            raise _fault(file, f"holds {available} bytes of compressed images, its header states {stored}")
         if packed and promised > LIMITS.zlib_ratio * (available + 64):
-            raise header.fault(f"holds {available} bytes, of which no {count} images of {size} can come", file)
+            raise _fault(file, f"holds {available} bytes, of which no {count} images of {size} can come")
     return sequence
 
 
-def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> _Header:
-    """MetaImage: `Name = value` lines, of which ElementDataFile is the last; NRRD: `field: value` and `key:=value`
-    lines up to an empty one, or to the end of a header by itself."""
-    header, ended = _Header(path), False
+def _fault(file: Path, what: str) -> NeecoError:
+    return NeecoError(f"{file}: {what}; copy or export the sequence again")
+
+
+def _integers(path: Path, plain: dict[str, str], name: str) -> list[int]:
+    words = plain.get(name.lower(), "").split()
+    if not words or not all(re.fullmatch(r"\d{1,12}", word) for word in words):
+        raise _fault(path, f"{name}: expected whole numbers, found {printable(' '.join(words) or 'nothing')}")
+    return [int(word) for word in words]
+
+
+def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> tuple[dict[str, str], dict[str, dict[int, str]], int]:
+    """Return the fields of the file, in small letters, those of its frames, and the byte where the data begins.
+    MetaImage: `Name = value` lines, of which ElementDataFile is the last; NRRD: `field: value` and `key:=value` lines
+    up to an empty one, or to the end of a header by itself."""
+    plain, frames = dict[str, str](), dict[str, dict[int, str]]()
     if is_nrrd and not stream.readline(LIMITS.line_bytes).startswith(b"NRRD000"):
-        raise header.fault("does not begin with NRRD000")
+        raise _fault(path, "does not begin with NRRD000")
     for line in iter(partial(stream.readline, LIMITS.line_bytes), b""):
         if len(line) == LIMITS.line_bytes or stream.tell() > LIMITS.header_bytes:
-            raise header.fault("its header does not end")
+            break
         text = line.decode("utf-8", "replace").strip()
         name, sign, value = (part.strip() for part in text.partition(":" if is_nrrd else "="))
         if text and not sign and not text.startswith("#"):
-            raise header.fault(f"{printable(text, 40)} is no {'`field: value`' if is_nrrd else '`Name = value`'}")
+            raise _fault(path, f"{printable(text, 40)} is no {'`field: value`' if is_nrrd else '`Name = value`'}")
         if match := _FRAME_FIELD.fullmatch(name):
-            header.frames.setdefault(match[2], {})[int(match[1])] = value.removeprefix("=").strip()
+            frames.setdefault(match[2], {})[int(match[1])] = value.removeprefix("=").strip()
         elif text:
-            header.plain[name.lower()] = value.removeprefix("=").strip()
-        ended = not text if is_nrrd else name.lower() == "elementdatafile"
-        if ended:
-            break
-    if not ended and not header.plain.keys() & {"data file", "datafile"}:
-        raise header.fault("its header does not end")
-    header.end = stream.tell()
-    return header
+            plain[name.lower()] = value.removeprefix("=").strip()
+        if not text if is_nrrd else name.lower() == "elementdatafile":
+            return plain, frames, stream.tell()
+    if stream.read(1) or not plain.keys() & {"data file", "datafile"}:
+        raise _fault(path, "its header does not end")
+    return plain, frames, stream.tell()
 
 
-def _dimensions(header: _Header, sizes: list[int], kinds: list[str]) -> tuple[tuple[int, int], int, int]:
+def _dimensions(path: Path, sizes: list[int], kinds: list[str]) -> tuple[tuple[int, int], int, int]:
     """(width, height), how many frames, and channels, of axes of which the last counts the frames."""
     channels = 1
     if len(kinds) == len(sizes) and kinds and (kinds[0] == "vector" or kinds[0].endswith("color")):
         channels, sizes, kinds = sizes[0], sizes[1:], kinds[1:]
     if kinds != [*["domain"] * (len(sizes) - 1), kinds[-1] if kinds else ""] or kinds[-1] not in ("list", "time"):
-        raise header.fault("kinds: are not domain ... list, with the frames last")
+        raise _fault(path, "kinds: are not domain ... list, with the frames last")
     if len(sizes) not in (3, 4) or (len(sizes) == 4 and sizes[2] > 1):
-        raise header.fault(f"{sizes} is no sequence of images; expected width, height, frames")
+        raise _fault(path, f"{sizes} is no sequence of images; expected width, height, frames")
     if max(sizes[:2]) > LIMITS.side_px or sizes[-1] > LIMITS.frames:
-        raise header.fault(f"{sizes} is too large")
+        raise _fault(path, f"{sizes} is too large")
     return (sizes[0], sizes[1]), sizes[-1], channels
 
 
@@ -248,25 +226,31 @@ class SequenceImages(VideoSource):
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         sequence, wanted = self.sequence, {self.frames[int(index)]: int(index) for index in indices}
-        (file, start), length, last = sequence.data, sequence.frame_bytes, max(wanted, default=-1)
+        (file, start), length = sequence.data, sequence.frame_bytes
         shape = (sequence.size[1], sequence.size[0], sequence.channels)
-        try:
-            with open_file(file, "images of a sequence") as stream:
-                contents = _packed_frames(stream, start, length) if sequence.packed else iter(())
-                for number in range(last + 1) if sequence.packed else sorted(wanted):
-                    if not sequence.packed:
-                        stream.seek(start + number * length)
-                        contents = iter((stream.read(length),))
-                    content = next(contents, b"")
-                    if len(content) < length:
-                        raise NeecoError(f"{file}: its images end early; copy or export the sequence again")
-                    if number in wanted:
-                        pixels = np.frombuffer(content, np.uint8).reshape(shape)
-                        yield wanted[number], np.broadcast_to(pixels, (*shape[:2], 3)).copy()
-                if last == sequence.count - 1 and next(contents, b""):
-                    raise NeecoError(f"{file}: holds more images than its header says; export the sequence again")
-        except (zlib.error, OSError) as error:
-            raise NeecoError(f"{file}: its images are damaged ({error}); copy or export the sequence again") from None
+        with one_line(file, "its images are damaged", "copy or export the sequence again"):
+            for number, content in _frames(file, start, length, None if sequence.packed else sorted(wanted)):
+                if number == sequence.count:
+                    raise _fault(file, "holds more images than its header says")
+                if len(content) < length:
+                    break
+                if number in wanted:
+                    pixels = np.frombuffer(content, np.uint8).reshape(shape)
+                    yield wanted.pop(number), np.broadcast_to(pixels, (*shape[:2], 3)).copy()
+                if not wanted and number + 1 < sequence.count:
+                    return
+        if wanted:
+            raise _fault(file, "its images end early")
+
+
+def _frames(file: Path, start: int, length: int, numbers: Sequence[int] | None) -> Iterator[tuple[int, bytes]]:
+    """Yield the numbers and bytes of frames: those of raw data, or (None) all of packed data in their order."""
+    with open_file(file, "images of a sequence") as stream:
+        for number in numbers or ():
+            stream.seek(start + number * length)
+            yield number, stream.read(length)
+        if numbers is None:
+            yield from enumerate(_packed_frames(stream, start, length))
 
 
 def _packed_frames(stream: BinaryIO, start: int, length: int) -> Iterator[bytes]:
@@ -296,42 +280,35 @@ class PlusSequence(RecordingFormat):
     suffixes = (*META, *NRRD)
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        sequence = _sequence_of(path)
-        span = np.ptp([*sequence.times.values()])
-
-        def rate(count: int) -> float | None:
-            return (count - 1) / span if span > 0 and count > 1 else None
-
-        streams = []
+        sequence = read_sequence(path)
+        span, streams = float(np.ptp([*sequence.times.values()])), list[Stream]()
         if sequence.has_images:
             frames, notes = sequence.images
             title = f"{'grey' if sequence.channels == 1 else 'RGB'} images of {sequence.size[0]}x{sequence.size[1]}"
             why = f" ({notes[0].partition(': ')[2]})" if notes else ""
             few = f"{len(frames)} of {sequence.count} images can be used{why}; record again"
             problem = few if len(frames) < LIMITS.min_images else None
-            streams.append(Stream(IMAGE_STREAM, IMAGES, title, len(frames), rate(sequence.count), problem=problem))
+            streams.append(
+                Stream(IMAGE_STREAM, Kind.IMAGES, title, len(frames), _rate(sequence.count, span), problem=problem)
+            )
         for name in sequence.transforms:
             texts, (body, _, meaning) = sequence.fields[name + TRANSFORM], _ends(name)
             # what is the same in every frame is a calibration (ImageToProbe), no motion
             fixed = len(texts) > 1 and len(set(texts.values())) == 1
             statuses = [status.lower() for status in sequence.statuses(name).values()]
             problem = None if GOOD in statuses else _unusable(_status_words(name, statuses[0]))
-            kind, title = (OTHER, "fixed transform") if fixed else (POSES, "transform")
-            streams.append(
-                Stream(
-                    name, kind, title, len(texts), rate(len(texts)), body=body, hints=meaning.hints, asks=meaning.asks,
-                    problem=problem,
-                )
-            )  # fmt: skip
+            kind, title = (Kind.OTHER, "fixed transform") if fixed else (Kind.POSES, "transform")
+            stream = Stream(name, kind, title, len(texts), _rate(len(texts), span), body=body, problem=problem)
+            streams.append(replace(stream, hints=meaning.hints, asks=meaning.asks))
         return tuple(streams)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
-        sequence = _sequence_of(path)
+        sequence = read_sequence(path)
         if not sequence.transforms:
             what = "holds no transforms (Seq_Frame0000_StylusToTrackerTransform)"
             raise NeecoError(f"{path}: {what}; name a log of poses")
         wanted = None if stream is None else stream.removesuffix(TRANSFORM)
-        name = choose_stream(path, self.streams(path), wanted, (POSES,)).name
+        name = self.choose(path, wanted, Kind.POSES).name
         statuses, dropped = sequence.statuses(name), dict[str, list[int]]()
         rows, frames, (_, stated_in, meaning) = [], [], _ends(name)
         for frame, text in sorted(sequence.fields[name + TRANSFORM].items()):
@@ -356,16 +333,15 @@ class PlusSequence(RecordingFormat):
         return replace(table, notes=tuple(notes))
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
-        sequence = _sequence_of(path)
-        choose_stream(path, self.streams(path), stream, (IMAGES,))
+        sequence = read_sequence(path)
+        self.choose(path, stream, Kind.IMAGES)
         frames, notes = sequence.images
         seconds = np.array([sequence.times[frame] for frame in frames])
         return SequenceImages(path, sequence.size, notes, seconds, sequence=sequence, frames=tuple(frames))
 
 
-def _sequence_of(path: Path) -> FrameSequence:
-    require_content(path)
-    return read_sequence(path, file_state(path))
+def _rate(count: int, span: float) -> float | None:
+    return (count - 1) / span if span > 0 and count > 1 else None
 
 
 def _status_words(name: str, status: str) -> str:

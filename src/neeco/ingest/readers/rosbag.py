@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.base.errors import NeecoError, counted
+from neeco.base.errors import NeecoError
 from neeco.base.files import visible_entries
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
@@ -24,21 +24,9 @@ from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid
 from neeco.ingest.calibration.camera_fields import cameras_in
 from neeco.ingest.calibration.stereo import RosCamera, from_projections
-from neeco.ingest.readers import (
-    IMAGES,
-    OTHER,
-    POSES,
-    READINGS,
-    RecordingFormat,
-    Stream,
-    Table,
-    VideoSource,
-    choose_stream,
-    file_state,
-    rate_of,
-)
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, file_state
 from neeco.ingest.readers.columns import BASE, CAMERA, PoseColumns
-from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, meaning_of, of_dvrk
+from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, camera_order, meaning_of, of_dvrk
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import SETTINGS as LOGS
 from neeco.ingest.readers.logs import read_pose_log
@@ -82,11 +70,11 @@ class RosBag(RecordingFormat):
         survey = self._survey(path)
         if stream is not None and stream.startswith("tf:") and stream not in survey.poses:
             return _chained(survey, stream)
-        chosen = choose_stream(path, _streams(survey), stream, (POSES, READINGS)).name
+        chosen = self.choose(path, stream, Kind.POSES, Kind.READINGS).name
         if chosen in survey.joints:
             readings = survey.joints[chosen]
             header = ("t_s", *map(joint_column, _joint_names(chosen, readings)))
-            return _table(survey, chosen, readings, header, readings.table())
+            return survey.table(chosen, readings, header, readings.table())
         poses = survey.poses[chosen]
         if len(poses.frames) > 1:
             listed = ", ".join(sorted(poses.frames)[:4])
@@ -98,19 +86,19 @@ class RosBag(RecordingFormat):
             values[:, :3] = turn.apply(values[:, :3]) + turned[:3, 3] / MM_PER_M
             values[valid, 3:] = (turn * Rotation.from_quat(values[valid, 3:])).as_quat()
         stated_in = next(iter(poses.frames), None) or None
-        return replace(_table(survey, chosen, poses, POSE_HEADER, values), stated_in=stated_in, meaning=meaning)
+        return replace(survey.table(chosen, poses, POSE_HEADER, values), stated_in=stated_in, meaning=meaning)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         from neeco.ingest.readers._bagfile import open_topic
 
         survey = self._survey(path)
         if stream not in survey.images:
-            stream = choose_stream(path, _streams(survey), stream, (IMAGES,)).name
-        return open_topic(survey, stream, _time_notes(survey, stream, survey.images[stream]))
+            stream = self.choose(path, stream, Kind.IMAGES).name
+        return open_topic(survey, stream)
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         survey = self._survey(path)
-        chosen = stream if stream else choose_stream(path, _streams(survey), None, (IMAGES,)).name
+        chosen = stream if stream else self.choose(path, None, Kind.IMAGES).name
         camera = _camera(survey, _info_topic(survey, chosen, of_right=False), chosen)
         return None if camera is None else camera.lens()
 
@@ -140,12 +128,9 @@ class RosBag(RecordingFormat):
 @lru_cache(maxsize=4)
 def _streams(survey: Survey) -> tuple[Stream, ...]:
     images = [
-        Stream(
-            name, IMAGES if log.stamps or log.bad else OTHER, log.title, len(log.arrived),
-            rate_of(survey.seconds(log)), problem=log.problem,
-        )
-        for name, log in sorted(survey.images.items(), key=lambda item: _camera_order(item[0]))
-    ]  # fmt: skip
+        survey.stream(name, log, Kind.IMAGES if log.stamps or log.bad else Kind.OTHER)
+        for name, log in sorted(survey.images.items(), key=lambda item: camera_order(item[0]))
+    ]
     meanings = {name: _meaning(survey, name)[0] for name in sorted(survey.poses)}
     arms = {name for name in meanings if _DVRK_POSE.search(name)}
     poses = [_pose_stream(survey, name, meanings, arms) for name in meanings]
@@ -161,59 +146,30 @@ def _pose_stream(survey: Survey, name: str, meanings: Mapping[str, NamedFrame], 
         offered = not log.static and all(topic.startswith("tf:") for topic in survey.poses)
     else:
         offered = not _COMMANDS.search(name)
-    frame = ", ".join(sorted(log.frames)) or "no named frame"
-    title = f"{log.type} in {frame}{', static' if log.static else ''}"
+    frame, bases = ", ".join(sorted(log.frames)) or "no named frame", ""
     hints = meaning.hints or (f"poses are stated in {frame}",)
     if name in arms and _body(name) == DVRK_CAMERA:
-        bases = (topic for topic in arms if topic != name and meanings[topic].frame not in CAMERA_FRAMES)
-        of_arms = {base for topic in bases for base in survey.poses[topic].frames}
+        others = (topic for topic in arms if topic != name and meanings[topic].frame not in CAMERA_FRAMES)
+        of_arms = {base for topic in others for base in survey.poses[topic].frames}
         if of_arms - log.frames:  # these would not register them
-            offered, title = False, f"{title}, the arms' in {', '.join(sorted(of_arms))}"
+            offered, bases = False, f", the arms' in {', '.join(sorted(of_arms))}"
     elif name in arms:
         hints = (*hints, DVRK_HINT)
-    return Stream(
-        name, OTHER if log.static else POSES, title, len(log.stamps), rate_of(survey.seconds(log)), offered=offered,
-        body=_body(name), hints=hints, asks=meaning.asks, problem=log.problem,
-    )  # fmt: skip
+    kind, static = (Kind.OTHER, ", static") if log.static else (Kind.POSES, "")
+    stream = survey.stream(name, log, kind, f" in {frame}{static}{bases}")
+    return replace(stream, offered=offered, body=_body(name), hints=hints, asks=meaning.asks)
 
 
 def _joint_stream(survey: Survey, name: str) -> Stream:
     log, offered, wrist = survey.joints[name], not _COMMANDS.search(name), None
     if _DVRK.search(name):
         offered, wrist = bool(_DVRK_JOINTS.search(name)), wrist_joints(_joint_names(name, log), "jaw" in name)
-    return Stream(
-        name, READINGS, log.type, len(log.stamps), rate_of(survey.seconds(log)), offered=offered, body=_body(name),
-        joints=wrist, problem=log.problem,
-    )  # fmt: skip
-
-
-def _table(survey: Survey, name: str, log: Samples, header: tuple[str, ...], values: np.ndarray) -> Table:
-    notes = _time_notes(survey, name, log)
-    left_out = (f"{counted(count, 'message')} left out: one {why}" for why, count in log.bad.items())
-    notes += [f"{survey.path.name}: {name}: {what}" for what in left_out]
-    rows, numbers = np.column_stack([survey.seconds(log), values]), np.arange(1, len(values) + 1)
-    return Table(survey.path, header, rows, numbers, stream=name, record="message", notes=tuple(notes))
-
-
-def _time_notes(survey: Survey, name: str, log: Samples) -> list[str]:
-    """Return notes on missing stamps and on stamps of another clock."""
-    stamps, received = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
-    none, notes, title = stamps == 0, [], f"{survey.path.name}: {name}"
-    if none.any():
-        what = "its headers have no times" if none.all() else f"{int(none.sum())} headers have no time"
-        notes.append(f"{title}: {what}; those of receipt are taken")
-    late = 0.0 if none.all() else float(np.median((received - stamps)[~none])) * 1e-9
-    if abs(late) > survey.limits.other_clock_s:
-        notes.append(
-            f"{title}: its headers' times are {late:.2f} s before those of receipt, on another clock; where "
-            "the streams do not share one, name its `clock` and give `sync`"
-        )
-    return notes
+    return replace(survey.stream(name, log, Kind.READINGS), offered=offered, body=_body(name), joints=wrist)
 
 
 def _image_frames(survey: Survey) -> set[str]:
     """Return the frames of the first camera's images; another camera, as a stereo scope's right one, has its own."""
-    first = min(survey.images, key=_camera_order, default=None)
+    first = min(survey.images, key=camera_order, default=None)
     return set() if first is None else survey.images[first].frames - {""}
 
 
@@ -311,26 +267,22 @@ def _fixed_transform(survey: Survey, child: str, frame: str) -> np.ndarray | Non
 def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str], list[str]]:
     """Return the transforms from a child and from a frame up to their common ancestor, each by its child. Raises
     NeecoError."""
-    roots, paths = [], []
+    chains: list[list[str]] = []
     for name in (child, frame):
-        edges: list[str] = []
-        while f"tf:{name}" in survey.poses:
-            parents = sorted(survey.poses[f"tf:{name}"].frames)
-            if len(parents) > 1 or name in edges:
-                loop = "is its own parent"
-                what = f"has several parents ({', '.join(parents[:4])})" if len(parents) > 1 else loop
-                raise NeecoError(f"{where}: {name} {what}; name another, or record the transforms anew")
-            edges.append(name)
-            name = parents[0]
-        roots.append(name)
-        paths.append(edges)
-    ups, downs = paths
-    if roots[0] != roots[1]:
-        raise NeecoError(f"{where}: nothing joins {child} to {frame}; their roots are {roots[0]} and {roots[1]}")
-    while ups and downs and ups[-1] == downs[-1]:
-        ups.pop()
-        downs.pop()
-    return ups, downs
+        chain = [name]
+        while (key := f"tf:{chain[-1]}") in survey.poses:
+            parents = sorted(survey.poses[key].frames)
+            if len(parents) > 1 or chain[-1] in chain[:-1]:
+                several = f"has several parents ({', '.join(parents[:4])})"
+                what = several if len(parents) > 1 else "is its own parent"
+                raise NeecoError(f"{where}: {chain[-1]} {what}; name another, or record the transforms anew")
+            chain.append(parents[0])
+        chains.append(chain)
+    ups, downs = chains
+    shared = next((name for name in ups if name in downs), None)
+    if shared is None:
+        raise NeecoError(f"{where}: nothing joins {child} to {frame}; their roots are {ups[-1]} and {downs[-1]}")
+    return ups[: ups.index(shared)], downs[: downs.index(shared)]
 
 
 def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.ndarray:
@@ -350,12 +302,6 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
             poses, _ = poses_at(log_of_edge, seconds, 0.0)
         total = poses @ total
     return total
-
-
-def _camera_order(topic: str) -> tuple[bool, bool, bool, str]:
-    """Return a sort key: the left camera first, the right one last; raw images before compressed ones."""
-    name = topic.lower()
-    return "right" in name, "left" not in name, name.endswith("/compressed"), topic
 
 
 def _body(topic: str) -> str | None:

@@ -36,7 +36,7 @@ SETTINGS = RowSettings()
 
 
 class Rows:
-    """The rows of a table in use; those left out, by reason, and those repaired, for the notes."""
+    """The rows of a table in use; those left out, by reason, and what was repaired or found, for the notes."""
 
     def __init__(self, table: Table) -> None:
         self.table = table
@@ -60,7 +60,7 @@ class Rows:
         self.drop(wrong, reason.split(";")[0])
 
     def notes(self) -> tuple[str, ...]:
-        """Return the changes to the rows, one sentence each."""
+        """Return the changes to the rows and what else was found, one sentence each."""
         name = self.table.title
         dropped = (
             f"{name}: {counted(len(lines), 'row')} dropped: {reason} ({self.table.list_rows(lines)})"
@@ -74,17 +74,15 @@ def keep_measured(rows: Rows, source: PoseColumns, recognised: str | None) -> No
     table, name = rows.table, source.state or recognised
     if name is None or not len(table.rows):
         return
-    states = [str(cell) for cell in table.rows[:, column_index(table, name)]]
-    good = {value.lower() for value in source.good}
-    bad = Counter(state for state in states if state.lower() not in good)
-    listed = [state for state, _ in bad.most_common(SETTINGS.states)]
-    for state in listed:
-        rows.drop(np.array([state == other for other in states]), f"{name} is {state[:20] or 'empty'!r}")
-    rows.keep &= [state not in bad for state in states]
+    states = table.rows[:, column_index(table, name)].astype(str)
+    bad = ~np.isin(np.char.lower(states), [value.lower() for value in source.good])
+    for state, _ in Counter(states[bad].tolist()).most_common(SETTINGS.states):
+        rows.drop(states == state, f"{name} is {state[:20] or 'empty'!r}")
+    rows.keep &= ~bad
     if not rows.keep.any():
         raise NeecoError(
             f"{table.where}: {name}: no row is {' or '.join(source.good)} ({table.list_rows(table.lines[:1])} has "
-            f"{states[0][:20]!r}); list the values that mark measured rows in the recording: columns.good"
+            f"{str(states[0])[:20]!r}); list the values that mark measured rows in the recording: columns.good"
         )
 
 
@@ -223,13 +221,13 @@ def _headers(table: Table, rows: range) -> list[int]:
     return [int(table.lines[row]) for row in rows if tuple(table.rows[row]) == table.header]
 
 
-def find_gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:
-    """Return the gaps in time (steps longer than 4 usual ones and 0.15 s), and a note of them."""
+def find_gaps(rows: Rows, times: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """Return the gaps in time (steps longer than 4 usual ones and 0.15 s), and note them."""
     steps = np.diff(times)
     longest = max(SETTINGS.gap_steps * float(np.median(steps)), SETTINGS.gap_s)
     gaps = tuple((float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest))
-    if not gaps:
-        return (), ()
-    total = sum(end - start for start, end in gaps)
-    first = ", ".join(f"{start:.2f}-{end:.2f} s" for start, end in gaps[:3])
-    return gaps, (f"{table.title}: {counted(len(gaps), 'gap')}, {total:.2f} s in all ({first}); not bridged",)
+    if gaps:
+        total = sum(end - start for start, end in gaps)
+        first = ", ".join(f"{start:.2f}-{end:.2f} s" for start, end in gaps[:3])
+        rows.repairs.append(f"{counted(len(gaps), 'gap')}, {total:.2f} s in all ({first}); not bridged")
+    return gaps

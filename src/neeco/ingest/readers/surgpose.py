@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +21,7 @@ from neeco.base.files import FastYamlLoader, parse_yaml, read_text, visible_entr
 from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.stereo import read_stereo
-from neeco.ingest.readers import (
-    IMAGES,
-    OTHER,
-    POSES,
-    READINGS,
-    RecordingFormat,
-    Stream,
-    Table,
-    VideoSource,
-    choose_stream,
-    compare_lengths,
-    file_state,
-)
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_lengths, kept
 from neeco.ingest.readers.rosbag import DVRK_HINT
 from neeco.ingest.readers.rows import SETTINGS as ROWS
 from neeco.ingest.readers.video import open_images, open_video
@@ -45,14 +33,7 @@ JOINT_NAMES = ("yaw_rad", "pitch_rad", "insertion_m", "roll_rad", "wrist_pitch_r
 WRIST = (("wrist_pitch", "wrist_pitch_rad"), ("wrist_yaw", "wrist_yaw_rad"), ("jaw", "jaw_rad"))
 POSE_HEADER = ("t_s", *(f"m{row}{column}{'_m' if column == 3 else ''}" for row in range(3) for column in range(4)))
 LIGHTS = ("regular", "", "green")  # folders of the videos; what is green shows the ultraviolet paint
-
-
-@dataclass(frozen=True, eq=False)  # it holds arrays
-class _Arms:
-    """rows [T, 12] of poses (3x4 by rows) and [T, J] of joints by arm, and the frames [T] they belong to."""
-
-    poses: dict[str, tuple[np.ndarray, np.ndarray]]
-    joints: dict[str, tuple[np.ndarray, np.ndarray]]
+_ByArm = dict[str, tuple[np.ndarray, np.ndarray]]  # frames [T], and rows [T, C] of each, by arm
 
 
 class SurgPose(RecordingFormat):
@@ -65,44 +46,44 @@ class SurgPose(RecordingFormat):
         return (path / POSE_FILE).is_file() and path.is_dir()
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        arms = _read(path)
-        count = max(len(frames) for frames, _ in arms.poses.values())
+        poses, joints = _read(path)
+        count = max(len(frames) for frames, _ in poses.values())
+        stream = partial(Stream, rate_hz=FRAMES_PER_SECOND)
         # the left camera's are the frames; others are listed
         streams = [
-            Stream(name, IMAGES, "video", count, FRAMES_PER_SECOND, offered=number == 0)
-            for number, name in enumerate(_videos(path))
+            stream(name, Kind.IMAGES, "video", count, offered=number == 0) for number, name in enumerate(_videos(path))
         ]
-        for name, (frames, _) in sorted(arms.poses.items()):
-            streams.append(Stream(name, POSES, "poses", len(frames), FRAMES_PER_SECOND, body=name, hints=(DVRK_HINT,)))
-        for name, (frames, values) in sorted(arms.joints.items()):
+        for name, (frames, _) in sorted(poses.items()):
+            streams.append(stream(name, Kind.POSES, "poses", len(frames), body=name, hints=(DVRK_HINT,)))
+        for name, (frames, values) in sorted(joints.items()):
             wrist = tuple(joint for joint in WRIST if joint[1] in JOINT_NAMES[: values.shape[1]])
             title = f"{name}{JOINTS_BEHIND}"
-            streams.append(Stream(title, READINGS, "joints", len(frames), FRAMES_PER_SECOND, body=name, joints=wrist))
+            streams.append(stream(title, Kind.READINGS, "joints", len(frames), body=name, joints=wrist))
         labels = sorted(file.name for file in path.glob("keypoints_*.yaml"))
-        return (*streams, *(Stream(name, OTHER, "labels", count) for name in labels))
+        return (*streams, *(Stream(name, Kind.OTHER, "labels", count) for name in labels))
 
     def read(self, path: Path, stream: str | None = None) -> Table:
-        arms = _read(path)
-        chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS))
-        if chosen.kind == POSES:
-            (frames, values), header = arms.poses[chosen.name], POSE_HEADER
+        poses, joints = _read(path)
+        chosen = self.choose(path, stream, Kind.POSES, Kind.READINGS)
+        if chosen.kind == Kind.POSES:
+            (frames, values), header = poses[chosen.name], POSE_HEADER
         else:
-            frames, values = arms.joints[chosen.name.removesuffix(JOINTS_BEHIND)]
+            frames, values = joints[chosen.name.removesuffix(JOINTS_BEHIND)]
             header = ("t_s", *JOINT_NAMES[: values.shape[1]])
         rows = np.column_stack([frames / FRAMES_PER_SECOND, values])
-        stated_in = f"{chosen.name}_base" if chosen.kind == POSES else None
+        stated_in = f"{chosen.name}_base" if chosen.kind == Kind.POSES else None
         return Table(path, header, rows, frames, stream=chosen.name, record="frame", stated_in=stated_in)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
-        name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        name = self.choose(path, stream, Kind.IMAGES).name
         file = path / name
         video = open_images(file, FRAMES_PER_SECOND) if file.is_dir() else open_video(file)
-        states = max(int(frames[-1]) + 1 for frames, _ in _read(path).poses.values())
+        states = max(int(frames[-1]) + 1 for frames, _ in _read(path)[0].values())
         notes = compare_lengths(file, video, states, FRAMES_PER_SECOND)
         return replace(video, notes=(*video.notes, *notes))
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
-        name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        name = self.choose(path, stream, Kind.IMAGES).name
         lenses = self.stereo(path, None, None)
         return None if lenses is None else lenses[:2]["right" in Path(name).name]
 
@@ -115,29 +96,22 @@ class SurgPose(RecordingFormat):
 
 def _videos(path: Path) -> list[str]:
     """Videos, or folders of their frames, the left one in usual light first."""
-    videos = []
-    for light in LIGHTS:
-        for side in ("left", "right"):
-            for name in (f"{side}_video.mp4", f"{side}_video", f"{side}_frames"):
-                if (path / light / name).exists():
-                    videos.append((Path(light) / name).as_posix())
-                    break
-    return videos
+    names = ("video.mp4", "video", "frames")
+    places = [[Path(light) / f"{side}_{name}" for name in names] for light in LIGHTS for side in ("left", "right")]
+    found = (next((place for place in group if (path / place).exists()), None) for group in places)
+    return [place.as_posix() for place in found if place is not None]
 
 
-def _read(path: Path) -> _Arms:
-    files = [path / name for name in (POSE_FILE, JOINT_FILE) if name == POSE_FILE or (path / name).exists()]
-    return _cached(path, file_state(*files))
+def _read(path: Path) -> tuple[_ByArm, _ByArm]:
+    """Return poses (3x4 by rows) and joints."""
+    poses, joints = path / POSE_FILE, path / JOINT_FILE
+    of_joints = _by_arm(joints, _joints, "six or seven joints") if joints.exists() else {}
+    return _by_arm(poses, _pose, "R (3x3) and t"), of_joints
 
 
-@lru_cache(maxsize=2)
-def _cached(path: Path, state: tuple[object, ...]) -> _Arms:
-    poses = _by_arm(path / POSE_FILE, _pose, "R (3x3) and t")
-    return _Arms(poses, _by_arm(path / JOINT_FILE, _joints, "six or seven joints") if len(state) > 1 else {})
-
-
-def _by_arm(file: Path, parse: Callable[[Any], np.ndarray], expected: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Frames [T] and rows [T, C] of each arm, from {frame: {arm: values}}."""
+@kept
+def _by_arm(file: Path, parse: Callable[[Any], np.ndarray], expected: str) -> _ByArm:
+    """Read {frame: {arm: values}}."""
     document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", FastYamlLoader)
     arms: dict[str, dict[int, np.ndarray | None]] = {}
     try:

@@ -19,7 +19,7 @@ from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import require_content, visible_entries
 from neeco.capture.images import FORMATS, open_image
 from neeco.capture.readers.parsed import natural_order
-from neeco.ingest.readers import VideoSource, numbers, read_table
+from neeco.ingest.readers import VideoSource, numbers, one_line, read_table, reason_of
 from neeco.ingest.readers.columns import recognise_time, scale_of
 
 FURTHER_FORMATS = {".bmp": "BMP", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}  # opened under these names alone
@@ -226,11 +226,8 @@ class _Scan:
         from av.stream import Disposition
 
         require_content(self.path)
-        try:
+        with one_line(self.path, "cannot be opened as a video", "give an intact video file"):
             container = av.open(str(self.path))
-        except (av.error.FFmpegError, OSError, ValueError) as error:
-            what = f"cannot be opened as a video ({_reason(error)})"
-            raise NeecoError(f"{self.path}: {what}; give an intact video file") from None
         with container:
             if not container.streams.video:
                 raise NeecoError(f"{self.path}: holds no video stream; give the recording's video")
@@ -261,7 +258,7 @@ class _Scan:
                 except StopIteration:
                     return
                 except (av.error.FFmpegError, ValueError) as error:
-                    self.failure = self.failure or _reason(error)
+                    self.failure = self.failure or reason_of(error)
                     if isinstance(error, av.error.EOFError) or self.corrupt > SETTINGS.max_corrupt:
                         return
                     self.corrupt += 1
@@ -356,11 +353,6 @@ def _rgb(frame: Any) -> np.ndarray:
 
     exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.BITEXACT
     return frame.to_ndarray(format="rgb24", interpolation=exact)
-
-
-def _reason(error: BaseException) -> str:
-    text = getattr(error, "strerror", None) or str(error)
-    return " ".join(str(text).split())[:100] or type(error).__name__
 
 
 def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[str]) -> tuple[list[Path], np.ndarray]:

@@ -22,8 +22,7 @@ from neeco.base.files import read_json, require_content
 from neeco.base.placeholders import placeholder
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.calibration.stereo import read_stereo
-from neeco.ingest.readers import IMAGES as IMAGE_STREAMS
-from neeco.ingest.readers import POSES, READINGS, Stream, VideoSource, format_of, read_table
+from neeco.ingest.readers import Kind, Stream, VideoSource, format_of, read_table
 from neeco.ingest.readers.columns import (
     BASE,
     MATRIX,
@@ -220,15 +219,15 @@ def _add_streams(files: _FolderFiles, path: Path, name: str) -> bool:
     for stream in streams:
         log, title = _Log(name, stream), f"{name}: {stream.name}"
         used = stream.offered and stream.count > 0 and stream.problem is None
-        if used and stream.kind == IMAGE_STREAMS:
+        if used and stream.kind == Kind.IMAGES:
             files.frames.append(_Frames(f"video: {{{', '.join(log.lines())}}}", name, path, stream.name))
-        elif used and stream.kind in (POSES, READINGS):
+        elif used and stream.kind in (Kind.POSES, Kind.READINGS):
             try:
                 _classify_stream(files, log, stream, path)
             except NeecoError as error:
                 files.leave_out(title, error, path)
         elif stream.problem is not None:
-            files.leave_out(title, stream.problem, path, stream.kind == IMAGE_STREAMS)
+            files.leave_out(title, stream.problem, path, stream.kind == Kind.IMAGES)
         else:
             rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
             files.leave_out(f"{title}: {stream.type}, {stream.count}{rate}")
@@ -241,7 +240,7 @@ def _classify_stream(files: _FolderFiles, log: _Log, stream: Stream, path: Path)
     table = read_table(path, stream.name)
     when = recognise_time(table.header)
     joints: Sequence[tuple[str | None, str]] = stream.joints or ()
-    if stream.kind == POSES:
+    if stream.kind == Kind.POSES:
         header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
         in_base = table.frame in (None, BASE) and not stream.asks
         files.poses.append((replace(log, in_base=in_base), recognise_pose(header)))
@@ -368,7 +367,7 @@ def _second_camera(
         folder = left.file.parents[left.name.count("/")]
         tries = [(line, name, partial(read_stereo, folder / name)) for name in calibrations if line]
     else:
-        streams = [item for item in reader.streams(left.file) if item.kind == IMAGE_STREAMS and not item.problem]
+        streams = [item for item in reader.streams(left.file) if item.kind == Kind.IMAGES and not item.problem]
         names = [item.name for item in streams if item.count and item.name != left.stream]
         lines = {name: left.line.replace(left.stream, name) for name in names}
         line = lines.get(namesake)
