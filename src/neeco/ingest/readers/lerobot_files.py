@@ -297,7 +297,7 @@ def batches(
             data = file.metadata.row_group(group.id).to_dict()["columns"]
             read = [chunk for chunk in data if f"{chunk['path_in_schema']}.".startswith(leaves)]
             if sum(chunk["total_uncompressed_size"] for chunk in read) > limits.group_bytes:
-                raise NeecoError(f"{path}: unpacks to over {limits.group_bytes} bytes; write smaller row groups")
+                raise NeecoError(f"{path}: unpacks to over {limits.group_bytes >> 20} MiB; write smaller row groups")
         yield from part.to_batches(
             columns=list(columns), filter=wanted, batch_size=rows, batch_readahead=0, use_threads=False
         )
