@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import torch
@@ -28,15 +28,13 @@ from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, instruments_of
 from neeco.raster.resampling import of_rendered_size, resampled
+from neeco.scene import GaussianScene
 from neeco.states.alignment import AlignConfig, AlignedFrame, align_frame, pose_changes
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
 from neeco.synthesis.samplers import DrawnCameras
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings, parse_class_names
 from neeco.synthesis.writers.folder import Record, encoded_sample, skipped_sample
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
-    from neeco.training.run import GaussianRun
+from neeco.training.run import GaussianRun
 
 N_REFERENCE_FRAMES = 16  # training frames from which the usual errors are estimated
 FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # the start is near: no coarse search

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -26,10 +26,8 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid
 from neeco.labels.annotation import place_in_image, working_ends
 from neeco.labels.drawing import LayeredDrawing, to_numpy
+from neeco.scene import GaussianScene, Recorded
 from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene, Recorded
 
 SoftMasks = Literal["mid", "mean"]
 SOFT_MASKS = "soft_masks"

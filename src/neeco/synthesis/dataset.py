@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import neeco
 from neeco.base.errors import NeecoError
@@ -23,6 +23,7 @@ from neeco.base.workers import address, check_workers
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.labellers import Labeller, ThresholdLabels, instruments_of
 from neeco.labels.settings import LABELS
+from neeco.scene import GaussianScene
 from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.card import write_card, write_preview
@@ -50,11 +51,7 @@ from neeco.synthesis.writers.folder import (
     record_path,
     write_states,
 )
-from neeco.training.run import SCENE_FILE, scene_digest
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
-    from neeco.training.run import GaussianRun
+from neeco.training.run import SCENE_FILE, GaussianRun, scene_digest
 
 SCHEMA = "neeco-dataset/1"
 INFO = "dataset.json"

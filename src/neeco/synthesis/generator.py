@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.labels.settings import LABELS
 from neeco.raster.native import keep_freed_memory, set_threads
+from neeco.scene import GaussianScene
 from neeco.scene.io import load_gaussians
 from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, split
 from neeco.synthesis.camera_effects import (
@@ -42,9 +43,6 @@ from neeco.synthesis.mixing import MixedSampler, Mixture
 from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers.folder import Encoded, Record, encoded_sample, skipped_sample
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
 
 VERB = "synthesize"
 # of an image's random numbers: camera effects and appearances do not change which state and view are sampled

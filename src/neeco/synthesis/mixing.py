@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -31,9 +30,7 @@ from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.visibility import VISIBILITY
 from neeco.synthesis.samplers import Sampler, make_sampler
-
-if TYPE_CHECKING:
-    from neeco.synthesis.settings import Settings
+from neeco.synthesis.settings import Settings
 
 
 @dataclass(frozen=True, kw_only=True)

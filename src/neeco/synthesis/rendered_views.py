@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,14 +21,12 @@ from neeco.capture.model import State
 from neeco.capture.readers import read_states
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw, to_numpy
+from neeco.scene import DrawableScene
 from neeco.synthesis.dataset import part_ids
 from neeco.synthesis.samplers import DrawnCameras, moved_camera
 from neeco.synthesis.settings import AS_RECORDED, ImageSettings
 from neeco.synthesis.states import PathStates, interpolate_pose
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene
-    from neeco.training.run import TrainedRun
+from neeco.training.run import TrainedRun
 
 STATES_FOLDER = "states"
 FPS = 25  # of a video

@@ -9,7 +9,6 @@ import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -27,6 +26,7 @@ from neeco.geometry.rotations import rigid
 from neeco.labels.annotation import any_in_image, working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
+from neeco.scene import GaussianScene
 from neeco.scene.drawable import Recorded
 from neeco.synthesis.settings import PATH_PREFIX, RECORDED_SIZE, SAMPLERS, ImageSettings, SizeSettings, Views
 from neeco.synthesis.states import (
@@ -38,9 +38,6 @@ from neeco.synthesis.states import (
     StateSampler,
     turn_about,
 )
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,12 +14,10 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.geometry.lines import frame_about
 from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
+from neeco.scene import DrawableScene
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.synthesis.samplers import instrument_axes
 from neeco.synthesis.states import JointRange, interpolate_pose, joint_ranges, turn_about
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene
 
 MARGIN = 0.2  # extension of a slider, as a share of the recorded range, where the capture states no limits
 STILL = math.radians(1.0)  # half of the range, in rad, of the slider of a joint that never moved

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,9 +28,6 @@ from neeco.scene.gaussian_scene import is_gaussian
 from neeco.scene.io import load_scene
 from neeco.training.run import checkpoint_path, read_checkpoint, read_config
 from neeco.viewer.controls import Shaft, shafts_of
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene
 
 SCENE_FILE = "scene.safetensors"
 

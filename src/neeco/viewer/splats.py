@@ -11,7 +11,7 @@ import gzip
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -28,9 +28,7 @@ from neeco.raster import depth_maps
 from neeco.raster.reference import brightened, headlight_factor, sh_basis
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
+from neeco.scene import GaussianScene
 
 Format = Literal["ply", "spz"]
 DIRECTIONS = 64  # by which harmonics are rotated: four times as many as there are harmonics
