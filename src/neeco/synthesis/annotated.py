@@ -129,9 +129,7 @@ def annotate_capture(
             on_progress(done, len(in_time))
         if not with_image(records.values()):
             best = max(record["trust"]["value"] for record in records.values())
-            raise NeecoError(
-                f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best is by {best}"
-            )
+            raise NeecoError(f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best by {best}")
     return Annotated(output, capture, [records[index] for index in sorted(records)])
 
 
@@ -245,13 +243,9 @@ def typical_errors(scene: GaussianScene, labeller: CompositedLabels, trained_on:
 
 def _check_instruments(scene: GaussianScene, capture: Capture) -> None:
     """Raises NeecoError unless every frame states the poses and joints of the scene's instruments."""
-    joints = {item.name: set(item.joints) for item in capture.instruments}
-    for instrument in scene.instruments:
-        if instrument.name not in joints:
-            names = ", ".join(joints) or "none"
-            raise NeecoError(f"{capture.root}: instruments: the scene learned {instrument.name!r}, here are: {names}")
-        missing = set(instrument.joints) - joints[instrument.name]
-        if missing:
-            raise NeecoError(
-                f"{capture.root}: instruments: {instrument.name}: no joint {min(missing)!r}, which the scene learned"
-            )
+    place, joints = f"{capture.root}: instruments", {item.name: set(item.joints) for item in capture.instruments}
+    for name, learned in ((item.name, set(item.joints)) for item in scene.instruments):
+        if name not in joints:
+            raise NeecoError(f"{place}: the scene learned {name!r}, here are: {', '.join(joints) or 'none'}")
+        if missing := learned - joints[name]:
+            raise NeecoError(f"{place}: {name}: no joint {min(missing)!r}, which the scene learned")

@@ -291,9 +291,7 @@ def _caption(record: Record) -> tuple[list[str], list[str]]:
 
 
 def _legend(canvas: ImageDraw.ImageDraw, names: Sequence[tuple[str, str]], width: int) -> None:
-    entries: list[tuple[str, Color]] = [
-        (f"{name} {part}", part_color(part_id)) for part_id, (name, part) in enumerate(names, 1)
-    ]
+    entries: list[tuple[str, Color]] = [(" ".join(name), part_color(number)) for number, name in enumerate(names, 1)]
     entries += [("minimum-area box", PREVIEW.rectangle), ("keypoint seen", PREVIEW.box)]
     entries += [("keypoint occluded", PREVIEW.hidden)]
     columns = max((width - PREVIEW.gap) // PREVIEW.label_column, 1)

@@ -118,9 +118,7 @@ def synthesize(
     info = description(run, identity, instrument_runs)
     begun = check_output(output, info, resume)
     if begun and record_path(output, settings.count).exists():
-        raise NeecoError(
-            f"--count: {output} holds more than {settings.count} images already; give more, or a new folder"
-        )
+        raise NeecoError(f"--count: {output} holds more than {settings.count} images; give more, or a new folder")
     generator = SampleGenerator.of(scene, settings, instrument_scenes)
     info["tissue_tolerance_mm"] = generator.acceptance.tolerance_mm
     if generator.gains:
@@ -301,9 +299,8 @@ def writers() -> dict[str, type[Writer]]:
 def writer(name: str) -> type[Writer]:
     """Return the writer of the format `name`. Raises NeecoError when there is none."""
     if name not in writers():
-        raise NeecoError(
-            f"--formats: {name!r} is unknown; choose of {', '.join(writers())}, or install the package that has it"
-        )
+        known = ", ".join(writers())
+        raise NeecoError(f"--formats: {name!r} is unknown; choose of {known}, or install the package that has it")
     return writers()[name]
 
 
@@ -334,7 +331,4 @@ def skipped(records: Iterable[Record]) -> list[int]:
 
 def refusals(records: Iterable[Record]) -> dict[str, int]:
     """Count the refused states by reason."""
-    refused: Counter[str] = Counter()
-    for record in records:
-        refused.update(record["refused"])
-    return dict(sorted(refused.items()))
+    return dict(sorted(sum((Counter(record["refused"]) for record in records), Counter[str]()).items()))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
 from types import MappingProxyType
@@ -31,7 +31,6 @@ from neeco.scene.io import load_gaussians
 from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, split
 from neeco.synthesis.camera_effects import (
     CameraEffects,
-    MixedMotion,
     RecordedMotion,
     apply_effects,
     average_exposure,
@@ -84,9 +83,7 @@ class LabelledSample:
     drawing: LayeredDrawing  # `image` with the camera effects
     labels: list[InstrumentLabel]
     refused: Mapping[str, int]  # states refused before this one, by reason
-    facts: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # additional entries of its record, such as its camera effects
+    facts: Mapping[str, Any]  # more entries of its record, such as its camera effects
 
 
 @dataclass(frozen=True)
@@ -136,7 +133,7 @@ class SampleGenerator:
     acceptance: Acceptance
     settings: Settings
     effects: CameraEffects | None = None
-    motion: RecordedMotion | MixedMotion | None = None  # where effects open a shutter
+    motion: RecordedMotion | None = None  # where effects open a shutter
     gains: tuple[tuple[float, float, float], ...] = ()  # by which the colours of each instrument scene were multiplied
     cameras: DrawnCameras = RECORDED_CAMERAS
     appearances: Appearances = ALL_AS_RECORDED
@@ -167,7 +164,11 @@ class SampleGenerator:
         effects, motion = None, None
         if settings.camera_effects is not None:
             effects = read_effects(Path(settings.camera_effects))
-            motion = _motion(tissue, instrument_scenes, settings) if effects.moves else None
+            if "shutter_s" in effects.ranges:
+                motion = RecordedMotion(tissue.recorded, [each.recorded for each in instrument_scenes])
+                if not motion.known:
+                    problem = "shutter_s: no two recorded frames are close enough in time to estimate motion; remove it"
+                    raise NeecoError(f"{settings.camera_effects}: {problem}")
         tolerance = settings.tissue_tolerance_mm if settings.tissue_check else None
         if settings.tissue_check and tolerance is None:
             tolerance = find_tolerance(scene, labeller)
@@ -315,10 +316,8 @@ def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
         if generator.sampler.prescribed:
             return skipped_sample(index, error.refused)
         raise
-    quality = generator.settings.jpeg_quality
-    return encoded_sample(
-        index, sample.drawing, sample.labels, refused=sample.refused, facts=sample.facts, quality=quality
-    )
+    how = {"refused": sample.refused, "facts": sample.facts, "quality": generator.settings.jpeg_quality}
+    return encoded_sample(index, sample.drawing, sample.labels, **how)
 
 
 def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:
@@ -384,25 +383,8 @@ def _intersect(drawing: LayeredDrawing, some: frozenset[str], others: frozenset[
     return False
 
 
-def _motion(
-    scene: GaussianScene, instrument_scenes: Sequence[GaussianScene], settings: Settings
-) -> RecordedMotion | MixedMotion:
-    """Return the motion while a shutter is open. Raises NeecoError where the recordings have none."""
-    motion: RecordedMotion | MixedMotion = RecordedMotion(scene.recorded)
-    if instrument_scenes:
-        motion = MixedMotion(scene.recorded, [each.recorded for each in instrument_scenes])
-    if not motion.known:
-        raise NeecoError(
-            f"{settings.camera_effects}: shutter_s: no two recorded frames are close enough in time to "
-            "estimate motion; remove it"
-        )
-    return motion
-
-
 def _within_circle(drawing: LayeredDrawing, radius: float) -> LayeredDrawing:
     """Remove the labels outside the camera's image circle."""
     height, width = drawing.depth.shape
     inside = torch.from_numpy(image_circle(height, width, radius) > 0.5)
-    return replace(
-        drawing, parts=torch.where(inside, drawing.parts, 0).to(drawing.parts.dtype), share=drawing.share * inside
-    )
+    return replace(drawing, parts=drawing.parts.masked_fill(~inside, 0), share=drawing.share * inside)

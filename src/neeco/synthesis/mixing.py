@@ -64,10 +64,8 @@ class Mixture:
         """Raises NeecoError where a scene's instruments cannot be taken out of it, or two have the same name."""
         for scene in (tissue, *instrument_scenes):
             if not scene.deformation.separates_instruments or scene.method != tissue.method:
-                raise NeecoError(
-                    f"--instruments: method {scene.method} does not keep tissue and instruments apart; "
-                    "mix runs of method kinematic"
-                )
+                problem = f"method {scene.method} does not keep tissue and instruments apart"
+                raise NeecoError(f"--instruments: {problem}; mix runs of method kinematic")
         names = [instrument.name for scene in instrument_scenes for instrument in scene.instruments]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
@@ -92,10 +90,8 @@ class Mixture:
     def sampler(self, settings: Settings) -> MixedSampler:
         """Draws where the instruments are, each as its own run's sampler does."""
         if settings.states not in ("interpolate", "extrapolate"):
-            raise NeecoError(
-                f"--states: {settings.states}: states of one recording; with --instruments use interpolate "
-                "or extrapolate"
-            )
+            fitting = "with --instruments use interpolate or extrapolate"
+            raise NeecoError(f"--states: {settings.states}: states of one recording; {fitting}")
         if settings.views == "orbit":
             raise NeecoError("--views: orbit is about one recording's tissue; with --instruments use another")
         samplers = [

@@ -95,10 +95,8 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
                 if event.stage == "failed":
                     raise NeecoError(event.value)
                 if event.stage == "abandoned":
-                    raise NeecoError(
-                        f"--workers: workers were killed repeatedly at image {tasks[event.index][0]} ({event.value}); "
-                        "if memory ran out, use fewer workers (and --resume)"
-                    )
+                    problem = f"workers were killed repeatedly at image {tasks[event.index][0]} ({event.value})"
+                    raise NeecoError(f"--workers: {problem}; if memory ran out, use fewer workers (and --resume)")
                 for result in event.value if event.stage == "done" else ():
                     yield result.write(output) if isinstance(result, Encoded) else result
     finally:

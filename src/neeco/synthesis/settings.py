@@ -63,9 +63,7 @@ class SizeSettings:
             fitting = (wide, max(1, round(wide * height / width))), (max(1, round(high * width / height)), high)
             if (wide, high) not in fitting:
                 others = " or ".join(f"{across}x{down}" for across, down in fitting)
-                raise NeecoError(
-                    f"--size: {self.size} is another shape than the recorded {width}x{height}; give {others}"
-                )
+                raise NeecoError(f"--size: {self.size}: the recorded {width}x{height} has another shape; give {others}")
             size = wide, high
         if size[0] * size[1] > MAX_PIXELS:
             option = "--size" if self.scale is None else "--scale"

@@ -34,8 +34,9 @@ from neeco.raster.reference import SH_C0
 from neeco.scene import DrawableScene, GaussianScene
 from neeco.scene.drawable import ArticulatedMotion
 from neeco.scene.gaussian_scene import require_gaussians
+from neeco.synthesis.samplers import shafts_of
 from neeco.training.run import TrainedRun, load_run
-from neeco.viewer.controls import shafts_of, slider_ranges
+from neeco.viewer.controls import slider_ranges
 
 SCHEMA = "neeco-page/1"
 SCRIPTS = ("scene.js", "states.js", "drawing.js", "camera.js", "panel.js", "main.js")  # in this order, as one module

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neeco.capture.model import Instrument, InstrumentState
-from neeco.synthesis.states import JointRange
-from neeco.viewer.controls import Controls, InstrumentControls, Shaft, slider_ranges
+from neeco.synthesis.states import JointRange, Shaft
+from neeco.viewer.controls import Controls, InstrumentControls, slider_ranges
 from neeco.viewer.runs import LoadedRun, Timeline
 from neeco.viewer.views import IMAGE, RunPicture, views_of
 

@@ -77,12 +77,9 @@ class RecordingSession:
         tracks = scene.add_frame("/tracks", show_axes=False, visible=False)
         self.axes = {}
         for number, name in enumerate(item.name for item in capture.instruments if capture.registered):
-            poses = [
-                to_numpy(frame.state.instruments[name].pose)
-                for frame in capture.frames
-                if name in frame.state.instruments
-            ]
-            path = np.array([pose[:3, 3] * unit for pose in poses], np.float32).reshape(-1, 3)
+            tracked = [frame.state.instruments.get(name) for frame in capture.frames]
+            places = [to_numpy(item.pose)[:3, 3] * unit for item in tracked if item is not None]
+            path = np.array(places, np.float32).reshape(-1, 3)
             color = RECORDING.track_colors[number % len(RECORDING.track_colors)]
             ends = np.stack([path[:-1], path[1:]], 1)
             if len(ends):

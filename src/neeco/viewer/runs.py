@@ -23,11 +23,11 @@ from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
-from neeco.scene.drawable import DrawableScene, Recorded
+from neeco.scene import DrawableScene, Recorded, load_scene
 from neeco.scene.gaussian_scene import is_gaussian
-from neeco.scene.io import load_scene
+from neeco.synthesis.samplers import shafts_of
+from neeco.synthesis.states import Shaft
 from neeco.training.run import checkpoint_path, read_checkpoint, read_config
-from neeco.viewer.controls import Shaft, shafts_of
 
 SCENE_FILE = "scene.safetensors"
 
@@ -159,9 +159,7 @@ class ViewedRun:
             except OSError as error:
                 raise NeecoError(f"{file}: cannot read: {error.strerror or error}") from error
             return str(file), status.st_ino, status.st_mtime_ns, status.st_size
-        raise NeecoError(
-            f"{self.path}: has neither a finished scene nor a checkpoint yet; wait until `neeco train` has written one"
-        )
+        raise NeecoError(f"{self.path}: has neither a finished scene nor a checkpoint yet; let `neeco train` write one")
 
     def _load(self) -> LoadedRun:
         config = read_config(self.path)

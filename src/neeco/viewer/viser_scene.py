@@ -194,8 +194,6 @@ def _click(clicked: Callable[[int], None], frame: int, _: object) -> None:
 
 def _frustum_frames(cameras: Sequence[Camera]) -> list[int]:
     """Frames whose cameras are shown: some from everywhere, none twice in one place."""
-    chosen: dict[bytes, int] = {}
-    for frame in evenly_spaced(len(cameras), SCENE.max_frusta):
-        pose = to_numpy(cameras[frame].world_from_camera)
-        chosen.setdefault(pose.round(3).tobytes(), frame)
-    return list(chosen.values())
+    frames = evenly_spaced(len(cameras), SCENE.max_frusta)
+    poses = [to_numpy(cameras[frame].world_from_camera).round(3) for frame in frames]
+    return [frames[first] for first in np.unique(poses, axis=0, return_index=True)[1]]

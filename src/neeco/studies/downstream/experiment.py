@@ -189,10 +189,8 @@ class DownstreamJob:
         now = {"schema": JOB_SCHEMA} | self.identity()
         require_same(str(file), ((key, stored.get(key), now[key]) for key in now), REMEDY)
         tested = require_like(stored, {"tests": {str: str}, "splits": dict}, str(file), REMEDY)["tests"]
-        for name, path in self.settings.tests.items():
-            require_same(
-                f"{file}: --test", [(name, tested.get(name, str(path.absolute())), str(path.absolute()))], REMEDY
-            )
+        tests = {name: str(path.absolute()) for name, path in self.settings.tests.items()}
+        require_same(f"{file}: --test", ((name, tested.get(name, tests[name]), tests[name]) for name in tests), REMEDY)
 
     def stored(self) -> dict[str, Any] | None:
         """Return the result of an earlier start, None where there is none of all tests. Raises NeecoError."""
@@ -363,11 +361,8 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
         labelled_count(word, 10**9)
     if any(REAL in condition for condition in conditions) and set(settings.num_real or "all") != {"0"}:
         labelled = len(recorded_samples(capture, "train", settings.classes, settings.labels))
-        wanted = settings.num_real or (
-            "0",
-            *(str(count) for count in settings.default_counts if count < labelled),
-            "all",
-        )
+        usual = (str(count) for count in settings.default_counts if count < labelled)
+        wanted = settings.num_real or ("0", *usual, "all")
         counts = sorted({labelled_count(word, labelled) for word in wanted})
     jobs = tuple(
         DownstreamJob(settings, model, condition, real, fold)
@@ -379,9 +374,7 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
     )
     trained = {job.condition.name for job in jobs}
     if missing := [item.name for item in conditions if item.name not in trained and (settings.conditions or not jobs)]:
-        raise NeecoError(
-            f"--num-real: leaves nothing to train {missing[0]} on; add 0 for sets alone, a number for real"
-        )
+        raise NeecoError(f"--num-real: leaves nothing to train {missing[0]} on; add 0 for sets, a number for real")
     entries = [entry.name for entry in settings.output.iterdir()] if settings.output.is_dir() else []
     if [name for name in entries if not name.startswith(".")] != ["jobs"]:  # not just before its first result
         check_output(settings.output, FILE, SCHEMA, settings.capture, "a downstream experiment")

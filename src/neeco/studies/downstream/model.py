@@ -107,9 +107,8 @@ class TorchModel(ABC):
 
     def _train(self, module: nn.Module, task: TrainingTask) -> None:
         fused = task.device.type == "cuda"
-        optimizer = torch.optim.AdamW(
-            module.parameters(), self.learning_rate, weight_decay=self.weight_decay, fused=fused
-        )
+        decay = self.weight_decay
+        optimizer = torch.optim.AdamW(module.parameters(), self.learning_rate, weight_decay=decay, fused=fused)
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self._rate(step, task.steps))
         rng = torch.Generator(task.device).manual_seed(task.seed) if task.batches.augmented else None
         with_boxes = self.predicts == "boxes"
@@ -162,9 +161,8 @@ def model_class(name: str) -> type[TorchModel]:
     """The model of that name. Raises NeecoError when there is none."""
     models = find_models()
     if name not in models:
-        raise NeecoError(
-            f"--models: {name!r} is unknown; choose of {', '.join(models)}, or install the package that has it"
-        )
+        known = ", ".join(models)
+        raise NeecoError(f"--models: {name!r} is unknown; choose of {known}, or install the package that has it")
     return models[name]
 
 

@@ -41,9 +41,7 @@ IGNORED = 255
 RECORDS = ".records"
 CHECKSUM = "sha256"  # of the rest of a record
 LABELS = ("masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
-MAX_INSTRUMENTS = (
-    8  # in `silhouettes`, whose bit k is set where instrument k would be visible if nothing else were there
-)
+MAX_INSTRUMENTS = 8  # in `silhouettes`: bit k is set where instrument k would be visible if nothing else were there
 POLYGONS = ("polygons", "segmentation")  # of a label or part, left out of states.jsonl
 FOLDERS = ("images", *LABELS, RECORDS)
 VALIDATION_EVERY = 5  # every fifth image is for validation; by the index alone, so a data set can grow

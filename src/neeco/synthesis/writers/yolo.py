@@ -13,6 +13,7 @@ Classes are instruments; those of yolo/parts/ are the part ids of dataset.json, 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,9 +50,8 @@ class Yolo(Writer):
         names = {k: f"{instrument}/{part}" for k, (instrument, part) in enumerate(images.part_names)}
         _write_variant(images, folder / "parts", segment_row, {"names": names}, visible_parts)
         if keypoints:
-            mirrored = [
-                name.replace("left", "\0").replace("right", "left").replace("\0", "right") for name in keypoints
-            ]
+            swapped = {"left": "right", "right": "left"}
+            mirrored = [re.sub("left|right", lambda found: swapped[found[0]], name) for name in keypoints]
             flip = [keypoints.index(name) if name in keypoints else k for k, name in enumerate(mirrored)]
             extra: dict[str, Any] = {"kpt_shape": [len(keypoints), 3], "flip_idx": flip}
             extra["kpt_names"] = {k: list(keypoints) for k in range(len(images.instruments))}
