@@ -192,10 +192,11 @@ class SampleGenerator:
         A random state is sampled again until one is acceptable, `settings.max_attempts` times at most. A prescribed
         state is only rendered from other views. Raises StatesRefused where none was acceptable.
         """
-        rng = np.random.default_rng(np.random.SeedSequence([self.settings.seed, index, EFFECTS_STREAM]))
+        rng = self._rng(index, EFFECTS_STREAM)
         effects = {} if self.effects is None else self.effects.draw(rng)
         drawing, refused = self._first_acceptable(index, effects)
-        appearance = self._appearance(index, drawing)
+        height, width = drawing.depth.shape
+        appearance = self.appearances.draw(self._rng(index, APPEARANCE_STREAM), width, height)
         drawing = self._with(drawing, appearance)
         labels = annotate(self.scene, drawing, self.labeller.names)
         facts: dict[str, Any] = {} if self.effects is None else {"camera_effects": effects}
@@ -204,8 +205,7 @@ class SampleGenerator:
         return LabelledSample(index, self._through_camera(drawing, effects, rng, appearance), labels, refused, facts)
 
     def _first_acceptable(self, index: int, effects: Mapping[str, float]) -> tuple[LayeredDrawing, Counter[str]]:
-        settings = self.settings
-        rng = np.random.default_rng(np.random.SeedSequence([settings.seed, index]))
+        settings, rng = self.settings, self._rng(index)
         refused: Counter[str] = Counter()
         for _ in range(1 if self.sampler.fixed(index) else settings.max_attempts):
             state, camera = self.sampler(index, rng)
@@ -225,10 +225,8 @@ class SampleGenerator:
             refused,
         )
 
-    def _appearance(self, index: int, drawing: LayeredDrawing) -> Appearance:
-        rng = np.random.default_rng(np.random.SeedSequence([self.settings.seed, index, APPEARANCE_STREAM]))
-        height, width = drawing.depth.shape
-        return self.appearances.draw(rng, width, height)
+    def _rng(self, *numbers: int) -> Generator:
+        return np.random.default_rng(np.random.SeedSequence([self.settings.seed, *numbers]))
 
     def _with(self, drawing: LayeredDrawing, appearance: Appearance) -> LayeredDrawing:
         """Return the rendering in another appearance; the depth of a background is unknown."""

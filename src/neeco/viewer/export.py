@@ -83,13 +83,11 @@ def embedded_page(run: TrainedRun) -> str | None:
 
 def page_of_run(run: TrainedRun, sh_degree: int) -> str:
     """The page of a run, harmonics up to `sh_degree`. Raises NeecoError where a page cannot hold it (`why_not`)."""
-    if refusal := why_not(run.scene):
-        raise NeecoError(f"--export: {refusal}")
-    scene = require_gaussians(run.scene, "--export")
+    scene = run.scene
     facts = [
         ("capture", Path(run.config["capture"]).name),
         ("method", scene.method),
-        ("Gaussians", f"{len(scene.canonical):,}"),
+        ("Gaussians", f"{scene.num_gaussians:,}"),
         ("frames trained on", str(len(scene.recorded.names))),
     ]
     iterations = scene.diagnostics.get("iterations")
@@ -107,22 +105,19 @@ def page_of(header: dict[str, Any], planes: bytes, title: str, facts: list[tuple
         head = json.dumps(header, separators=(",", ":"), allow_nan=False)
     except ValueError:
         raise NeecoError(NOT_FINITE) from None
-    return (
-        _templates()
-        .get_template("page.html")
-        .render(
-            title=title,
-            subtitle="learned with neeco: move the sliders, drag the picture",
-            facts=facts,
-            script=Markup(script),
-            style=Markup(style),
-            worker=Markup(_source(WORKER)),
-            script_hash=Markup(_hash(script)),
-            style_hash=Markup(_hash(style)),
-            head=_deflated(head.encode()),
-            scene=_deflated(planes),
-            wasm=_deflated(files(__package__).joinpath(WASM).read_bytes()),
-        )
+    template = _templates().get_template("page.html")
+    return template.render(
+        title=title,
+        subtitle="learned with neeco: move the sliders, drag the picture",
+        facts=facts,
+        script=Markup(script),
+        style=Markup(style),
+        worker=Markup(_source(WORKER)),
+        script_hash=Markup(_hash(script)),
+        style_hash=Markup(_hash(style)),
+        head=_deflated(head.encode()),
+        scene=_deflated(planes),
+        wasm=_deflated(files(__package__).joinpath(WASM).read_bytes()),
     )
 
 
@@ -165,12 +160,14 @@ def why_not(scene: DrawableScene) -> str | None:
 
 
 @torch.no_grad()
-def pack(scene: GaussianScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
+def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
     """(header, planes) of a scene, harmonics up to `sh_degree`. Raises NeecoError where its method cannot be packed, or
     there are more instruments, joints or labels than the page has room for."""
-    canonical, motion = scene.canonical, scene.motion()
+    motion = scene.motion()
     if (refusal := why_not(scene)) or motion is None:
         raise NeecoError(f"--export: {refusal}")
+    scene = require_gaussians(scene, "--export")
+    canonical = scene.canonical
     degree = min(sh_degree, scene.sh_degree)
     means, boxes = _in_boxes(canonical.means, canonical.counts)
     scales, scale_range = _quantized(motion.log_scales.clamp_min(float(np.log(EXPORT.thinnest_mm))), 255)
@@ -269,27 +266,16 @@ def _instruments(scene: GaussianScene, motion: ArticulatedMotion) -> list[dict[s
         names, joints = list(instrument.joints), []
         for name in names:
             span = ranges[instrument.name, name]
-            slides = instrument.slides(name)
-            joints.append({"name": name, "range": [span.lower, span.upper], "slides": slides})
+            joints.append({"name": name, "range": [span.lower, span.upper], "slides": instrument.slides(name)})
         shaft = shafts[instrument.name]
         side, up, _ = frame_about(shaft.along).T
         vectors = {"end": shaft.end, "along": shaft.along, "side": side, "up": up}
-        instruments.append(
-            {
-                "name": instrument.name,
-                "shaft": {name: vector.tolist() for name, vector in vectors.items()},
-                "joints": joints,
-                "axes": [
-                    {
-                        "pivot": item.pivot.tolist(),
-                        "axis": item.axis.tolist(),
-                        "joint": names.index(item.reading),
-                        "slides": item.slides,
-                    }
-                    for item in axes
-                ],
-            }
-        )
+        moves = []
+        for item in axes:
+            place = {"pivot": item.pivot.tolist(), "axis": item.axis.tolist()}
+            moves.append(place | {"joint": names.index(item.reading), "slides": item.slides})
+        shape = {name: vector.tolist() for name, vector in vectors.items()}
+        instruments.append({"name": instrument.name, "shaft": shape, "joints": joints, "axes": moves})
     return instruments
 
 

@@ -9,7 +9,7 @@ import contextlib
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -36,7 +36,7 @@ document.documentElement.addEventListener("keydown", event => {
 </script>"""
 
 
-class ViserPage:
+class ViserPage(contextlib.AbstractContextManager["ViserPage"]):
     """viser's running server; `address` is what to open. Use as a context manager, or call `stop`."""
 
     def __init__(self, host: str, port: int, cameras: Sequence[Camera], distance: float, unit: float) -> None:
@@ -53,9 +53,6 @@ class ViserPage:
         initial.look_at = tuple((pose[:3, 3] + distance * pose[:3, 2]) * unit)
         initial.up = tuple(-pose[:3, 1])
         initial.fov = field_of_view(cameras[0])
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()

@@ -263,12 +263,12 @@ class DownstreamJob:
         predictions = predict([example.image for example in truth])
         if self.fold == self.settings.kept_fold:
             write_predictions(self.folder, test, [sample.name for sample in samples], predictions)
-        frames: list[dict[str, float]] = []
-        for prediction, example in zip(predictions, truth, strict=True):
-            if isinstance(prediction, Detections):
-                frames.append({"box_iou": box_iou(prediction, example)})
-            else:
-                frames.append(mask_scores(prediction, example, names))
+        frames = [
+            {"box_iou": box_iou(found, example)}
+            if isinstance(found, Detections)
+            else mask_scores(found, example, names)
+            for found, example in zip(predictions, truth, strict=True)
+        ]
         boxes = [prediction for prediction in predictions if isinstance(prediction, Detections)]
         rows = [
             {"frame": sample.name}
@@ -377,7 +377,8 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
         raise NeecoError(f"--num-real: leaves nothing to train {missing[0]} on; add 0 for sets, a number for real")
     entries = [entry.name for entry in settings.output.iterdir()] if settings.output.is_dir() else []
     if [name for name in entries if not name.startswith(".")] != ["jobs"]:  # not just before its first result
-        check_output(settings.output, FILE, SCHEMA, settings.capture, "a downstream experiment")
+        same = {"schema": SCHEMA, "capture": str(settings.capture.absolute())}
+        check_output(settings.output, FILE, "a downstream experiment", **same)
     for job in jobs:
         job.check()
     return DownstreamPlan(
