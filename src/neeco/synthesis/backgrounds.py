@@ -166,11 +166,8 @@ class Appearances:
     @classmethod
     def of(cls, settings: Settings) -> Appearances:
         """Those that settings describe. Raises NeecoError for a folder without images."""
-        folders = {
-            name: None if folder is None else ImageFolder.of(folder, name)
-            for name, folder in settings.image_folders().items()
-        }
-        return cls(folders["backgrounds"], folders["match_colors"])
+        folders = {name: ImageFolder.of(folder, name) for name, folder in settings.image_folders().items()}
+        return cls(folders.get("backgrounds"), folders.get("match_colors"))
 
     def draw(self, rng: Generator, width: int, height: int) -> Appearance:
         """Sample the appearance of an image. Raises NeecoError where a background cannot be read."""

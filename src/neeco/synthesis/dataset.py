@@ -102,10 +102,7 @@ def synthesize(
     runs = (run, *instrument_runs)
     scene, *instrument_scenes = (each.scene for each in runs)
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
-    folders = {
-        name: None if folder is None else ImageFolder.of(folder, name).digest()
-        for name, folder in settings.image_folders().items()
-    }
+    folders = {name: ImageFolder.of(folder, name).digest() for name, folder in settings.image_folders().items()}
     check_formats(formats, settings)
     recorded = scene.recorded.cameras[0]
     identity = settings.identity() | {
@@ -136,14 +133,13 @@ def synthesize(
     with folder.being_written() as records:
         if records:
             on_progress(len(records))
-        missing = [k for k in range(settings.count) if k not in records]
-        scene_file, *others = (Path(each.path) / SCENE_FILE for each in runs)
-        # workers need not find the tolerance again
-        resolved = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
-        spec = GeneratorSpec(scene_file, resolved, str(scene.center.device), tuple(others))
-        made = 0
+        missing, made = [k for k in range(settings.count) if k not in records], 0
         processes = min(workers, len(missing))
         if missing and (processes > 1 or address()):
+            scene_file, *others = (Path(each.path) / SCENE_FILE for each in runs)
+            # workers need not find the tolerance again
+            resolved = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
+            spec = GeneratorSpec(scene_file, resolved, str(scene.center.device), tuple(others))
             rendered = draw_in_workers(spec, output, missing, processes)
         else:
             rendered = (draw_to_folder(generator, output, index) for index in missing)
@@ -307,9 +303,8 @@ def writer(name: str) -> type[Writer]:
 def check_formats(formats: Sequence[str], settings: ImageSettings) -> None:
     """Raises NeecoError for a format that is unknown, or that cannot describe the images."""
     for name in formats:
-        if settings.lens and not writer(name).accepts_distortion:
+        if not writer(name).accepts_distortion and settings.lens:
             raise NeecoError(f"--formats: {name} cannot store distorted images; remove {name} or --lens")
-        writer(name)
 
 
 def part_ids(names: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -139,9 +139,7 @@ class SampleGenerator:
     appearances: Appearances = ALL_AS_RECORDED
 
     @classmethod
-    def of(
-        cls, scene: GaussianScene, settings: Settings, instrument_scenes: Sequence[GaussianScene] = ()
-    ) -> SampleGenerator:
+    def of(cls, scene: GaussianScene, settings: Settings, instrument_scenes: Sequence[GaussianScene] = ()) -> Self:
         """Return the generator that `settings` describe, of `scene` or of its tissue under the instruments of
         `instrument_scenes`. Raises NeecoError where the scenes do not support them."""
         cameras = DrawnCameras.of(settings, scene.recorded, scene.recorded.cameras)
@@ -314,7 +312,7 @@ def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
         if generator.sampler.prescribed:
             return skipped_sample(index, error.refused)
         raise
-    how = {"refused": sample.refused, "facts": sample.facts, "quality": generator.settings.jpeg_quality}
+    how: dict[str, Any] = {"refused": sample.refused, "facts": sample.facts, "quality": generator.settings.jpeg_quality}
     return encoded_sample(index, sample.drawing, sample.labels, **how)
 
 

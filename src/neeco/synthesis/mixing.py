@@ -31,6 +31,7 @@ from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.visibility import VISIBILITY
 from neeco.synthesis.samplers import Sampler, make_sampler
 from neeco.synthesis.settings import Settings
+from neeco.synthesis.states import with_poses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,10 +95,8 @@ class Mixture:
             raise NeecoError(f"--states: {settings.states}: states of one recording; {fitting}")
         if settings.views == "orbit":
             raise NeecoError("--views: orbit is about one recording's tissue; with --instruments use another")
-        samplers = [
-            make_sampler(scene, settings.states, settings.margin, "recorded", settings.count)
-            for scene in self.instrument_scenes
-        ]
+        states, margin, count = settings.states, settings.margin, settings.count
+        samplers = (make_sampler(scene, states, margin, "recorded", count) for scene in self.instrument_scenes)
         return MixedSampler(self, tuple(samplers))
 
     def place(self, scene: GaussianScene, state: State, seen_by: Camera, camera: Camera) -> dict[str, InstrumentState]:
@@ -118,10 +117,7 @@ class Mixture:
             depth = max(end[2] + here - there, min(min_depth, end[2]))
             shift[:3, 3] = (depth / end[2] - 1) * end
         carry = to_numpy(camera.world_from_camera) @ shift @ camera_from_world
-        return {
-            name: InstrumentState(torch.from_numpy(carry @ to_numpy(item.pose)), item.joints)
-            for name, item in registered.instruments.items()
-        }
+        return dict(with_poses(registered, lambda name, pose: carry @ pose).instruments)
 
     def _recorded(self) -> Recorded:
         """Frames spread over the tissue's cameras, with the instrument scenes' recorded states placed before them."""

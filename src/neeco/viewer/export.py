@@ -173,6 +173,7 @@ def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
     scales, scale_range = _quantized(motion.log_scales.clamp_min(float(np.log(EXPORT.thinnest_mm))), 255)
     base, base_range = _quantized(canonical.sh_dc[:, 0] * SH_C0 + 0.5, 65535)
     turns = [_quantized(column[:, None], 65535) for column in motion.amounts.flatten(1).unbind(1)]
+    none = np.zeros((len(canonical), 0), np.int64)  # where nothing turns
     harmonics, bands = _harmonics(canonical.sh_rest, degree)
     fields = (  # name, whole numbers [N, K], type
         ("mean", means, "uint24"),
@@ -180,7 +181,7 @@ def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
         ("scale", scales, "uint8"),
         ("opacity", _rounded(torch.sigmoid(canonical.opacity_logits)[:, None] * 255), "uint8"),
         ("base", base, "uint16"),
-        ("turn", _columns(canonical.means, [numbers for numbers, _ in turns]), "uint16"),
+        ("turn", np.concatenate([none, *(numbers for numbers, _ in turns)], 1), "uint16"),
         ("label", _rounded(scene.label_channels() * 255), "uint8"),
         ("sh", harmonics, "int8"),
     )
@@ -206,21 +207,16 @@ def _planes(numbers: np.ndarray, kind: str) -> bytes:
     return np.ascontiguousarray(split[..., : BYTES[kind]].transpose(2, 0, 1)).tobytes()
 
 
-def _columns(rows: Tensor, blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """Concatenate blocks [N, K] by columns; without any, return whole numbers of as many rows as `rows` has."""
-    return np.concatenate([np.zeros((len(rows), 0), np.int64), *blocks], 1)
-
-
 def _harmonics(rest: Tensor, degree: int) -> tuple[np.ndarray, list[float]]:
     """[N, 3 K] in -127 to 127 of harmonics [N, 15, 3], the first left out, and what 127 stands for in every degree: its
     largest."""
-    blocks, bands = [], []
+    blocks, bands = [np.zeros((len(rest), 0), np.int64)], []
     for d in range(1, degree + 1):
         band = rest[:, d * d - 1 : (d + 1) ** 2 - 1]
         largest = max(float(band.abs().max()) if band.numel() else 0.0, 1e-9)
         blocks.append(_rounded(band / largest * 127).reshape(len(rest), -1))
         bands.append(largest)
-    return _columns(rest, blocks), bands
+    return np.concatenate(blocks, 1), bands
 
 
 def _in_boxes(means: Tensor, counts: Sequence[int]) -> tuple[np.ndarray, list[list[list[float]]]]:

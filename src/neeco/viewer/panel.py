@@ -139,8 +139,7 @@ class Panel:
         self.worst.on_update(_by_user(self._worst_chosen))
 
     def _add_saving(self) -> None:
-        gui = self._gui
-        labelled = bool(self._loaded.scene.label_names)
+        gui, labelled = self._gui, bool(self._loaded.scene.label_names)
         with gui.add_folder("Keep"):
             self.keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
             hint = "As neeco synthesize writes one, from here."

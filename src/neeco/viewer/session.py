@@ -216,6 +216,7 @@ class ClientSession:
         self._camera_frame = 0  # whose camera the window was sent to last
         self._followed: int | None = 0  # the frame that the camera went along to
         client.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._loaded = run.loaded
         self._build(run.loaded)
         self._go_to(0)
         client.camera.on_update(lambda _: self._request())
@@ -270,7 +271,7 @@ class ClientSession:
         cameras, unit = loaded.recorded.cameras, self._run.unit
         self.overlays = Overlays(self._client, cameras, points, unit, self._go_to, self._request)
         self._loaded = loaded
-        self._panel = Panel(self._client, loaded, self._request, self._go_to, self._toggle_gizmo)
+        self._panel: Panel = Panel(self._client, loaded, self._request, self._go_to, self._toggle_gizmo)
         self._panel.keep.on_click(lambda _: self._save_state())
         self._panel.save.on_click(lambda _: self._save_image())
 

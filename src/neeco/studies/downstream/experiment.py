@@ -264,10 +264,8 @@ class DownstreamJob:
         if self.fold == self.settings.kept_fold:
             write_predictions(self.folder, test, [sample.name for sample in samples], predictions)
         frames = [
-            {"box_iou": box_iou(found, example)}
-            if isinstance(found, Detections)
-            else mask_scores(found, example, names)
-            for found, example in zip(predictions, truth, strict=True)
+            {"box_iou": box_iou(found, true)} if isinstance(found, Detections) else mask_scores(found, true, names)
+            for found, true in zip(predictions, truth, strict=True)
         ]
         boxes = [prediction for prediction in predictions if isinstance(prediction, Detections)]
         rows = [

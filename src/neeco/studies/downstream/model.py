@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from neeco.base.errors import NeecoError, install_hint
+from neeco.base.errors import NeecoError
 from neeco.base.files import write_atomically
 from neeco.base.registry import plugins
 from neeco.studies.downstream.results import Prediction
@@ -66,9 +65,9 @@ class TorchModel(ABC):
     report_every: ClassVar[int] = 10  # steps between two reports of progress
 
     @classmethod
-    @abstractmethod
     def missing_requirement(cls) -> str | None:
         """Return what this machine lacks to train it, with the remedy; None when it can be trained."""
+        return None
 
     @classmethod
     def is_too_small(cls, size: tuple[int, int]) -> bool:
@@ -142,12 +141,6 @@ class TorchModel(ABC):
             batch = batch.contiguous(memory_format=torch.channels_last)
             predictions += self.predictions(module, batch, [(image.shape[0], image.shape[1]) for image in some])
         return predictions
-
-
-def missing_packages(*packages: str) -> str | None:
-    """`missing_requirement` of a model that needs packages of the extra `downstream`."""
-    absent = [name for name in packages if importlib.util.find_spec(name) is None]
-    return f"needs {' and '.join(absent)}; {install_hint('downstream')}" if absent else None
 
 
 @cache
