@@ -224,8 +224,8 @@ class Curve:
         if not self.shares or session.progress < self.shares[0]:
             return
         self.shares = tuple(share for share in self.shares if share > session.progress)
-        row = {"iteration": session.iteration, "seconds": round(session.seconds, 3)}
-        row |= {"progress": round(session.progress, 4)}
+        seconds, progress = round(session.seconds, 3), round(session.progress, 4)
+        row = {"iteration": session.iteration, "seconds": seconds, "progress": progress}
         self.rows += [row | {"split": split, "psnr": self.score(session.scene, split)} for split in self.frames]
         write_text(self.file, "".join(json.dumps(row, allow_nan=False) + "\n" for row in finite(self.rows)))
 

@@ -98,9 +98,9 @@ class CameraEffects:
         values = {}
         for name in EFFECTS:
             applies, place = rng.random(), rng.random()
-            effect_range = self.ranges.get(name)
-            if effect_range is not None and applies < effect_range.share:
-                values[name] = round(effect_range.low + (effect_range.high - effect_range.low) * place, 5)
+            if name in self.ranges and applies < self.ranges[name].share:
+                low, high = self.ranges[name].low, self.ranges[name].high
+                values[name] = round(low + (high - low) * place, 5)
         return values
 
     def to_json(self) -> dict[str, Any]:

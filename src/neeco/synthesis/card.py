@@ -244,9 +244,7 @@ def _tinted(image: np.ndarray, ids: np.ndarray) -> np.ndarray:
     colors = np.concatenate([np.zeros((1, 3)), PART_COLORS[np.arange(max(int(ids.max()), 1)) % len(PART_COLORS)]])[ids]
     inside = ids > 0
     tinted = np.where(inside[..., None], (1 - PREVIEW.tint) * image + PREVIEW.tint * colors, image)
-    edge = outline(inside)
-    tinted[edge] = colors[edge]
-    return tinted
+    return np.where(outline(inside)[..., None], colors, tinted)
 
 
 def _draw_label(canvas: ImageDraw.ImageDraw, label: dict[str, Any], bones: Pairs, scale: float) -> None:

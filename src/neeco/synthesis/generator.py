@@ -241,7 +241,8 @@ class SampleGenerator:
             gaussians = self.scene.at(state)
             owners = self.labeller.owners(state, gaussians)
             image = appearance.over_background(split(gaussians, owners, camera, image, share))
-        return appearance.matched(image)
+        colors = appearance.colors
+        return image if colors is None else torch.from_numpy(colors.given_to(image.numpy()))
 
     def _through_camera(
         self,

@@ -55,8 +55,8 @@ def split_views(run: TrainedRun, split: str, capture_path: Path | None = None) -
 
     Stems that several frames share are made unique by the names of the folders above them. Raises NeecoError.
     """
-    scene, other = run.scene, None if capture_path is None else read_capture(capture_path)
-    capture = run.capture() if other is None else scene.recorded.completed(other, scene.instruments)
+    other = None if capture_path is None else read_capture(capture_path)
+    capture = run.scene.recorded.completed(other, run.scene.instruments) if other else run.capture()
     frames = capture.split(split)
     if not frames:
         splits = ", ".join(capture.splits) or "none"

@@ -280,7 +280,7 @@ class DrawnCameras:
         and a camera among `cameras` whose images have another shape."""
         images.check()
         if images.lens and recorded.lens is None:
-            raise NeecoError("--lens: the capture states no lens; ingest it again and train on that, or remove --lens")
+            raise NeecoError("--lens: the scene's capture states no lens; ingest it and train again, or remove --lens")
         drawn_cameras = cls(images, recorded.lens if images.lens else None)
         for camera in cameras:
             drawn_cameras(camera)

@@ -59,8 +59,8 @@ class SizeSettings:
             wide, high = (int(side) for side in self.size.lower().split("x"))
             fitting = (wide, max(1, round(wide * height / width))), (max(1, round(high * width / height)), high)
             if (wide, high) not in fitting:
-                others = " or ".join(f"{across}x{down}" for across, down in fitting)
-                raise NeecoError(f"--size: {self.size}: the recorded {width}x{height} has another shape; give {others}")
+                fits = " or ".join(f"{across}x{down}" for across, down in fitting)
+                raise NeecoError(f"--size: {self.size}: another shape than the recorded {width}x{height}; give {fits}")
             size = wide, high
         if size[0] * size[1] > MAX_PIXELS:
             option = "--size" if self.scale is None else "--scale"

@@ -180,24 +180,19 @@ class GridStates:
     """Every joint value with every roll, about recorded poses.
 
     Cell `index` mod (joint_values * rolls): all joints at the same fraction of their recorded ranges, each instrument
-    rolled about its shaft by -roll .. +roll. Each full round of cells stands on another recorded pose.
+    rolled about its shaft by -30 to 30 degrees. Each full round of cells stands on another recorded pose.
     """
 
     prescribed = True
 
     def __init__(
-        self,
-        states: Sequence[State],
-        shafts: Mapping[str, Shaft],
-        joint_values: int = 5,
-        rolls: int = 5,
-        roll_rad: float = np.pi / 6,
+        self, states: Sequence[State], shafts: Mapping[str, Shaft], joint_values: int = 5, rolls: int = 5
     ) -> None:
         self.states = _with_instruments(states)
         self.ranges = joint_ranges(self.states)
         self.shafts = shafts
-        self.fractions = np.linspace(0, 1, joint_values) if joint_values > 1 else np.array([0.5])
-        self.rolls = np.linspace(-roll_rad, roll_rad, rolls) if rolls > 1 else np.array([0.0])
+        self.fractions = np.linspace(0, 1, joint_values)
+        self.rolls = np.linspace(-np.pi / 6, np.pi / 6, rolls)
 
     def __call__(self, index: int, rng: Generator) -> State:
         round_number, cell = divmod(index, len(self.fractions) * len(self.rolls))

@@ -13,7 +13,6 @@ import json
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -105,8 +104,8 @@ def page_of(header: dict[str, Any], planes: bytes, title: str, facts: list[tuple
         head = json.dumps(header, separators=(",", ":"), allow_nan=False)
     except ValueError:
         raise NeecoError(NOT_FINITE) from None
-    template = _templates().get_template("page.html")
-    return template.render(
+    pages = Environment(loader=PackageLoader("neeco.viewer", "page"), autoescape=True, undefined=StrictUndefined)
+    return pages.get_template("page.html").render(
         title=title,
         subtitle="learned with neeco: move the sliders, drag the picture",
         facts=facts,
@@ -133,11 +132,6 @@ def _hash(text: str) -> str:
 
 def _deflated(data: bytes) -> str:
     return base64.b64encode(zlib.compress(data, 9)).decode()
-
-
-@cache
-def _templates() -> Environment:
-    return Environment(loader=PackageLoader("neeco.viewer", "page"), autoescape=True, undefined=StrictUndefined)
 
 
 def why_not(scene: DrawableScene) -> str | None:

@@ -63,8 +63,7 @@ class RecordingSession:
     def __init__(self, client: viser.ClientHandle, capture: Capture, unit: float, distance: float) -> None:
         self._client, self._capture, self._unit, self._distance = client, capture, unit, distance
         self._lock, self._shown = threading.RLock(), (-1, 0.0)
-        gui, scene = client.gui, client.scene
-        cameras = [frame.camera for frame in capture.frames]
+        gui, scene, cameras = client.gui, client.scene, [frame.camera for frame in capture.frames]
         overlays = Overlays(client, cameras, capture.points, unit, self.go_to, lambda: None)
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         with gui.add_folder("Recording"):

@@ -88,7 +88,7 @@ class ViewerServer(ViserPage):
 
     def stop(self) -> None:
         """End the rendering, then the server."""
-        self.run.end_watch()
+        self.run.ended.set()
         self.render_thread.stop()
         super().stop()
 
@@ -113,11 +113,8 @@ def _start_server(access: Access) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> None:
             return None
 
-    def with_slider_keys(page: bytes) -> bytes:
-        return page.replace(b"<head>", b"<head>" + SLIDER_KEYS, 1)
-
     # viser's own banner would name an address without the token
-    with controlled_sockets(access, with_slider_keys) as opened, contextlib.redirect_stdout(io.StringIO()):
+    with controlled_sockets(access, SLIDER_KEYS) as opened, contextlib.redirect_stdout(io.StringIO()):
         server = Server(host=access.host, port=access.port, label="neeco", verbose=False)
     if not opened:
         _stop_server(server)

@@ -58,9 +58,7 @@ class RunPicture:
 
 def views_of(scene: DrawableScene, has_images: bool) -> tuple[str, ...]:
     """The VIEWS that a scene has; has_images: the capture is at hand."""
-    absent = set()
-    if not scene.label_names:
-        absent |= set(LABELLED)
+    absent = set[str]() if scene.label_names else set(LABELLED)
     if not scene.has_gaussians:
         absent.add(UNOBSERVED)
     if not has_images:

@@ -182,22 +182,21 @@ class DownstreamJob:
 
     def check(self) -> None:
         """Raises NeecoError when the folder holds another job's result, or a test of another capture by this name."""
+        self.stored()
+
+    def stored(self) -> dict[str, Any] | None:
+        """Return the result of an earlier start, None where there is none of all tests. Raises NeecoError as `check`
+        does."""
         file = self.folder / JOB_FILE
         if not file.exists():
-            return
+            return None
         stored = require_like(read_json(file), {"schema": str}, str(file), REMEDY)
         now = {"schema": JOB_SCHEMA} | self.identity()
         require_same(str(file), ((key, stored.get(key), now[key]) for key in now), REMEDY)
         tested = require_like(stored, {"tests": {str: str}, "splits": dict}, str(file), REMEDY)["tests"]
         tests = {name: str(path.absolute()) for name, path in self.settings.tests.items()}
         require_same(f"{file}: --test", ((name, tested.get(name, tests[name]), tests[name]) for name in tests), REMEDY)
-
-    def stored(self) -> dict[str, Any] | None:
-        """Return the result of an earlier start, None where there is none of all tests. Raises NeecoError."""
-        self.check()
-        file = self.folder / JOB_FILE
-        result = dict(read_json(file)) if file.exists() else None
-        return result if result and set(self.settings.all_tests) <= set(result["splits"]) else None
+        return dict(stored) if set(self.settings.all_tests) <= set(stored["splits"]) else None
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
         """Train, test, write `folder`/job.json last, and return what it holds; at once when it is there already."""

@@ -19,14 +19,7 @@ import numpy as np
 import torch
 
 from neeco.base.errors import NeecoError
-from neeco.base.files import (
-    read_bytes,
-    read_text,
-    require_replaceable,
-    write_atomically,
-    write_text,
-    write_unsynced,
-)
+from neeco.base.files import read_bytes, read_text, require_replaceable, write_atomically, write_text, write_unsynced
 from neeco.capture.images import encoded_image, encoded_png
 from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.geometry.lens import Lens
@@ -174,10 +167,9 @@ def write_states(root: Path, records: list[Record]) -> None:
     """Write states.jsonl: a line per image, state and labels; readable again as `--states states.jsonl`."""
     lines = []
     for record in records:
-        line = public_record(record)
-        line["labels"] = [_without_polygons(label) for label in record["labels"]]
-        lines.append(json.dumps(line, allow_nan=False))
-    write_text(root / "states.jsonl", "".join(f"{line}\n" for line in lines))
+        labels = [_without_polygons(label) for label in record["labels"]]
+        lines.append(json.dumps(public_record(record) | {"labels": labels}, allow_nan=False) + "\n")
+    write_text(root / "states.jsonl", "".join(lines))
 
 
 def public_record(record: Record) -> dict[str, Any]:

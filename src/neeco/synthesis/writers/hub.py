@@ -126,12 +126,11 @@ def push_to_hub(folder: Path, name: str) -> str:
 
         hub = HfApi(library_name="neeco")
         repository = hub.create_repo(name, repo_type="dataset", private=True, exist_ok=True)
-        message = "Add data set rendered by neeco"
         hub.upload_folder(
             repo_id=repository.repo_id,
             repo_type="dataset",
             folder_path=folder,
-            commit_message=message,
+            commit_message="Add data set rendered by neeco",
             ignore_patterns=list(LEFT_OUT),
         )
         return str(repository)

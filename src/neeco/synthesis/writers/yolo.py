@@ -97,8 +97,7 @@ def oriented_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
 
 def joined_polygon(polygons: list[np.ndarray]) -> np.ndarray:
     """Return one polygon [P, 2] out of several, joined by bridges of no width between their nearest corners."""
-    joined, *rest = polygons
-    remaining = list(rest)
+    joined, *remaining = polygons
     while remaining:
         gaps = [np.linalg.norm(joined[:, None] - other[None], axis=2) for other in remaining]
         nearest = int(np.argmin([gap.min() for gap in gaps]))
@@ -130,11 +129,10 @@ def _write_variant(
         ]
         write_unsynced(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines).encode())
         link(images.root / record["image"], folder / "images" / split / Path(record["image"]).name)
-    has_validation = any(record["split"] == "val" for record in records)
     # without "path", tools take the folder of data.yaml itself, wherever the data set is moved
     data = {
         "train": "images/train",
-        "val": "images/val" if has_validation else "images/train",
+        "val": "images/val" if any(record["split"] == "val" for record in records) else "images/train",
         "names": dict(enumerate(images.instruments)),
         **extra,
     }
