@@ -15,12 +15,12 @@ from source_trees import module_paths, module_trees
 # lines of Python: the limit, and the aim
 ROOMS = {
     "cli": (2080, 1700),
-    "viewer": (2920, 2100),
+    "viewer": (2770, 2100),
     "report": (1600, 1500),
-    "studies": (3040, 2600),
+    "studies": (3001, 2600),
     "ingest": (18_150, 10_500),
     "tracking": (1420, 1200),
-    "synthesis": (4410, 3200),
+    "synthesis": (4234, 3200),
     "evaluation": (1410, 1200),
     "labels": (925, 800),
     "methods": (5070, 3500),
@@ -33,7 +33,7 @@ ROOMS = {
     "geometry": (1000, 1000),
     "base": (1600, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (307, 240), (3628, 3000), (293, 300)
+FILES, FUNCTIONS, NUMBERS = (304, 240), (3602, 3000), (293, 300)
 
 
 def lines_of_rooms() -> Counter[str]:
