@@ -361,7 +361,7 @@ def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSettings, capture:
         ),
         (
             {"num_real": ("0",), "conditions": ("real",)},
-            "--num-real: leaves nothing to train real on; add 0 for sets, a number for real",
+            "--num-real: leaves nothing to train real on; add 0 for sets alone, a number for real",
         ),
         (
             {"num_real": ("6",), "conditions": ("real", "kin")},

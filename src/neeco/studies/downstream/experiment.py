@@ -371,7 +371,8 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
     )
     trained = {job.condition.name for job in jobs}
     if missing := [item.name for item in conditions if item.name not in trained and (settings.conditions or not jobs)]:
-        raise NeecoError(f"--num-real: leaves nothing to train {missing[0]} on; add 0 for sets, a number for real")
+        problem = f"leaves nothing to train {missing[0]} on"
+        raise NeecoError(f"--num-real: {problem}; add 0 for sets alone, a number for real")
     entries = [entry.name for entry in settings.output.iterdir()] if settings.output.is_dir() else []
     if [name for name in entries if not name.startswith(".")] != ["jobs"]:  # not just before its first result
         same = {"schema": SCHEMA, "capture": str(settings.capture.absolute())}
