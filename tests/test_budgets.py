@@ -15,25 +15,25 @@ from source_trees import module_paths, module_trees
 # lines of Python: the limit, and the aim
 ROOMS = {
     "cli": (2080, 1700),
-    "viewer": (2920, 2100),
+    "viewer": (2770, 2100),
     "report": (1600, 1500),
-    "studies": (3040, 2600),
+    "studies": (3002, 2600),
     "ingest": (17_954, 10_500),
-    "tracking": (1420, 1200),
-    "synthesis": (4410, 3200),
+    "tracking": (1410, 1200),
+    "synthesis": (4234, 3200),
     "evaluation": (1410, 1200),
     "labels": (925, 800),
-    "methods": (5070, 3500),
+    "methods": (5061, 3500),
     "training": (2040, 1700),
-    "states": (3370, 2600),
-    "evidence": (940, 1200),
+    "states": (3361, 2600),
+    "evidence": (939, 1200),
     "scene": (1997, 1800),
-    "capture": (4980, 3900),
-    "raster": (4060, 3800),
-    "geometry": (1000, 1000),
+    "capture": (4972, 3900),
+    "raster": (4055, 3800),
+    "geometry": (983, 1000),
     "base": (1600, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (304, 240), (3620, 3000), (293, 300)
+FILES, FUNCTIONS, NUMBERS = (304, 240), (3599, 3000), (292, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

@@ -24,7 +24,6 @@ from neeco.synthesis import camera_effects
 from neeco.synthesis.camera_effects import (
     EFFECTS,
     CameraEffects,
-    MixedMotion,
     Motion,
     Range,
     RecordedMotion,
@@ -241,12 +240,12 @@ def test_mixed_instruments_and_camera_move_each_as_recorded(moving: GaussianScen
         cameras=tuple(moved_camera(CAMERA, rigid(np.eye(3), np.array([0, 2.0 * k, 0]))) for k in range(12)),
         states=tuple(State({}, k / 25) for k in range(12)),
     )
-    motion = MixedMotion(other, [moving.recorded])
+    motion = RecordedMotion(other, [moving.recorded])
     assert motion.known
     drawn = motion(rod_state(), np.random.default_rng(0))
     assert drawn.instruments["rod"][3:] == pytest.approx([30.0, 0, 0], abs=1e-6)
     assert drawn.camera[3:] == pytest.approx([0, 50.0, 0], abs=1e-6)
-    assert not MixedMotion(other, [replace(moving.recorded, states=moving.recorded.states[:1])]).known
+    assert not RecordedMotion(other, [replace(moving.recorded, states=moving.recorded.states[:1])]).known
 
 
 def test_an_exposure_is_drawn_as_often_as_its_motion_needs(moving: GaussianScene) -> None:

@@ -14,7 +14,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.capture.readers import read_states
 from neeco.capture.writer import state_to_json
 from neeco.geometry.rotations import rigid
-from neeco.synthesis.samplers import SAMPLING, OrbitViews, PerturbedViews, RecordedViews, instrument_axes, make_sampler
+from neeco.synthesis.samplers import SAMPLING, OrbitViews, PerturbedViews, RecordedViews, make_sampler, shafts_of
 from neeco.synthesis.states import (
     ExtrapolatedStates,
     GridStates,
@@ -114,13 +114,13 @@ def test_limits_narrower_than_the_recording_do_not_cut_into_it():
 
 
 def test_the_grid_holds_every_joint_value_with_every_roll_about_the_shaft(scene):
-    axes = instrument_axes(scene)
-    assert np.allclose(axes["rod"][1], [0, 1, 0])
-    sampler = GridStates(scene.recorded.states, axes, joint_values=3, rolls=4)
+    shafts = shafts_of(scene)
+    assert np.allclose(shafts["rod"].along, [0, 1, 0])
+    sampler = GridStates(scene.recorded.states, shafts, joint_values=3, rolls=4)
     states = [sampler(k, rng_of(k)).instruments["rod"] for k in range(12)]
     assert {round(s.joints["jaw_angle"], 6) for s in states} == {0.0, 0.4, 0.8}
-    shafts = np.stack([s.pose[:3, 1].numpy() for s in states])
-    assert np.allclose(shafts, shafts[0])  # rolling keeps the shaft
+    directions = np.stack([s.pose[:3, 1].numpy() for s in states])
+    assert np.allclose(directions, directions[0])  # rolling keeps the shaft
     assert len({tuple(np.round(s.pose[:3, 0].numpy(), 6)) for s in states}) == 4
 
 

@@ -23,7 +23,8 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import to_numpy
 from neeco.scene.io import save_scene
-from neeco.viewer.controls import Controls, InstrumentControls, controlled_state, shafts_of
+from neeco.synthesis.samplers import shafts_of
+from neeco.viewer.controls import Controls, InstrumentControls, controlled_state
 from neeco.viewer.runs import ViewedRun
 from neeco.viewer.server import ViewerServer
 from neeco.viewer.views import DEPTH, DIFFERENCE, IMAGE, OVERLAY, PARTS, UNOBSERVED, picture, views_of

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from viewer_world import LIMITS, grasper_scene
 
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.synthesis.samplers import shafts_of
+from neeco.synthesis.states import Shaft
 from neeco.viewer.controls import (
     Controls,
     InstrumentControls,
-    Shaft,
     controlled_state,
     interpolated_state,
-    shafts_of,
     slider_ranges,
 )
 

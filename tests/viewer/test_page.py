@@ -23,7 +23,8 @@ from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
-from neeco.viewer.controls import Controls, InstrumentControls, controlled_state, shafts_of
+from neeco.synthesis.samplers import shafts_of
+from neeco.viewer.controls import Controls, InstrumentControls, controlled_state
 from neeco.viewer.export import pack, page_of
 
 pytestmark = pytest.mark.browser

@@ -84,17 +84,12 @@ class JobEvent:
     result: Result | None = None
 
 
-def check_output(output: Path, file: str, schema: str, capture: Path, noun: str) -> dict[str, Any] | None:
-    """Return what a study begun earlier in `output` wrote into its `file`; None where nothing was begun.
-
-    noun: name of the study, for messages. Raises NeecoError when `output` is no folder, holds something else, or the
-    study of another capture.
-    """
+def check_output(output: Path, file: str, noun: str, **same: Any) -> None:
+    """Raise NeecoError when `output` is no folder, holds something else, or a study begun earlier whose `file` differs
+    from `same`. noun: name of the study, for messages."""
     stored = read_begun(output, file, resume=None, work=noun)
     if stored is not None:
-        now = {"schema": schema, "capture": str(capture.absolute())}
-        require_same(str(output / file), ((key, stored.get(key), now[key]) for key in now), REMEDY)
-    return stored
+        require_same(str(output / file), ((key, stored.get(key), same[key]) for key in same), REMEDY)
 
 
 def run_jobs(
@@ -225,8 +220,8 @@ def _run_in_workers(
                     report(index, "training", 0.0, text)
                     continue
                 running.remove(index)
-                failure = f"its worker died: {reason}"
-                results[index] = reason if event.stage == "done" else _failed(jobs[index], failure)
+                done = event.stage == "done"
+                results[index] = reason if done else _failed(jobs[index], f"its worker died: {reason}")
                 finish(index, results[index])
     except KeyboardInterrupt:
         names = "; ".join(jobs[index].title for index in sorted(running))

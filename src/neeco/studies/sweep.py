@@ -10,7 +10,7 @@ from typing import Any
 
 from neeco import __version__
 from neeco.base.errors import NeecoError, counted
-from neeco.base.files import own_folder, require_same, write_json, write_text
+from neeco.base.files import own_folder, write_json, write_text
 from neeco.base.settings import name_and_value, plain
 from neeco.capture import Capture
 from neeco.capture.checks import read_checked
@@ -21,7 +21,7 @@ from neeco.raster.devices import device_of
 from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import UNLIMITED
 from neeco.studies.configurations import COSTS, MEASURES, Study, SweepRequest, Table
-from neeco.studies.study import REMEDY, JobEvent, Result, check_output, check_workers, machine, run_jobs, spread
+from neeco.studies.study import JobEvent, Result, check_output, check_workers, machine, run_jobs, spread
 from neeco.studies.tables import UNKNOWN, Cell, Column, ResultTable, Row, csv_text, summary_table
 from neeco.studies.training_job import JOB_FILE, TrainingJob, read_result
 from neeco.training.config import TrainConfig, training_config
@@ -92,10 +92,8 @@ def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) 
         for seed in range(study.seeds)  # every configuration's first seed comes first: half of the runs show all
         for name, config in configs.items()
     )
-    stored = check_output(request.output, SWEEP_FILE, SCHEMA, request.capture, "a sweep")
-    if stored is not None:
-        same = [("clock", stored.get("clock"), jobs[0].clock)]
-        require_same(str(request.output / SWEEP_FILE), same, REMEDY)
+    same = {"schema": SCHEMA, "capture": str(request.capture.absolute()), "clock": jobs[0].clock}
+    check_output(request.output, SWEEP_FILE, "a sweep", **same)
     digest = fingerprint(capture)
     for job in jobs:
         job.check()
@@ -171,9 +169,8 @@ def config_of(request: SweepRequest, study: Study, name: str, place: str, method
             if field in SHARED:
                 raise NeecoError(f"{origin}{field}: give {SHARED[field]}, which all runs share")
             if of_all and not any(_has(method, field) for method in methods.values()):
-                raise NeecoError(
-                    f"{origin}{field}: no such field in the methods {', '.join(dict.fromkeys(methods.values()))}"
-                )
+                known = ", ".join(dict.fromkeys(methods.values()))
+                raise NeecoError(f"{origin}{field}: no such field in the methods {known}")
             if not of_all or _has(methods[name], field):
                 settings.append(setting)
                 given_in[field] = origin

@@ -102,6 +102,5 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
     """CSV with a header line, unrounded; None and what a row lacks are empty, what the columns lack is left out."""
     import pandas
 
-    return str(
-        pandas.DataFrame(list(rows), columns=list(columns), dtype=object).to_csv(index=False, lineterminator="\n")
-    )
+    table = pandas.DataFrame(list(rows), columns=list(columns), dtype=object)
+    return str(table.to_csv(index=False, lineterminator="\n"))

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -23,15 +23,13 @@ from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.image_metrics import find_lpips, psnr
 from neeco.labels.drawing import draw
 from neeco.raster.devices import device_of
+from neeco.scene import DrawableScene
 from neeco.scene.method_registry import method_class
+from neeco.scene.training_session import Session
 from neeco.studies.study import REMEDY, JobProgress, Result
 from neeco.training.config import TrainConfig
 from neeco.training.run import open_run, read_config, require_same_capture, stored_config
 from neeco.training.train import ProgressRow, train
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene
-    from neeco.scene.training_session import Session
 
 JOB_SCHEMA = "neeco-job/2"
 JOB_FILE = "job.json"  # the result of a finished job
@@ -226,8 +224,8 @@ class Curve:
         if not self.shares or session.progress < self.shares[0]:
             return
         self.shares = tuple(share for share in self.shares if share > session.progress)
-        row = {"iteration": session.iteration, "seconds": round(session.seconds, 3)}
-        row |= {"progress": round(session.progress, 4)}
+        seconds, progress = round(session.seconds, 3), round(session.progress, 4)
+        row = {"iteration": session.iteration, "seconds": seconds, "progress": progress}
         self.rows += [row | {"split": split, "psnr": self.score(session.scene, split)} for split in self.frames]
         write_text(self.file, "".join(json.dumps(row, allow_nan=False) + "\n" for row in finite(self.rows)))
 

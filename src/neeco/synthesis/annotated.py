@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import torch
@@ -26,17 +26,15 @@ from neeco.evidence.label_quality import QUALITY, label_counts, learned_foregrou
 from neeco.geometry.distortion import field_pinhole
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
-from neeco.labels.labellers import CompositedLabels, instruments_of
+from neeco.labels.labellers import CompositedLabels, Labeller, instruments_of
 from neeco.raster.resampling import of_rendered_size, resampled
+from neeco.scene import GaussianScene
 from neeco.states.alignment import AlignConfig, AlignedFrame, align_frame, pose_changes
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
 from neeco.synthesis.samplers import DrawnCameras
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings, parse_class_names
 from neeco.synthesis.writers.folder import Record, encoded_sample, skipped_sample
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
-    from neeco.training.run import GaussianRun
+from neeco.training.run import GaussianRun
 
 N_REFERENCE_FRAMES = 16  # training frames from which the usual errors are estimated
 FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # the start is near: no coarse search
@@ -112,16 +110,7 @@ def annotate_capture(
         typical = typical_errors(scene, labeller, trained_on)
         foreground = learned_foreground(scene, trained_on.split("train"))
         info["usual_errors"] = asdict(typical)
-        annotator = _Annotator(
-            scene=scene,
-            labeller=labeller,
-            typical=typical,
-            foreground=foreground,
-            min_trust=min_trust,
-            output=output,
-            images=images,
-            cameras=cameras,
-        )
+        annotator = _Annotator(folder, typical, foreground, min_trust, images, cameras)
         start: Tensor | None = None  # each fit starts from that of the frame before it in time
         in_time = sorted(range(len(capture.frames)), key=lambda k: capture.frames[k].state.time)
         for done, index in enumerate(in_time, 1):
@@ -131,22 +120,18 @@ def annotate_capture(
             on_progress(done, len(in_time))
         if not with_image(records.values()):
             best = max(record["trust"]["value"] for record in records.values())
-            raise NeecoError(
-                f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best is by {best}"
-            )
+            raise NeecoError(f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best by {best}")
     return Annotated(output, capture, [records[index] for index in sorted(records)])
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Annotator:
     """Fits, renders, judges and writes frames."""
 
-    scene: GaussianScene
-    labeller: CompositedLabels
+    folder: DataSetFolder
     typical: TypicalErrors
     foreground: Foreground | None
     min_trust: float
-    output: Path
     images: ImageSettings
     cameras: DrawnCameras
 
@@ -165,16 +150,16 @@ class _Annotator:
             "moved": pose_changes(replace(frame, state=recorded), fit.state, fit.camera),
             "increments": fit.increments.tolist(),
         }
+        scene, names, output = self.folder.scene, self.folder.labeller.names, self.folder.output
         if trust.value < self.min_trust:
-            labels = annotate(self.scene, drawing, self.labeller.names)
-            facts["labels"] = [label.to_json() for label in labels]
-            return skipped_sample(index, {NOT_TRUSTED: 1}, facts).write(self.output)
+            facts["labels"] = [label.to_json() for label in annotate(scene, drawing, names)]
+            return skipped_sample(index, {NOT_TRUSTED: 1}, facts).write(output)
         drawing, missing = self._as_written(drawing, image)
-        labels = annotate(self.scene, drawing, self.labeller.names)
+        labels = annotate(scene, drawing, names)
         if missing is not None:
             labels = [_without_keypoints_in(missing, label) for label in labels]
         encoded = encoded_sample(index, drawing, labels, facts=facts, quality=self.images.jpeg_quality)
-        return encoded.write(self.output)
+        return encoded.write(output)
 
     def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> tuple[LayeredDrawing, Tensor | None]:
         """The recorded `image` with the labels of `drawing`, at the requested size and lens, and where it shows nothing
@@ -183,7 +168,8 @@ class _Annotator:
         wanted = self.cameras(recorded)
         if wanted is recorded:
             return replace(drawing, image=image), None
-        drawing = draw_layers(self.scene, self.labeller, drawing.state, wanted, Settings.min_component)
+        scene, labeller = self.folder.scene, self.folder.labeller
+        drawing = draw_layers(scene, labeller, drawing.state, wanted, Settings.min_component)
         if wanted.is_pinhole:
             method = cv2.INTER_AREA if wanted.width < recorded.width else cv2.INTER_CUBIC
             pixels = cv2.resize(image.numpy(), (wanted.width, wanted.height), interpolation=method)
@@ -204,11 +190,12 @@ class _Annotator:
         return drawing, missing
 
     def _fitted(self, frame: Frame, image: Tensor, start: Tensor | None) -> tuple[AlignedFrame, LayeredDrawing, Trust]:
-        fit, drawing = fitted(self.scene, self.labeller, frame, image, start)
+        scene = self.folder.scene
+        fit, drawing = fitted(scene, self.folder.labeller, frame, image, start)
         mask = frame.load_mask()
         trust = estimate_trust(drawing, image, mask, self.typical)
         if self.foreground is not None:
-            view = Comparison.of(self.scene, fit.state, self.scene.recorded.as_learned(fit.camera), image, mask)
+            view = Comparison.of(scene, fit.state, scene.recorded.as_learned(fit.camera), image, mask)
             quality = quality_of(label_counts(view, self.foreground), QUALITY.least_shown)
             if quality is not None:
                 trust = replace(trust, value=min(trust.value, quality.iou))
@@ -225,7 +212,7 @@ def _without_keypoints_in(missing: Tensor, label: InstrumentLabel) -> Instrument
 
 
 def fitted(
-    scene: GaussianScene, labeller: CompositedLabels, frame: Frame, image: Tensor, start: Tensor | None
+    scene: GaussianScene, labeller: Labeller, frame: Frame, image: Tensor, start: Tensor | None
 ) -> tuple[AlignedFrame, LayeredDrawing]:
     """The poses of `frame` fitted to its image [H, W, 3], and what the scene renders there; `start`: a neighbour's
     increments, without which the search starts coarse."""
@@ -234,7 +221,7 @@ def fitted(
     return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.min_component, tissue_image=True)
 
 
-def typical_errors(scene: GaussianScene, labeller: CompositedLabels, trained_on: Capture) -> TypicalErrors:
+def typical_errors(scene: GaussianScene, labeller: Labeller, trained_on: Capture) -> TypicalErrors:
     """The scene's errors on the frames that it was trained on."""
     frames = trained_on.split("train")
     drawings = []
@@ -247,13 +234,9 @@ def typical_errors(scene: GaussianScene, labeller: CompositedLabels, trained_on:
 
 def _check_instruments(scene: GaussianScene, capture: Capture) -> None:
     """Raises NeecoError unless every frame states the poses and joints of the scene's instruments."""
-    joints = {item.name: set(item.joints) for item in capture.instruments}
-    for instrument in scene.instruments:
-        if instrument.name not in joints:
-            names = ", ".join(joints) or "none"
-            raise NeecoError(f"{capture.root}: instruments: the scene learned {instrument.name!r}, here are: {names}")
-        missing = set(instrument.joints) - joints[instrument.name]
-        if missing:
-            raise NeecoError(
-                f"{capture.root}: instruments: {instrument.name}: no joint {min(missing)!r}, which the scene learned"
-            )
+    place, joints = f"{capture.root}: instruments", {item.name: set(item.joints) for item in capture.instruments}
+    for name, learned in ((item.name, set(item.joints)) for item in scene.instruments):
+        if name not in joints:
+            raise NeecoError(f"{place}: the scene learned {name!r}, here are: {', '.join(joints) or 'none'}")
+        if missing := learned - joints[name]:
+            raise NeecoError(f"{place}: {name}: no joint {min(missing)!r}, which the scene learned")

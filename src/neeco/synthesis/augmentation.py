@@ -118,11 +118,8 @@ def _placements(random: _Random, aspect: float) -> Tensor:
     turn, zoom = placed * random.uniform(-CHANGES.turn, CHANGES.turn), CHANGES.zoom ** (placed * random.uniform(-1, 1))
     cosine, sine = turn.cos() / zoom, turn.sin() / zoom
     shift = placed[:, None] * random.uniform(-2 * CHANGES.shift, 2 * CHANGES.shift, 2)
-    rows = [
-        torch.stack([cosine * flip, -sine / aspect, shift[:, 0]], 1),
-        torch.stack([sine * aspect * flip, cosine, shift[:, 1]], 1),
-    ]
-    return torch.stack(rows, 1)
+    numbers = (cosine * flip, -sine / aspect, shift[:, 0], sine * aspect * flip, cosine, shift[:, 1])
+    return torch.stack(numbers, 1).reshape(-1, 2, 3)
 
 
 def _relight(colors: Tensor, random: _Random) -> Tensor:

@@ -74,10 +74,6 @@ class ImageFolder:
         content = b"".join(hashlib.sha256(read_bytes(file, "an image")).digest() for file in self.files)
         return hashlib.sha256(content).hexdigest()
 
-    def colors(self, number: int) -> Colors:
-        """The colours of an image. Raises NeecoError where the file cannot be read."""
-        return _colors_of_file(self.files[number])
-
     def crop(self, number: int, rng: Generator, width: int, height: int) -> np.ndarray:
         """Sample a background, float32 [height, width, 3] in [0, 1]: a random crop of an image, perhaps mirrored,
         resized. Raises NeecoError where the file cannot be read."""
@@ -137,10 +133,6 @@ class Appearance:
     adaptation: float = 0.0  # in [0, 1]
     colors: Colors | None = None
 
-    def matched(self, image: Tensor) -> Tensor:
-        """The image [H, W, 3] in the colours."""
-        return image if self.colors is None else torch.from_numpy(self.colors.given_to(image.numpy()))
-
     def over_background(self, layers: Layers) -> Tensor:
         """The image [H, W, 3] of these layers over the background."""
         assert self.background is not None
@@ -166,18 +158,16 @@ class Appearances:
     @classmethod
     def of(cls, settings: Settings) -> Appearances:
         """Those that settings describe. Raises NeecoError for a folder without images."""
-        folders = {
-            name: None if folder is None else ImageFolder.of(folder, name)
-            for name, folder in settings.image_folders().items()
-        }
-        return cls(folders["backgrounds"], folders["match_colors"])
+        folders = {name: ImageFolder.of(folder, name) for name, folder in settings.image_folders().items()}
+        return cls(folders.get("backgrounds"), folders.get("match_colors"))
 
     def draw(self, rng: Generator, width: int, height: int) -> Appearance:
         """Sample the appearance of an image. Raises NeecoError where a background cannot be read."""
         replaced, adaptation, place, matched, frame = rng.random(5)
         appearance = Appearance()
         if self.frames is not None and matched < IMAGES.replaced:
-            appearance = replace(appearance, colors=self.frames.colors(int(frame * len(self.frames.files))))
+            file = self.frames.files[int(frame * len(self.frames.files))]
+            appearance = replace(appearance, colors=_colors_of_file(file))
         if self.backgrounds is None or replaced >= IMAGES.replaced:
             return appearance
         number = int(place * len(self.backgrounds.files))

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -26,10 +26,8 @@ from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid
 from neeco.labels.annotation import place_in_image, working_ends
 from neeco.labels.drawing import LayeredDrawing, to_numpy
+from neeco.scene import GaussianScene, Recorded
 from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene, Recorded
 
 SoftMasks = Literal["mid", "mean"]
 SOFT_MASKS = "soft_masks"
@@ -94,20 +92,15 @@ class CameraEffects:
     ranges: Mapping[str, Range]
     soft_masks: SoftMasks = "mid"
 
-    @property
-    def moves(self) -> bool:
-        """Return whether anything moves while the shutter is open."""
-        return "shutter_s" in self.ranges
-
     def draw(self, rng: Generator) -> dict[str, float]:
         """Sample the effects of one image by name. Always takes as many random numbers, so that a value depends on no
         other's range."""
         values = {}
         for name in EFFECTS:
             applies, place = rng.random(), rng.random()
-            effect_range = self.ranges.get(name)
-            if effect_range is not None and applies < effect_range.share:
-                values[name] = round(effect_range.low + (effect_range.high - effect_range.low) * place, 5)
+            if name in self.ranges and applies < self.ranges[name].share:
+                low, high = self.ranges[name].low, self.ranges[name].high
+                values[name] = round(low + (high - low) * place, 5)
         return values
 
     def to_json(self) -> dict[str, Any]:
@@ -144,10 +137,8 @@ def _range(value: Any, effect: Effect, where: str) -> Range:
         raise NeecoError(f"{where}: {value!r} is no range; give a number or [LOW, HIGH]")
     low, high, share = numbers
     if not effect.lowest <= low <= high <= effect.highest:
-        raise NeecoError(
-            f"{where}: {value} is out of range; give LOW <= HIGH within {effect.lowest:g} to {effect.highest:g} "
-            f"({effect.meaning})"
-        )
+        limits = f"{effect.lowest:g} to {effect.highest:g} ({effect.meaning})"
+        raise NeecoError(f"{where}: {value} is out of range; give LOW <= HIGH within {limits}")
     if not 0 <= share <= 1:
         raise NeecoError(f"{where}: share: {share:g} is not a share of the images; give 0 to 1")
     return Range(low, high, share)
@@ -255,9 +246,13 @@ class Motion:
 
 
 class RecordedMotion:
-    """Samples motions from the recorded frames whose states are most similar to the given one."""
+    """Samples motions from the recorded frames whose states are most similar to the given one.
 
-    def __init__(self, recorded: Recorded) -> None:
+    instruments: recordings of instruments that `recorded`, of the camera, does not show: each moves as in any frame of
+    its own, and so does the camera.
+    """
+
+    def __init__(self, recorded: Recorded, instruments: Sequence[Recorded] = ()) -> None:
         order = sorted(range(len(recorded.states)), key=lambda k: recorded.states[k].time)
         self._motions, states = [], []
         for first, second in pairwise(order):
@@ -266,42 +261,21 @@ class RecordedMotion:
                 self._motions.append(motion_between(a, recorded.cameras[first], b, recorded.cameras[second]))
                 states.append(a)
         self._frames = SimilarFrames(states, len(states), joints=True)
+        self._instruments = [RecordedMotion(each) for each in instruments]
 
     @property
     def known(self) -> bool:
-        """Return whether the recording has any two frames close enough in time to give a motion."""
-        return bool(self._motions)
-
-    def any(self, rng: Generator) -> Motion:
-        """Return the motion of any recorded frame."""
-        return self._motions[self._frames.any(rng)]
+        """Return whether every recording has two frames close enough in time to give a motion."""
+        return bool(self._motions) and all(each.known for each in self._instruments)
 
     def __call__(self, state: State, rng: Generator) -> Motion:
         """Return a motion for `state`."""
-        return self._motions[self._frames.like(state, rng)]
-
-
-class MixedMotion:
-    """Samples motions of instruments and a camera that were not recorded together: each from a frame of its own
-    recording."""
-
-    def __init__(self, tissue: Recorded, instruments: Sequence[Recorded]) -> None:
-        self._tissue = RecordedMotion(tissue)
-        self._instruments = [RecordedMotion(recorded) for recorded in instruments]
-
-    @property
-    def known(self) -> bool:
-        """Return whether every recording has a motion."""
-        return self._tissue.known and all(recorded.known for recorded in self._instruments)
-
-    def __call__(self, state: State, rng: Generator) -> Motion:
-        """Return a motion for `state`."""
-        motions = [recorded.any(rng) for recorded in self._instruments]
-        return Motion(
-            {name: twist for motion in motions for name, twist in motion.instruments.items()},
-            {name: rates for motion in motions for name, rates in motion.joints.items()},
-            self._tissue.any(rng).camera,
-        )
+        if not self._instruments:
+            return self._motions[self._frames.like(state, rng)]
+        *motions, own = (each._motions[each._frames.any(rng)] for each in (*self._instruments, self))
+        twists = {name: twist for motion in motions for name, twist in motion.instruments.items()}
+        rates = {name: rates for motion in motions for name, rates in motion.joints.items()}
+        return Motion(twists, rates, own.camera)
 
 
 def subframes(
@@ -325,15 +299,11 @@ def subframes(
 
 def motion_between(a: State, camera_a: Camera, b: State, camera_b: Camera) -> Motion:
     """The constant speeds that lead from one recorded frame to a later one."""
-    seconds = b.time - a.time
-    twists = {
-        name: _twist(to_numpy(item.pose), to_numpy(b.instruments[name].pose), seconds)
-        for name, item in a.instruments.items()
-    }
-    joints = {
-        name: {joint: (b.instruments[name].joints[joint] - value) / seconds for joint, value in item.joints.items()}
-        for name, item in a.instruments.items()
-    }
+    seconds, twists, joints = b.time - a.time, {}, {}
+    for name, item in a.instruments.items():
+        later = b.instruments[name]
+        twists[name] = _twist(to_numpy(item.pose), to_numpy(later.pose), seconds)
+        joints[name] = {joint: (later.joints[joint] - value) / seconds for joint, value in item.joints.items()}
     camera = _twist(to_numpy(camera_a.world_from_camera), to_numpy(camera_b.world_from_camera), seconds)
     return Motion(twists, joints, camera)
 

@@ -183,11 +183,10 @@ class PreviewSettings:
 
 PREVIEW = PreviewSettings()
 Color = str | tuple[int, int, int]
+Pairs = Sequence[tuple[str, str]]  # instrument and part by part id, from 1; keypoints that a bone joins
 
 
-def write_preview(
-    root: Path, records: Sequence[Record], names: Sequence[tuple[str, str]], bones: Sequence[tuple[str, str]]
-) -> None:
+def write_preview(root: Path, records: Sequence[Record], names: Pairs, bones: Pairs) -> None:
     """Write preview.png: up to 8 images spread over the data set, each plain and with parts, boxes and keypoints."""
     tiles = [draw_tile(root, records[k], bones) for k in evenly_spaced(len(records), PREVIEW.tiles, floor=True)]
     columns = min(PREVIEW.columns, len(tiles))
@@ -204,7 +203,7 @@ def write_preview(
     write_atomically(root / "preview.png", lambda temporary: sheet.save(temporary, format="PNG", compress_level=1))
 
 
-def draw_tile(root: Path, record: Record, bones: Sequence[tuple[str, str]] = ()) -> Image.Image:
+def draw_tile(root: Path, record: Record, bones: Pairs = ()) -> Image.Image:
     """Return one image, beside it the same with its labels, and a caption below; `bones` join keypoints."""
     pixels = np.asarray(open_image(root / record["image"]).convert("RGB"), dtype=float)
     parts = np.asarray(open_image(root / "parts" / f"{stem(record['index'])}.png"))
@@ -245,14 +244,10 @@ def _tinted(image: np.ndarray, ids: np.ndarray) -> np.ndarray:
     colors = np.concatenate([np.zeros((1, 3)), PART_COLORS[np.arange(max(int(ids.max()), 1)) % len(PART_COLORS)]])[ids]
     inside = ids > 0
     tinted = np.where(inside[..., None], (1 - PREVIEW.tint) * image + PREVIEW.tint * colors, image)
-    edge = outline(inside)
-    tinted[edge] = colors[edge]
-    return tinted
+    return np.where(outline(inside)[..., None], colors, tinted)
 
 
-def _draw_label(
-    canvas: ImageDraw.ImageDraw, label: dict[str, Any], bones: Sequence[tuple[str, str]], scale: float
-) -> None:
+def _draw_label(canvas: ImageDraw.ImageDraw, label: dict[str, Any], bones: Pairs, scale: float) -> None:
     if label["area"] > 0:
         x, y, width, height = (value * scale for value in label["box"])
         canvas.rectangle((x, y, x + width - 1, y + height - 1), outline=PREVIEW.box)
@@ -260,9 +255,8 @@ def _draw_label(
         canvas.line([*corners, corners[0]], fill=PREVIEW.rectangle, width=2)
         draw_name(canvas, x, y, label["name"])
     points = {name: (x * scale, y * scale, v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
-    for start, end in bones:
-        if start in points and end in points:
-            canvas.line([points[start][:2], points[end][:2]], fill=PREVIEW.bone, width=2)
+    for start, end in (bone for bone in bones if points.keys() >= {*bone}):
+        canvas.line([points[start][:2], points[end][:2]], fill=PREVIEW.bone, width=2)
     for x, y, visibility in points.values():
         fill = PREVIEW.hidden if visibility == OCCLUDED else PREVIEW.box
         canvas.ellipse((x - 4, y - 4, x + 4, y + 4), fill=fill, outline=PREVIEW.bone, width=2)
@@ -290,10 +284,8 @@ def _caption(record: Record) -> tuple[list[str], list[str]]:
     return [f"{record['index']:06d}", record["split"], *joints], seen
 
 
-def _legend(canvas: ImageDraw.ImageDraw, names: Sequence[tuple[str, str]], width: int) -> None:
-    entries: list[tuple[str, Color]] = [
-        (f"{name} {part}", part_color(part_id)) for part_id, (name, part) in enumerate(names, 1)
-    ]
+def _legend(canvas: ImageDraw.ImageDraw, names: Pairs, width: int) -> None:
+    entries: list[tuple[str, Color]] = [(" ".join(name), part_color(number)) for number, name in enumerate(names, 1)]
     entries += [("minimum-area box", PREVIEW.rectangle), ("keypoint seen", PREVIEW.box)]
     entries += [("keypoint occluded", PREVIEW.hidden)]
     columns = max((width - PREVIEW.gap) // PREVIEW.label_column, 1)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import neeco
 from neeco.base.errors import NeecoError
@@ -23,6 +23,7 @@ from neeco.base.workers import address, check_workers
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.labellers import Labeller, ThresholdLabels, instruments_of
 from neeco.labels.settings import LABELS
+from neeco.scene import GaussianScene
 from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.card import write_card, write_preview
@@ -50,11 +51,7 @@ from neeco.synthesis.writers.folder import (
     record_path,
     write_states,
 )
-from neeco.training.run import SCENE_FILE, scene_digest
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
-    from neeco.training.run import GaussianRun
+from neeco.training.run import SCENE_FILE, GaussianRun, scene_digest
 
 SCHEMA = "neeco-dataset/1"
 INFO = "dataset.json"
@@ -105,10 +102,7 @@ def synthesize(
     runs = (run, *instrument_runs)
     scene, *instrument_scenes = (each.scene for each in runs)
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
-    folders = {
-        name: None if folder is None else ImageFolder.of(folder, name).digest()
-        for name, folder in settings.image_folders().items()
-    }
+    folders = {name: ImageFolder.of(folder, name).digest() for name, folder in settings.image_folders().items()}
     check_formats(formats, settings)
     recorded = scene.recorded.cameras[0]
     identity = settings.identity() | {
@@ -121,9 +115,7 @@ def synthesize(
     info = description(run, identity, instrument_runs)
     begun = check_output(output, info, resume)
     if begun and record_path(output, settings.count).exists():
-        raise NeecoError(
-            f"--count: {output} holds more than {settings.count} images already; give more, or a new folder"
-        )
+        raise NeecoError(f"--count: {output} holds more than {settings.count} images; give more, or a new folder")
     generator = SampleGenerator.of(scene, settings, instrument_scenes)
     info["tissue_tolerance_mm"] = generator.acceptance.tolerance_mm
     if generator.gains:
@@ -141,14 +133,13 @@ def synthesize(
     with folder.being_written() as records:
         if records:
             on_progress(len(records))
-        missing = [k for k in range(settings.count) if k not in records]
-        scene_file, *others = (Path(each.path) / SCENE_FILE for each in runs)
-        # workers need not find the tolerance again
-        resolved = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
-        spec = GeneratorSpec(scene_file, resolved, str(scene.center.device), tuple(others))
-        made = 0
+        missing, made = [k for k in range(settings.count) if k not in records], 0
         processes = min(workers, len(missing))
         if missing and (processes > 1 or address()):
+            scene_file, *others = (Path(each.path) / SCENE_FILE for each in runs)
+            # workers need not find the tolerance again
+            resolved = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
+            spec = GeneratorSpec(scene_file, resolved, str(scene.center.device), tuple(others))
             rendered = draw_in_workers(spec, output, missing, processes)
         else:
             rendered = (draw_to_folder(generator, output, index) for index in missing)
@@ -304,18 +295,16 @@ def writers() -> dict[str, type[Writer]]:
 def writer(name: str) -> type[Writer]:
     """Return the writer of the format `name`. Raises NeecoError when there is none."""
     if name not in writers():
-        raise NeecoError(
-            f"--formats: {name!r} is unknown; choose of {', '.join(writers())}, or install the package that has it"
-        )
+        known = ", ".join(writers())
+        raise NeecoError(f"--formats: {name!r} is unknown; choose of {known}, or install the package that has it")
     return writers()[name]
 
 
 def check_formats(formats: Sequence[str], settings: ImageSettings) -> None:
     """Raises NeecoError for a format that is unknown, or that cannot describe the images."""
     for name in formats:
-        if settings.lens and not writer(name).accepts_distortion:
+        if not writer(name).accepts_distortion and settings.lens:
             raise NeecoError(f"--formats: {name} cannot store distorted images; remove {name} or --lens")
-        writer(name)
 
 
 def part_ids(names: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
@@ -337,7 +326,4 @@ def skipped(records: Iterable[Record]) -> list[int]:
 
 def refusals(records: Iterable[Record]) -> dict[str, int]:
     """Count the refused states by reason."""
-    refused: Counter[str] = Counter()
-    for record in records:
-        refused.update(record["refused"])
-    return dict(sorted(refused.items()))
+    return dict(sorted(sum((Counter(record["refused"]) for record in records), Counter[str]()).items()))

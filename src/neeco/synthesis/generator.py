@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -26,11 +26,11 @@ from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.labels.settings import LABELS
 from neeco.raster.native import keep_freed_memory, set_threads
+from neeco.scene import GaussianScene
 from neeco.scene.io import load_gaussians
 from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, split
 from neeco.synthesis.camera_effects import (
     CameraEffects,
-    MixedMotion,
     RecordedMotion,
     apply_effects,
     average_exposure,
@@ -42,9 +42,6 @@ from neeco.synthesis.mixing import MixedSampler, Mixture
 from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers.folder import Encoded, Record, encoded_sample, skipped_sample
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
 
 VERB = "synthesize"
 # of an image's random numbers: camera effects and appearances do not change which state and view are sampled
@@ -86,9 +83,7 @@ class LabelledSample:
     drawing: LayeredDrawing  # `image` with the camera effects
     labels: list[InstrumentLabel]
     refused: Mapping[str, int]  # states refused before this one, by reason
-    facts: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # additional entries of its record, such as its camera effects
+    facts: Mapping[str, Any]  # more entries of its record, such as its camera effects
 
 
 @dataclass(frozen=True)
@@ -138,15 +133,13 @@ class SampleGenerator:
     acceptance: Acceptance
     settings: Settings
     effects: CameraEffects | None = None
-    motion: RecordedMotion | MixedMotion | None = None  # where effects open a shutter
+    motion: RecordedMotion | None = None  # where effects open a shutter
     gains: tuple[tuple[float, float, float], ...] = ()  # by which the colours of each instrument scene were multiplied
     cameras: DrawnCameras = RECORDED_CAMERAS
     appearances: Appearances = ALL_AS_RECORDED
 
     @classmethod
-    def of(
-        cls, scene: GaussianScene, settings: Settings, instrument_scenes: Sequence[GaussianScene] = ()
-    ) -> SampleGenerator:
+    def of(cls, scene: GaussianScene, settings: Settings, instrument_scenes: Sequence[GaussianScene] = ()) -> Self:
         """Return the generator that `settings` describe, of `scene` or of its tissue under the instruments of
         `instrument_scenes`. Raises NeecoError where the scenes do not support them."""
         cameras = DrawnCameras.of(settings, scene.recorded, scene.recorded.cameras)
@@ -169,7 +162,11 @@ class SampleGenerator:
         effects, motion = None, None
         if settings.camera_effects is not None:
             effects = read_effects(Path(settings.camera_effects))
-            motion = _motion(tissue, instrument_scenes, settings) if effects.moves else None
+            if "shutter_s" in effects.ranges:
+                motion = RecordedMotion(tissue.recorded, [each.recorded for each in instrument_scenes])
+                if not motion.known:
+                    problem = "shutter_s: no two recorded frames are close enough in time to estimate motion; remove it"
+                    raise NeecoError(f"{settings.camera_effects}: {problem}")
         tolerance = settings.tissue_tolerance_mm if settings.tissue_check else None
         if settings.tissue_check and tolerance is None:
             tolerance = find_tolerance(scene, labeller)
@@ -193,10 +190,11 @@ class SampleGenerator:
         A random state is sampled again until one is acceptable, `settings.max_attempts` times at most. A prescribed
         state is only rendered from other views. Raises StatesRefused where none was acceptable.
         """
-        rng = np.random.default_rng(np.random.SeedSequence([self.settings.seed, index, EFFECTS_STREAM]))
+        rng = self._rng(index, EFFECTS_STREAM)
         effects = {} if self.effects is None else self.effects.draw(rng)
         drawing, refused = self._first_acceptable(index, effects)
-        appearance = self._appearance(index, drawing)
+        height, width = drawing.depth.shape
+        appearance = self.appearances.draw(self._rng(index, APPEARANCE_STREAM), width, height)
         drawing = self._with(drawing, appearance)
         labels = annotate(self.scene, drawing, self.labeller.names)
         facts: dict[str, Any] = {} if self.effects is None else {"camera_effects": effects}
@@ -205,8 +203,7 @@ class SampleGenerator:
         return LabelledSample(index, self._through_camera(drawing, effects, rng, appearance), labels, refused, facts)
 
     def _first_acceptable(self, index: int, effects: Mapping[str, float]) -> tuple[LayeredDrawing, Counter[str]]:
-        settings = self.settings
-        rng = np.random.default_rng(np.random.SeedSequence([settings.seed, index]))
+        settings, rng = self.settings, self._rng(index)
         refused: Counter[str] = Counter()
         for _ in range(1 if self.sampler.fixed(index) else settings.max_attempts):
             state, camera = self.sampler(index, rng)
@@ -226,10 +223,8 @@ class SampleGenerator:
             refused,
         )
 
-    def _appearance(self, index: int, drawing: LayeredDrawing) -> Appearance:
-        rng = np.random.default_rng(np.random.SeedSequence([self.settings.seed, index, APPEARANCE_STREAM]))
-        height, width = drawing.depth.shape
-        return self.appearances.draw(rng, width, height)
+    def _rng(self, *numbers: int) -> Generator:
+        return np.random.default_rng(np.random.SeedSequence([self.settings.seed, *numbers]))
 
     def _with(self, drawing: LayeredDrawing, appearance: Appearance) -> LayeredDrawing:
         """Return the rendering in another appearance; the depth of a background is unknown."""
@@ -246,7 +241,8 @@ class SampleGenerator:
             gaussians = self.scene.at(state)
             owners = self.labeller.owners(state, gaussians)
             image = appearance.over_background(split(gaussians, owners, camera, image, share))
-        return appearance.matched(image)
+        colors = appearance.colors
+        return image if colors is None else torch.from_numpy(colors.given_to(image.numpy()))
 
     def _through_camera(
         self,
@@ -317,10 +313,8 @@ def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
         if generator.sampler.prescribed:
             return skipped_sample(index, error.refused)
         raise
-    quality = generator.settings.jpeg_quality
-    return encoded_sample(
-        index, sample.drawing, sample.labels, refused=sample.refused, facts=sample.facts, quality=quality
-    )
+    how: dict[str, Any] = {"refused": sample.refused, "facts": sample.facts, "quality": generator.settings.jpeg_quality}
+    return encoded_sample(index, sample.drawing, sample.labels, **how)
 
 
 def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:
@@ -386,25 +380,8 @@ def _intersect(drawing: LayeredDrawing, some: frozenset[str], others: frozenset[
     return False
 
 
-def _motion(
-    scene: GaussianScene, instrument_scenes: Sequence[GaussianScene], settings: Settings
-) -> RecordedMotion | MixedMotion:
-    """Return the motion while a shutter is open. Raises NeecoError where the recordings have none."""
-    motion: RecordedMotion | MixedMotion = RecordedMotion(scene.recorded)
-    if instrument_scenes:
-        motion = MixedMotion(scene.recorded, [each.recorded for each in instrument_scenes])
-    if not motion.known:
-        raise NeecoError(
-            f"{settings.camera_effects}: shutter_s: no two recorded frames are close enough in time to "
-            "estimate motion; remove it"
-        )
-    return motion
-
-
 def _within_circle(drawing: LayeredDrawing, radius: float) -> LayeredDrawing:
     """Remove the labels outside the camera's image circle."""
     height, width = drawing.depth.shape
     inside = torch.from_numpy(image_circle(height, width, radius) > 0.5)
-    return replace(
-        drawing, parts=torch.where(inside, drawing.parts, 0).to(drawing.parts.dtype), share=drawing.share * inside
-    )
+    return replace(drawing, parts=drawing.parts.masked_fill(~inside, 0), share=drawing.share * inside)

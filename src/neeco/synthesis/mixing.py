@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -31,9 +30,8 @@ from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.visibility import VISIBILITY
 from neeco.synthesis.samplers import Sampler, make_sampler
-
-if TYPE_CHECKING:
-    from neeco.synthesis.settings import Settings
+from neeco.synthesis.settings import Settings
+from neeco.synthesis.states import with_poses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +65,8 @@ class Mixture:
         """Raises NeecoError where a scene's instruments cannot be taken out of it, or two have the same name."""
         for scene in (tissue, *instrument_scenes):
             if not scene.deformation.separates_instruments or scene.method != tissue.method:
-                raise NeecoError(
-                    f"--instruments: method {scene.method} does not keep tissue and instruments apart; "
-                    "mix runs of method kinematic"
-                )
+                problem = f"method {scene.method} does not keep tissue and instruments apart"
+                raise NeecoError(f"--instruments: {problem}; mix runs of method kinematic")
         names = [instrument.name for scene in instrument_scenes for instrument in scene.instruments]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
@@ -95,16 +91,12 @@ class Mixture:
     def sampler(self, settings: Settings) -> MixedSampler:
         """Draws where the instruments are, each as its own run's sampler does."""
         if settings.states not in ("interpolate", "extrapolate"):
-            raise NeecoError(
-                f"--states: {settings.states}: states of one recording; with --instruments use interpolate "
-                "or extrapolate"
-            )
+            fitting = "with --instruments use interpolate or extrapolate"
+            raise NeecoError(f"--states: {settings.states}: states of one recording; {fitting}")
         if settings.views == "orbit":
             raise NeecoError("--views: orbit is about one recording's tissue; with --instruments use another")
-        samplers = [
-            make_sampler(scene, settings.states, settings.margin, "recorded", settings.count)
-            for scene in self.instrument_scenes
-        ]
+        states, margin, count = settings.states, settings.margin, settings.count
+        samplers = (make_sampler(scene, states, margin, "recorded", count) for scene in self.instrument_scenes)
         return MixedSampler(self, tuple(samplers))
 
     def place(self, scene: GaussianScene, state: State, seen_by: Camera, camera: Camera) -> dict[str, InstrumentState]:
@@ -125,10 +117,7 @@ class Mixture:
             depth = max(end[2] + here - there, min(min_depth, end[2]))
             shift[:3, 3] = (depth / end[2] - 1) * end
         carry = to_numpy(camera.world_from_camera) @ shift @ camera_from_world
-        return {
-            name: InstrumentState(torch.from_numpy(carry @ to_numpy(item.pose)), item.joints)
-            for name, item in registered.instruments.items()
-        }
+        return dict(with_poses(registered, lambda name, pose: carry @ pose).instruments)
 
     def _recorded(self) -> Recorded:
         """Frames spread over the tissue's cameras, with the instrument scenes' recorded states placed before them."""

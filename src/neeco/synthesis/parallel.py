@@ -48,7 +48,7 @@ class PackedSpec:
         if spec.settings.states not in SAMPLERS:
             paths["states.jsonl"] = states_file(spec.settings.states)
         for name, images in spec.settings.image_folders().items():
-            for file in () if images is None else ImageFolder.of(images, name).files:
+            for file in ImageFolder.of(images, name).files:
                 paths[f"{name}/{file.name}"] = file
         files = {name: read_bytes(path, "a scene or settings file") for name, path in paths.items()}
         content = b"".join(hashlib.sha256(files[name]).digest() for name in sorted(files))
@@ -69,8 +69,7 @@ class PackedSpec:
         settings = self.spec.settings
         if "effects.yaml" in self.files:
             settings = replace(settings, camera_effects=str(folder / "effects.yaml"))
-        names = [name for name, images in settings.image_folders().items() if images is not None]
-        moved: dict[str, Any] = {name: str(folder / name) for name in names}
+        moved: dict[str, Any] = {name: str(folder / name) for name in settings.image_folders()}
         settings = replace(settings, **moved)
         if "states.jsonl" in self.files:
             prefix = PATH_PREFIX if settings.states.startswith(PATH_PREFIX) else ""
@@ -95,10 +94,8 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
                 if event.stage == "failed":
                     raise NeecoError(event.value)
                 if event.stage == "abandoned":
-                    raise NeecoError(
-                        f"--workers: workers were killed repeatedly at image {tasks[event.index][0]} ({event.value}); "
-                        "if memory ran out, use fewer workers (and --resume)"
-                    )
+                    problem = f"workers were killed repeatedly at image {tasks[event.index][0]} ({event.value})"
+                    raise NeecoError(f"--workers: {problem}; if memory ran out, use fewer workers (and --resume)")
                 for result in event.value if event.stage == "done" else ():
                     yield result.write(output) if isinstance(result, Encoded) else result
     finally:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,14 +21,12 @@ from neeco.capture.model import State
 from neeco.capture.readers import read_states
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw, to_numpy
+from neeco.scene import DrawableScene
 from neeco.synthesis.dataset import part_ids
 from neeco.synthesis.samplers import DrawnCameras, moved_camera
 from neeco.synthesis.settings import AS_RECORDED, ImageSettings
 from neeco.synthesis.states import PathStates, interpolate_pose
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene
-    from neeco.training.run import TrainedRun
+from neeco.training.run import TrainedRun
 
 STATES_FOLDER = "states"
 FPS = 25  # of a video
@@ -57,10 +55,8 @@ def split_views(run: TrainedRun, split: str, capture_path: Path | None = None) -
 
     Stems that several frames share are made unique by the names of the folders above them. Raises NeecoError.
     """
-    if capture_path is None:
-        capture = run.capture()
-    else:
-        capture = run.scene.recorded.completed(read_capture(capture_path), run.scene.instruments)
+    other = None if capture_path is None else read_capture(capture_path)
+    capture = run.scene.recorded.completed(other, run.scene.instruments) if other else run.capture()
     frames = capture.split(split)
     if not frames:
         splits = ", ".join(capture.splits) or "none"
@@ -76,13 +72,10 @@ def split_views(run: TrainedRun, split: str, capture_path: Path | None = None) -
 
 def state_views(scene: DrawableScene, path: Path) -> list[View]:
     """The states of a JSON-lines file, each from its own camera, or the first recorded one where it has none."""
-    first = scene.recorded.cameras[0]
-    views = []
-    instruments = scene.recorded.with_limits(scene.instruments)
-    for k, line in enumerate(read_states(path, instruments)):
-        camera = first if line.world_from_camera is None else moved_camera(first, line.world_from_camera)
-        views.append(View(f"{k:06d}", line.state, camera))
-    return views
+    first, lines = scene.recorded.cameras[0], read_states(path, scene.recorded.with_limits(scene.instruments))
+    poses = (line.world_from_camera for line in lines)
+    cameras = [first if pose is None else moved_camera(first, pose) for pose in poses]
+    return [View(f"{k:06d}", line.state, camera) for k, (line, camera) in enumerate(zip(lines, cameras, strict=True))]
 
 
 def render(
@@ -144,18 +137,15 @@ def write_video(
         raise NeecoError(f"--video: images of {len(sizes)} sizes; give --size")
     width, height = (2 * (side // 2) for side in sizes.pop())
 
-    def frames() -> Iterator[av.VideoFrame]:
-        for done, view in enumerate(views, 1):
-            image = to_bytes(draw(scene, view.state, cameras(view.camera)).image)[:height, :width]
-            yield av.VideoFrame.from_ndarray(np.ascontiguousarray(image.numpy()), format="rgb24")
-            on_progress(done)
-
     def write(temporary: Path) -> None:
         with av.open(str(temporary), "w", format="mp4", options={"movflags": "faststart"}) as container:
             stream = container.add_stream("h264", rate=FPS, options=QUALITY)
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            for frame in frames():
+            for done, view in enumerate(views, 1):
+                image = to_bytes(draw(scene, view.state, cameras(view.camera)).image)[:height, :width]
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image.numpy()), format="rgb24")
                 container.mux(stream.encode(frame))
+                on_progress(done)
             container.mux(stream.encode())
 
     write_atomically(path, write)

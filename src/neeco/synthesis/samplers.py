@@ -9,7 +9,6 @@ import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -27,7 +26,8 @@ from neeco.geometry.rotations import rigid
 from neeco.labels.annotation import any_in_image, working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
-from neeco.scene.drawable import Recorded
+from neeco.scene import DrawableScene, GaussianScene, Recorded
+from neeco.scene.gaussian_scene import is_gaussian
 from neeco.synthesis.settings import PATH_PREFIX, RECORDED_SIZE, SAMPLERS, ImageSettings, SizeSettings, Views
 from neeco.synthesis.states import (
     ExtrapolatedStates,
@@ -35,12 +35,10 @@ from neeco.synthesis.states import (
     InterpolatedStates,
     ListedStates,
     PathStates,
+    Shaft,
     StateSampler,
     turn_about,
 )
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,30 +182,24 @@ def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views,
     if states == "extrapolate":
         return Sampler(scene, ExtrapolatedStates(scene.recorded.states, scene.instruments, margin), view_sampler)
     if states == "grid":
-        return Sampler(scene, GridStates(scene.recorded.states, instrument_axes(scene)), view_sampler)
+        return Sampler(scene, GridStates(scene.recorded.states, shafts_of(scene)), view_sampler)
     lines = read_states(states_file(states), scene.recorded.with_limits(scene.instruments))
     if states.startswith(PATH_PREFIX):
         return Sampler(scene, PathStates([line.state for line in lines], count), view_sampler)
     intrinsics = scene.recorded.cameras[0]
-    cameras = tuple(
-        None if line.world_from_camera is None else moved_camera(intrinsics, line.world_from_camera) for line in lines
-    )
+    poses = [line.world_from_camera for line in lines]
+    cameras = tuple(None if pose is None else moved_camera(intrinsics, pose) for pose in poses)
     return Sampler(scene, ListedStates([line.state for line in lines]), view_sampler, cameras)
 
 
 def _view_sampler(scene: GaussianScene, views: Views) -> ViewSampler:
     recorded = RecordedViews(scene.recorded.cameras, scene.recorded.states)
-    view_sampler: ViewSampler = recorded
     still = scene.recorded.still
     if views == "perturbed":
-        view_sampler = PerturbedViews(recorded, *((SAMPLING.still_degrees, SAMPLING.still_mm) if still else ()))
-    elif views == "orbit" and still:
-        raise NeecoError(
-            "--views orbit: the scope stood still, and nothing shows the scene from the side; use recorded or perturbed"
-        )
-    elif views == "orbit":
-        view_sampler = OrbitViews(recorded, surface_centre(scene))
-    return view_sampler
+        return PerturbedViews(recorded, *((SAMPLING.still_degrees, SAMPLING.still_mm) if still else ()))
+    if views == "orbit" and still:
+        raise NeecoError("--views orbit: the scope stood still, which shows no side; use recorded or perturbed")
+    return OrbitViews(recorded, surface_centre(scene)) if views == "orbit" else recorded
 
 
 def states_file(states: str) -> Path:
@@ -227,23 +219,21 @@ def states_fingerprint(states: str) -> str | None:
 
 
 @torch.no_grad()
-def instrument_axes(scene: GaussianScene) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Axis of each instrument in its own frame: a point [3] mm and a unit direction [3].
-
-    The learned shaft where the scene knows one, else the frame's z axis.
-    """
-    axes = {instrument.name: (np.zeros(3), np.array([0.0, 0.0, 1.0])) for instrument in scene.instruments}
+def shafts_of(scene: DrawableScene) -> dict[str, Shaft]:
+    """Every instrument's shaft: as learned, where the method learns one."""
+    shafts = {item.name: Shaft(np.zeros(3), np.array([0.0, 0.0, 1.0]), False) for item in scene.instruments}
+    if not is_gaussian(scene) or not scene.recorded.states:
+        return shafts
     state = scene.recorded.states[0]
     for name, points in scene.keypoints(state).items():
         if not {"shaft_far", "shaft_near"} <= set(points):
             continue
-        instrument_from_world = np.linalg.inv(to_numpy(scene.registered(state).instruments[name].pose))
-        far, near = (
-            (instrument_from_world @ np.append(to_numpy(points[end]), 1.0))[:3] for end in ("shaft_far", "shaft_near")
-        )
+        from_world = np.linalg.inv(to_numpy(scene.registered(state).instruments[name].pose))
+        ends = (to_numpy(points[end]) for end in ("shaft_far", "shaft_near"))
+        far, near = ((from_world @ np.append(end, 1.0))[:3] for end in ends)
         if (length := float(np.linalg.norm(near - far))) > 1e-6:
-            axes[name] = near, (near - far) / length
-    return axes
+            shafts[name] = Shaft(near, (near - far) / length, True)
+    return shafts
 
 
 def moved_camera(camera: Camera, world_from_camera: np.ndarray) -> Camera:
@@ -268,11 +258,9 @@ def surface_points(depth: np.ndarray, camera: Camera, step: int = 4) -> np.ndarr
 def surface_centre(scene: GaussianScene) -> np.ndarray:
     """The median [3] mm of the surface points that recorded cameras see."""
     recorded = scene.recorded
-    points = []
-    for k in evenly_spaced(len(recorded.cameras), SAMPLING.n_surface_views, floor=True):
-        camera = recorded.cameras[k]
-        points.append(surface_points(surface_depth(rasterize(scene.at(recorded.states[k]), camera)), camera))
-    seen = np.concatenate(points)
+    chosen = evenly_spaced(len(recorded.cameras), SAMPLING.n_surface_views, floor=True)
+    views = [(scene.at(recorded.states[k]), recorded.cameras[k]) for k in chosen]
+    seen = np.concatenate([surface_points(surface_depth(rasterize(*view)), view[1]) for view in views])
     if len(seen) == 0:
         raise NeecoError("--views orbit: the scene shows no surface to orbit about; use --views recorded")
     return np.median(seen, axis=0)
@@ -292,10 +280,7 @@ class DrawnCameras:
         and a camera among `cameras` whose images have another shape."""
         images.check()
         if images.lens and recorded.lens is None:
-            raise NeecoError(
-                "--lens: the scene's capture states no lens; ingest the recording again and train on it, or "
-                "remove --lens"
-            )
+            raise NeecoError("--lens: the scene's capture states no lens; ingest it and train again, or remove --lens")
         drawn_cameras = cls(images, recorded.lens if images.lens else None)
         for camera in cameras:
             drawn_cameras(camera)

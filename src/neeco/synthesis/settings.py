@@ -16,6 +16,7 @@ from neeco.labels.settings import LABELS
 
 LabelWay = Literal["composited", "threshold"]
 Views = Literal["recorded", "perturbed", "orbit"]
+ImageFormat = Literal["png", "jpg"]
 FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")  # of our own writers
 DEFAULT_FORMATS = ("coco", "yolo", "imagefolder")  # the last for `datasets.load_dataset` of the folder
 WRITERS = "neeco.writers"  # the group of entry points of others'
@@ -26,11 +27,7 @@ SAMPLERS = ("interpolate", "extrapolate", "grid")  # values of `states` other th
 MAX_PIXELS = 2**26  # of an image
 MAX_IMAGES = 10**6  # of a data set: their names have six digits
 JPEG_QUALITY = 95  # of 100, by default
-
 MIN_TRUST = 0.8  # of a recorded frame's label, below which `annotate` does not write it
-
-
-ImageFormat = Literal["png", "jpg"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +59,8 @@ class SizeSettings:
             wide, high = (int(side) for side in self.size.lower().split("x"))
             fitting = (wide, max(1, round(wide * height / width))), (max(1, round(high * width / height)), high)
             if (wide, high) not in fitting:
-                others = " or ".join(f"{across}x{down}" for across, down in fitting)
-                raise NeecoError(
-                    f"--size: {self.size} is another shape than the recorded {width}x{height}; give {others}"
-                )
+                fits = " or ".join(f"{across}x{down}" for across, down in fitting)
+                raise NeecoError(f"--size: {self.size}: another shape than the recorded {width}x{height}; give {fits}")
             size = wide, high
         if size[0] * size[1] > MAX_PIXELS:
             option = "--size" if self.scale is None else "--scale"
@@ -215,9 +210,10 @@ class Settings(ImageSettings):
                 limits = f"{low:,g} or more" if math.isinf(high) else f"{low:,g} to {high:,}"
                 raise NeecoError(f"--{name.replace('_', '-')}: {value} is out of range; give {limits}")
 
-    def image_folders(self) -> dict[str, str | None]:
-        """Return the folders of images of another operation, by setting."""
-        return {"backgrounds": self.backgrounds, "match_colors": self.match_colors}
+    def image_folders(self) -> dict[str, str]:
+        """Return the folders of images of another operation that are given, by setting."""
+        folders = {"backgrounds": self.backgrounds, "match_colors": self.match_colors}
+        return {name: folder for name, folder in folders.items() if folder is not None}
 
     def identity(self) -> dict[str, Any]:
         """Return the settings that must stay the same for a data set to be continued, other than `image_identity`: all

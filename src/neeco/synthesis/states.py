@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -52,6 +53,14 @@ class JointRange:
         return JointRange(lower, upper)
 
 
+class Shaft(NamedTuple):
+    """The line that an instrument is slid along and turned about, in its own frame."""
+
+    end: np.ndarray  # [3] mm; yaw and pitch turn about it
+    along: np.ndarray  # [3] unit, towards the jaws
+    learned: bool  # False: the scene knows no shaft; the tracked frame's origin and z axis
+
+
 def turn_about(point: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
     """The rigid motion [4, 4] that turns by a rotation vector [3] rad and leaves `point` [3] mm where it is."""
     rotation = Rotation.from_rotvec(rotvec).as_matrix()
@@ -72,18 +81,12 @@ def interpolate_pose(first: np.ndarray, second: np.ndarray, weight: float) -> np
 def interpolate_state(first: State, second: State, weight: float) -> State:
     """The state between two, of the instruments both know: poses as `interpolate_pose`, joints and time linearly."""
     instruments = {}
-    for name, a in first.instruments.items():
-        b = second.instruments.get(name)
-        if b is None:
-            continue
-        joints = {
-            joint: (1 - weight) * value + weight * b.joints[joint]
-            for joint, value in a.joints.items()
-            if joint in b.joints
-        }
-        instruments[name] = InstrumentState(
-            torch.from_numpy(interpolate_pose(to_numpy(a.pose), to_numpy(b.pose), weight)), joints
-        )
+    for name in (name for name in first.instruments if name in second.instruments):
+        a, b = first.instruments[name], second.instruments[name]
+        both = (joint for joint in a.joints if joint in b.joints)
+        joints = {joint: (1 - weight) * a.joints[joint] + weight * b.joints[joint] for joint in both}
+        pose = interpolate_pose(to_numpy(a.pose), to_numpy(b.pose), weight)
+        instruments[name] = InstrumentState(torch.from_numpy(pose), joints)
     return State(instruments, (1 - weight) * first.time + weight * second.time)
 
 
@@ -177,25 +180,19 @@ class GridStates:
     """Every joint value with every roll, about recorded poses.
 
     Cell `index` mod (joint_values * rolls): all joints at the same fraction of their recorded ranges, each instrument
-    rolled about its axis by -roll .. +roll. Each full round of cells stands on another recorded pose.
-    `axes`: instrument -> (point [3] mm, direction [3] unit) in the instrument's frame.
+    rolled about its shaft by -30 to 30 degrees. Each full round of cells stands on another recorded pose.
     """
 
     prescribed = True
 
     def __init__(
-        self,
-        states: Sequence[State],
-        axes: Mapping[str, tuple[np.ndarray, np.ndarray]],
-        joint_values: int = 5,
-        rolls: int = 5,
-        roll_rad: float = np.pi / 6,
+        self, states: Sequence[State], shafts: Mapping[str, Shaft], joint_values: int = 5, rolls: int = 5
     ) -> None:
         self.states = _with_instruments(states)
         self.ranges = joint_ranges(self.states)
-        self.axes = axes
-        self.fractions = np.linspace(0, 1, joint_values) if joint_values > 1 else np.array([0.5])
-        self.rolls = np.linspace(-roll_rad, roll_rad, rolls) if rolls > 1 else np.array([0.0])
+        self.shafts = shafts
+        self.fractions = np.linspace(0, 1, joint_values)
+        self.rolls = np.linspace(-np.pi / 6, np.pi / 6, rolls)
 
     def __call__(self, index: int, rng: Generator) -> State:
         round_number, cell = divmod(index, len(self.fractions) * len(self.rolls))
@@ -203,11 +200,9 @@ class GridStates:
         # golden-ratio steps: successive rounds stand far apart in the recording
         base = self.states[int(round_number * 0.6180339887 * len(self.states)) % len(self.states)]
 
-        def rolled(name: str, pose: np.ndarray) -> np.ndarray:
-            point, direction = self.axes[name]
-            return pose @ turn_about(point, roll * direction)
-
-        return with_joints(with_poses(base, rolled), lambda name, joint: self.ranges[name, joint].at(fraction))
+        turns = {name: turn_about(shaft.end, roll * shaft.along) for name, shaft in self.shafts.items()}
+        state = with_poses(base, lambda name, pose: pose @ turns[name])
+        return with_joints(state, lambda name, joint: self.ranges[name, joint].at(fraction))
 
 
 class PathStates:

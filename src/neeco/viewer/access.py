@@ -94,9 +94,9 @@ def is_loopback(host: str) -> bool:
 
 
 @contextlib.contextmanager
-def controlled_sockets(access: Access, changed: Callable[[bytes], bytes]) -> Iterator[list[bool]]:
-    """Inside the block, a server that is opened by `websockets` answers as `access` allows, and `changed` alters its
-    pages. viser has no setting for that, so `websockets.serve` is replaced. Yields a list that is empty as long as
+def controlled_sockets(access: Access, head: bytes) -> Iterator[list[bool]]:
+    """Inside the block, a server that is opened by `websockets` answers as `access` allows; its pages begin with
+    `head`. viser has no setting for that, so `websockets.serve` is replaced. Yields a list that is empty as long as
     none was opened."""
     import websockets.asyncio.server as websocket_server
 
@@ -116,7 +116,7 @@ def controlled_sockets(access: Access, changed: Callable[[bytes], bytes]) -> Ite
             request.headers.pop("Accept-Encoding", None)  # so that pages can be read
             response = process_request(connection, request)
             if response is not None:
-                response.body = changed(response.body)
+                response.body = response.body.replace(b"<head>", b"<head>" + head, 1)
                 del response.headers["Content-Length"]
                 response.headers["Content-Length"] = str(len(response.body))
             return response

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,24 +14,10 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.geometry.lines import frame_about
 from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
-from neeco.scene.gaussian_scene import is_gaussian
-from neeco.synthesis.samplers import instrument_axes
-from neeco.synthesis.states import JointRange, interpolate_pose, joint_ranges, turn_about
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene
+from neeco.synthesis.states import JointRange, Shaft, interpolate_state, joint_ranges, turn_about
 
 MARGIN = 0.2  # extension of a slider, as a share of the recorded range, where the capture states no limits
 STILL = math.radians(1.0)  # half of the range, in rad, of the slider of a joint that never moved
-
-
-@dataclass(frozen=True)
-class Shaft:
-    """The line that an instrument is slid along and turned about, in its own frame."""
-
-    end: np.ndarray  # [3] mm; yaw and pitch turn about it
-    along: np.ndarray  # [3] unit, towards the jaws
-    learned: bool  # False: the scene knows no shaft; the tracked frame's origin and z axis
 
 
 @dataclass(frozen=True)
@@ -81,28 +66,7 @@ def interpolated_state(states: Sequence[State], frame: float) -> State:
     """The recording at a place between two frames: positions, joints and time linearly, rotations by slerp."""
     frame = min(max(frame, 0.0), len(states) - 1.0)
     first, share = int(frame), frame - int(frame)
-    if share == 0.0:
-        return states[first]
-    start, end = states[first], states[first + 1]
-    moved = {}
-    for name, one in start.instruments.items():
-        two = end.instruments[name]
-        pose = interpolate_pose(to_numpy(one.pose), to_numpy(two.pose), share)
-        joints = {joint: (1 - share) * value + share * two.joints[joint] for joint, value in one.joints.items()}
-        moved[name] = InstrumentState(torch.from_numpy(pose), joints)
-    return State(moved, (1 - share) * start.time + share * end.time)
-
-
-def shafts_of(scene: DrawableScene) -> dict[str, Shaft]:
-    """Every instrument's shaft: as learned, where the method learns one."""
-    if not is_gaussian(scene) or not scene.recorded.states:
-        return {item.name: Shaft(np.zeros(3), np.array([0.0, 0.0, 1.0]), False) for item in scene.instruments}
-    with torch.no_grad():
-        keypoints = scene.keypoints(scene.recorded.states[0])
-    return {
-        name: Shaft(end, along, {"shaft_far", "shaft_near"} <= set(keypoints.get(name, ())))
-        for name, (end, along) in instrument_axes(scene).items()
-    }
+    return interpolate_state(states[first], states[first + 1], share) if share else states[first]
 
 
 def slider_ranges(instruments: Sequence[Instrument], states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
@@ -111,7 +75,7 @@ def slider_ranges(instruments: Sequence[Instrument], states: Sequence[State]) ->
     ranges = {}
     for (name, joint), recorded in joint_ranges(states).items():
         limits = next((item.joints.get(joint) for item in instruments if item.name == name), None)
-        if limits is not None and all(map(math.isfinite, limits)) and limits[0] < limits[1]:
+        if limits is not None and -math.inf < limits[0] < limits[1] < math.inf:
             ranges[name, joint] = JointRange(*limits)
             continue
         if recorded.upper - recorded.lower < 2 * STILL:

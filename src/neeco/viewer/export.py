@@ -13,7 +13,6 @@ import json
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -34,8 +33,9 @@ from neeco.raster.reference import SH_C0
 from neeco.scene import DrawableScene, GaussianScene
 from neeco.scene.drawable import ArticulatedMotion
 from neeco.scene.gaussian_scene import require_gaussians
+from neeco.synthesis.samplers import shafts_of
 from neeco.training.run import TrainedRun, load_run
-from neeco.viewer.controls import shafts_of, slider_ranges
+from neeco.viewer.controls import slider_ranges
 
 SCHEMA = "neeco-page/1"
 SCRIPTS = ("scene.js", "states.js", "drawing.js", "camera.js", "panel.js", "main.js")  # in this order, as one module
@@ -82,13 +82,11 @@ def embedded_page(run: TrainedRun) -> str | None:
 
 def page_of_run(run: TrainedRun, sh_degree: int) -> str:
     """The page of a run, harmonics up to `sh_degree`. Raises NeecoError where a page cannot hold it (`why_not`)."""
-    if refusal := why_not(run.scene):
-        raise NeecoError(f"--export: {refusal}")
-    scene = require_gaussians(run.scene, "--export")
+    scene = run.scene
     facts = [
         ("capture", Path(run.config["capture"]).name),
         ("method", scene.method),
-        ("Gaussians", f"{len(scene.canonical):,}"),
+        ("Gaussians", f"{scene.num_gaussians:,}"),
         ("frames trained on", str(len(scene.recorded.names))),
     ]
     iterations = scene.diagnostics.get("iterations")
@@ -106,22 +104,19 @@ def page_of(header: dict[str, Any], planes: bytes, title: str, facts: list[tuple
         head = json.dumps(header, separators=(",", ":"), allow_nan=False)
     except ValueError:
         raise NeecoError(NOT_FINITE) from None
-    return (
-        _templates()
-        .get_template("page.html")
-        .render(
-            title=title,
-            subtitle="learned with neeco: move the sliders, drag the picture",
-            facts=facts,
-            script=Markup(script),
-            style=Markup(style),
-            worker=Markup(_source(WORKER)),
-            script_hash=Markup(_hash(script)),
-            style_hash=Markup(_hash(style)),
-            head=_deflated(head.encode()),
-            scene=_deflated(planes),
-            wasm=_deflated(files(__package__).joinpath(WASM).read_bytes()),
-        )
+    pages = Environment(loader=PackageLoader("neeco.viewer", "page"), autoescape=True, undefined=StrictUndefined)
+    return pages.get_template("page.html").render(
+        title=title,
+        subtitle="learned with neeco: move the sliders, drag the picture",
+        facts=facts,
+        script=Markup(script),
+        style=Markup(style),
+        worker=Markup(_source(WORKER)),
+        script_hash=Markup(_hash(script)),
+        style_hash=Markup(_hash(style)),
+        head=_deflated(head.encode()),
+        scene=_deflated(planes),
+        wasm=_deflated(files(__package__).joinpath(WASM).read_bytes()),
     )
 
 
@@ -137,11 +132,6 @@ def _hash(text: str) -> str:
 
 def _deflated(data: bytes) -> str:
     return base64.b64encode(zlib.compress(data, 9)).decode()
-
-
-@cache
-def _templates() -> Environment:
-    return Environment(loader=PackageLoader("neeco.viewer", "page"), autoescape=True, undefined=StrictUndefined)
 
 
 def why_not(scene: DrawableScene) -> str | None:
@@ -164,17 +154,20 @@ def why_not(scene: DrawableScene) -> str | None:
 
 
 @torch.no_grad()
-def pack(scene: GaussianScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
+def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
     """(header, planes) of a scene, harmonics up to `sh_degree`. Raises NeecoError where its method cannot be packed, or
     there are more instruments, joints or labels than the page has room for."""
-    canonical, motion = scene.canonical, scene.motion()
+    motion = scene.motion()
     if (refusal := why_not(scene)) or motion is None:
         raise NeecoError(f"--export: {refusal}")
+    scene = require_gaussians(scene, "--export")
+    canonical = scene.canonical
     degree = min(sh_degree, scene.sh_degree)
     means, boxes = _in_boxes(canonical.means, canonical.counts)
     scales, scale_range = _quantized(motion.log_scales.clamp_min(float(np.log(EXPORT.thinnest_mm))), 255)
     base, base_range = _quantized(canonical.sh_dc[:, 0] * SH_C0 + 0.5, 65535)
     turns = [_quantized(column[:, None], 65535) for column in motion.amounts.flatten(1).unbind(1)]
+    none = np.zeros((len(canonical), 0), np.int64)  # where nothing turns
     harmonics, bands = _harmonics(canonical.sh_rest, degree)
     fields = (  # name, whole numbers [N, K], type
         ("mean", means, "uint24"),
@@ -182,7 +175,7 @@ def pack(scene: GaussianScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
         ("scale", scales, "uint8"),
         ("opacity", _rounded(torch.sigmoid(canonical.opacity_logits)[:, None] * 255), "uint8"),
         ("base", base, "uint16"),
-        ("turn", _columns(canonical.means, [numbers for numbers, _ in turns]), "uint16"),
+        ("turn", np.concatenate([none, *(numbers for numbers, _ in turns)], 1), "uint16"),
         ("label", _rounded(scene.label_channels() * 255), "uint8"),
         ("sh", harmonics, "int8"),
     )
@@ -208,21 +201,16 @@ def _planes(numbers: np.ndarray, kind: str) -> bytes:
     return np.ascontiguousarray(split[..., : BYTES[kind]].transpose(2, 0, 1)).tobytes()
 
 
-def _columns(rows: Tensor, blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """Concatenate blocks [N, K] by columns; without any, return whole numbers of as many rows as `rows` has."""
-    return np.concatenate([np.zeros((len(rows), 0), np.int64), *blocks], 1)
-
-
 def _harmonics(rest: Tensor, degree: int) -> tuple[np.ndarray, list[float]]:
     """[N, 3 K] in -127 to 127 of harmonics [N, 15, 3], the first left out, and what 127 stands for in every degree: its
     largest."""
-    blocks, bands = [], []
+    blocks, bands = [np.zeros((len(rest), 0), np.int64)], []
     for d in range(1, degree + 1):
         band = rest[:, d * d - 1 : (d + 1) ** 2 - 1]
         largest = max(float(band.abs().max()) if band.numel() else 0.0, 1e-9)
         blocks.append(_rounded(band / largest * 127).reshape(len(rest), -1))
         bands.append(largest)
-    return _columns(rest, blocks), bands
+    return np.concatenate(blocks, 1), bands
 
 
 def _in_boxes(means: Tensor, counts: Sequence[int]) -> tuple[np.ndarray, list[list[list[float]]]]:
@@ -268,27 +256,16 @@ def _instruments(scene: GaussianScene, motion: ArticulatedMotion) -> list[dict[s
         names, joints = list(instrument.joints), []
         for name in names:
             span = ranges[instrument.name, name]
-            slides = instrument.slides(name)
-            joints.append({"name": name, "range": [span.lower, span.upper], "slides": slides})
+            joints.append({"name": name, "range": [span.lower, span.upper], "slides": instrument.slides(name)})
         shaft = shafts[instrument.name]
         side, up, _ = frame_about(shaft.along).T
         vectors = {"end": shaft.end, "along": shaft.along, "side": side, "up": up}
-        instruments.append(
-            {
-                "name": instrument.name,
-                "shaft": {name: vector.tolist() for name, vector in vectors.items()},
-                "joints": joints,
-                "axes": [
-                    {
-                        "pivot": item.pivot.tolist(),
-                        "axis": item.axis.tolist(),
-                        "joint": names.index(item.reading),
-                        "slides": item.slides,
-                    }
-                    for item in axes
-                ],
-            }
-        )
+        moves = []
+        for item in axes:
+            place = {"pivot": item.pivot.tolist(), "axis": item.axis.tolist()}
+            moves.append(place | {"joint": names.index(item.reading), "slides": item.slides})
+        shape = {name: vector.tolist() for name, vector in vectors.items()}
+        instruments.append({"name": instrument.name, "shaft": shape, "joints": joints, "axes": moves})
     return instruments
 
 

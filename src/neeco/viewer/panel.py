@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neeco.capture.model import Instrument, InstrumentState
-from neeco.synthesis.states import JointRange
-from neeco.viewer.controls import Controls, InstrumentControls, Shaft, slider_ranges
+from neeco.synthesis.states import JointRange, Shaft
+from neeco.viewer.controls import Controls, InstrumentControls, slider_ranges
 from neeco.viewer.runs import LoadedRun, Timeline
 from neeco.viewer.views import IMAGE, RunPicture, views_of
 
@@ -41,22 +41,21 @@ NONE_CHOSEN = "—"
 PLOT_COLOR = "#228be6"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Actions:
-    """Callbacks of the panel."""
-
-    changed: Callable[[], None]
-    go_to: Callable[[int], None]  # the camera of a frame
-    toggle_gizmo: Callable[[str, int, bool], None]  # an instrument's name and number, and whether its gizmo appears
-    save_state: Callable[[], None]
-    save_image: Callable[[], None]
-
-
 class Panel:
-    """Controls of the run that is shown."""
+    """Controls of the run that is shown. The buttons `keep` and `save` are for others to listen to."""
 
-    def __init__(self, client: viser.ClientHandle, loaded: LoadedRun, actions: Actions) -> None:
-        self._gui, self._loaded, self._actions = client.gui, loaded, actions
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        loaded: LoadedRun,
+        changed: Callable[[], None],
+        go_to: Callable[[int], None],
+        toggle_gizmo: Callable[[str, int, bool], None],
+    ) -> None:
+        """changed: called when the user moved something; go_to: with the frame whose camera is wanted; toggle_gizmo:
+        with an instrument's name and number, and whether its gizmo appears."""
+        self._gui, self._loaded = client.gui, loaded
+        self._changed, self._go_to, self._toggle_gizmo = changed, go_to, toggle_gizmo
         self._worst: list[int] = []
         self._plotted: tuple[Timeline, int] | None = None  # and how many frames were known when it was shown
         self._plotted_at = 0.0
@@ -103,64 +102,49 @@ class Panel:
         gui, views = self._gui, views_of(self._loaded.scene, bool(self._loaded.frames))
         with gui.add_folder("Picture"):
             self.view = gui.add_dropdown("show", views, initial_value=IMAGE)
-        self.view.on_update(self._moved)
+        self.view.on_update(_by_user(self._changed))
 
     def _add_recording(self) -> None:
-        gui, first = self._gui, self._loaded
-        last = len(first.recorded.states) - 1
-        poses = [camera.world_from_camera for camera in first.recorded.cameras]
+        gui, last = self._gui, len(self._loaded.recorded.states) - 1
+        poses = [camera.world_from_camera for camera in self._loaded.recorded.cameras]
+        moves = any(not pose.equal(poses[0]) for pose in poses)
         with gui.add_folder("Recording"):
             hint = "Between two frames the state is interpolated."
             self.frame = gui.add_slider("frame", 0.0, float(last), 0.1, 0.0, hint=hint)
             self.play = gui.add_checkbox("play", False)
-            self.follows = gui.add_checkbox(
-                "camera of the frame",
-                any(not pose.equal(poses[0]) for pose in poses),
-                hint="The camera goes along with the frames.",
-            )
+            hint = "The camera goes along with the frames."
+            self.follows = gui.add_checkbox("camera of the frame", moves, hint=hint)
             self.go = gui.add_button("go to this frame's camera")
             self.cameras = gui.add_checkbox("recorded cameras", False, hint="Click one to stand there.")
-            self.points = gui.add_checkbox("sparse points", False, visible=first.capture is not None)
-        self.frame.on_update(self._moved)
+            self.points = gui.add_checkbox("sparse points", False, visible=self._loaded.capture is not None)
+        self.frame.on_update(_by_user(self._changed))
         for control in (self.play, self.follows, self.cameras, self.points):
-            control.on_update(self._moved)
-        self.go.on_click(lambda _: self._actions.go_to(round(self.place)))
+            control.on_update(_by_user(self._changed))
+        self.go.on_click(lambda _: self._go_to(round(self.place)))
 
     def _add_instruments(self) -> list[InstrumentPanel]:
-        first = self._loaded
-        ranges = slider_ranges(first.scene.instruments, first.recorded.states)
-        return [
-            InstrumentPanel(
-                self._gui,
-                instrument,
-                ranges,
-                first.shafts[instrument.name],
-                self._actions.changed,
-                partial(self._actions.toggle_gizmo, instrument.name, number),
-            )
-            for number, instrument in enumerate(first.scene.instruments)
-        ]
+        loaded, panels = self._loaded, []
+        ranges = slider_ranges(loaded.scene.instruments, loaded.recorded.states)
+        for number, instrument in enumerate(loaded.scene.instruments):
+            shaft, toggle = loaded.shafts[instrument.name], partial(self._toggle_gizmo, instrument.name, number)
+            panels.append(InstrumentPanel(self._gui, instrument, ranges, shaft, self._changed, toggle))
+        return panels
 
     def _add_timeline(self) -> None:
         self._plot: Any = None
         self._timeline_folder = self._gui.add_folder("PSNR of every frame", visible=bool(self._loaded.frames))
         with self._timeline_folder:
-            self.worst = self._gui.add_dropdown(
-                "worst", (NONE_CHOSEN,), initial_value=NONE_CHOSEN, hint="Go to that frame, state and camera."
-            )
-        self.worst.on_update(self._worst_chosen)
+            hint = "Go to that frame, state and camera."
+            self.worst = self._gui.add_dropdown("worst", (NONE_CHOSEN,), initial_value=NONE_CHOSEN, hint=hint)
+        self.worst.on_update(_by_user(self._worst_chosen))
 
     def _add_saving(self) -> None:
-        gui = self._gui
-        labelled = bool(self._loaded.scene.label_names)
+        gui, labelled = self._gui, bool(self._loaded.scene.label_names)
         with gui.add_folder("Keep"):
-            keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
-            save = gui.add_button(
-                "save labelled image", disabled=not labelled, hint="As neeco synthesize writes one, from here."
-            )
+            self.keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
+            hint = "As neeco synthesize writes one, from here."
+            self.save = gui.add_button("save labelled image", disabled=not labelled, hint=hint)
             self.saved = gui.add_html("")
-        keep.on_click(lambda _: self._actions.save_state())
-        save.on_click(lambda _: self._actions.save_image())
 
     def _draw_plot(self, data: tuple[np.ndarray, ...]) -> None:
         if self._plot is not None:
@@ -178,19 +162,15 @@ class Panel:
                 padding=(6, 8, 0, 0),
             )
 
-    def _moved(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None:  # else the program moved it
-            self._actions.changed()
-
-    def _worst_chosen(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is None or self.worst.value == NONE_CHOSEN:
+    def _worst_chosen(self) -> None:
+        if self.worst.value == NONE_CHOSEN:
             return
         frame = self._worst[list(self.worst.options).index(self.worst.value) - 1]
         for instrument in self.instruments:
             instrument.reset()
         self.play.value = False
         self.frame.value = float(frame)
-        self._actions.go_to(frame)
+        self._go_to(frame)
 
 
 class InstrumentPanel:
@@ -213,29 +193,22 @@ class InstrumentPanel:
         # what sliders show of a reading: degrees of one that turns, mm of one that slides
         self._per_unit = {joint: 1.0 if instrument.slides(joint) else math.degrees(1.0) for joint in instrument.joints}
         with gui.add_folder(f"Instrument {self.name}"):
-            self._joints = {
-                joint: _joint_slider(gui, joint, span, self._per_unit[joint]) for joint, span in self._ranges.items()
-            }
+            spans = self._ranges.items()
+            self._joints = {joint: _joint_slider(gui, joint, span, self._per_unit[joint]) for joint, span in spans}
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
-            self.slide = gui.add_slider(
-                "along shaft (mm)", -PANEL.slide_mm, PANEL.slide_mm, 0.5, 0.0, hint=f"Along {about}."
-            )
+            end, most, angle = "About the shaft's end.", PANEL.slide_mm, PANEL.yaw_deg
+            self.slide = gui.add_slider("along shaft (mm)", -most, most, 0.5, 0.0, hint=f"Along {about}.")
             self.roll = gui.add_slider("roll (°)", -180.0, 180.0, 1.0, 0.0, hint=f"About {about}.")
-            self.yaw = gui.add_slider("yaw (°)", -PANEL.yaw_deg, PANEL.yaw_deg, 0.5, 0.0, hint="About the shaft's end.")
-            self.pitch = gui.add_slider(
-                "pitch (°)", -PANEL.yaw_deg, PANEL.yaw_deg, 0.5, 0.0, hint="About the shaft's end."
-            )
-            self.gizmo = gui.add_checkbox(
-                "drag it in the scene",
-                False,
-                hint="Arrows and rings move and turn the instrument; sliders add to that.",
-            )
+            self.yaw = gui.add_slider("yaw (°)", -angle, angle, 0.5, 0.0, hint=end)
+            self.pitch = gui.add_slider("pitch (°)", -angle, angle, 0.5, 0.0, hint=end)
+            hint = "Arrows and rings move and turn the instrument; sliders add to that."
+            self.gizmo = gui.add_checkbox("drag it in the scene", False, hint=hint)
             self.back = gui.add_button("back to the recording")
         for slider in self._joints.values():
-            slider.on_update(self._joint_moved)
+            slider.on_update(_by_user(self._joint_moved))
         for control in (self.slide, self.roll, self.yaw, self.pitch):
-            control.on_update(self._moved)
-        self.gizmo.on_update(self._gizmo_toggled)
+            control.on_update(_by_user(changed))
+        self.gizmo.on_update(_by_user(self._gizmo_toggled))
         self.back.on_click(lambda _: self.reset())
 
     def controls(self, pose: np.ndarray | None) -> InstrumentControls:
@@ -278,20 +251,18 @@ class InstrumentPanel:
             self._toggle_gizmo(False)
         self._changed()
 
-    def _joint_moved(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is None:  # it followed the recording
-            return
+    def _joint_moved(self) -> None:
         self._joints_as_recorded = False
         self._changed()
 
-    def _moved(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None:
-            self._changed()
+    def _gizmo_toggled(self) -> None:
+        self._toggle_gizmo(bool(self.gizmo.value))
+        self._changed()
 
-    def _gizmo_toggled(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None:
-            self._toggle_gizmo(bool(self.gizmo.value))
-            self._changed()
+
+def _by_user(action: Callable[[], None]) -> Callable[[viser.GuiEvent[Any]], None]:
+    """`action` where a user moved a control, not the program."""
+    return lambda event: None if event.client is None else action()
 
 
 def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: float) -> viser.GuiSliderHandle[float]:
@@ -301,9 +272,8 @@ def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: flo
     digits = max(0, 1 - math.floor(math.log10((upper - lower) / 5)))
     step = 10.0**-digits
     lower, upper = round(math.floor(lower / step) * step, digits), round(math.ceil(upper / step) * step, digits)
-    return gui.add_slider(
-        f"{joint} ({'mm' if per_unit == 1 else '°'})", lower, upper, step, min(max(0.0, lower), upper)
-    )
+    unit = "mm" if per_unit == 1 else "°"
+    return gui.add_slider(f"{joint} ({unit})", lower, upper, step, min(max(0.0, lower), upper))
 
 
 def status_html(rendered: RunPicture, seconds: float, note: str) -> str:

@@ -65,7 +65,7 @@ class PictureSettings:
 PICTURES = PictureSettings()
 
 
-class PosingServer:
+class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
     """A running server on one capture; `address` is what to open. Use as a context manager, or call `stop`.
 
     Any thread may call it: one or more browsers pose the capture.
@@ -98,9 +98,6 @@ class PosingServer:
         )
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> PosingServer:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
@@ -196,7 +193,7 @@ class PosingServer:
     def save(self, instrument: str, index: int, roll_deg: float, joints_deg: Mapping[str, float]) -> dict[str, Any]:
         """Add an answer, solve again and write both; the overview, and under `said` what contradicts the answer. Raises
         NeecoError."""
-        with self._lock, self._own_capture():
+        with self._lock, own_folder(self.posed.root, wait_s=LOCK_WAIT_S):
             _require_state(self._posings[instrument], roll_deg, joints_deg)
             now = datetime.datetime.now().strftime("%Y-%m-%d %H:%M")
             answer = HandPose(self.posed.frames[index], instrument, roll_deg, dict(joints_deg), now)
@@ -206,7 +203,7 @@ class PosingServer:
 
     def _undo(self, instrument: str) -> dict[str, Any]:
         """Take the last answer for an instrument out again; the overview, and under `frame` what it was of."""
-        with self._lock, self._own_capture():
+        with self._lock, own_folder(self.posed.root, wait_s=LOCK_WAIT_S):
             answers = read_answers(self.posed.root)
             positions = [position for position, answer in enumerate(answers) if answer.instrument == instrument]
             if not positions:
@@ -214,10 +211,6 @@ class PosingServer:
             removed = answers.pop(positions[-1])
             self._keep(answers)
             return self._overview(instrument) | {"frame": self.posed.frames.index(removed.frame)}
-
-    def _own_capture(self) -> contextlib.AbstractContextManager[None]:
-        """The capture for this process alone, from reading its answers to writing them and its states."""
-        return own_folder(self.posed.root, wait_s=LOCK_WAIT_S)
 
     def _keep(self, answers: list[HandPose]) -> None:
         posings = self.posed.solve(answers)  # raises before anything is written
@@ -323,7 +316,6 @@ def page() -> bytes:
 
 def _require_state(posing: SolvedPosing, roll_deg: float, joints_deg: Mapping[str, float]) -> None:
     """Raise NeecoError where these are no roll and joints of the instrument."""
-    if set(joints_deg) != set(posing.joints) or not all(
-        abs(value) <= 360 for value in (roll_deg, *joints_deg.values())
-    ):
+    turns = all(abs(value) <= 360 for value in (roll_deg, *joints_deg.values()))
+    if set(joints_deg) != set(posing.joints) or not turns:
         raise NeecoError(f"answer: expected {', '.join(posing.angles)} in degrees between -360 and 360")

@@ -63,8 +63,7 @@ class RecordingSession:
     def __init__(self, client: viser.ClientHandle, capture: Capture, unit: float, distance: float) -> None:
         self._client, self._capture, self._unit, self._distance = client, capture, unit, distance
         self._lock, self._shown = threading.RLock(), (-1, 0.0)
-        gui, scene = client.gui, client.scene
-        cameras = [frame.camera for frame in capture.frames]
+        gui, scene, cameras = client.gui, client.scene, [frame.camera for frame in capture.frames]
         overlays = Overlays(client, cameras, capture.points, unit, self.go_to, lambda: None)
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         with gui.add_folder("Recording"):
@@ -77,12 +76,9 @@ class RecordingSession:
         tracks = scene.add_frame("/tracks", show_axes=False, visible=False)
         self.axes = {}
         for number, name in enumerate(item.name for item in capture.instruments if capture.registered):
-            poses = [
-                to_numpy(frame.state.instruments[name].pose)
-                for frame in capture.frames
-                if name in frame.state.instruments
-            ]
-            path = np.array([pose[:3, 3] * unit for pose in poses], np.float32).reshape(-1, 3)
+            tracked = [frame.state.instruments.get(name) for frame in capture.frames]
+            places = [to_numpy(item.pose)[:3, 3] * unit for item in tracked if item is not None]
+            path = np.array(places, np.float32).reshape(-1, 3)
             color = RECORDING.track_colors[number % len(RECORDING.track_colors)]
             ends = np.stack([path[:-1], path[1:]], 1)
             if len(ends):

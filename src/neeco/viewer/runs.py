@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,14 +23,11 @@ from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
-from neeco.scene.drawable import DrawableScene, Recorded
+from neeco.scene import DrawableScene, Recorded, load_scene
 from neeco.scene.gaussian_scene import is_gaussian
-from neeco.scene.io import load_scene
+from neeco.synthesis.samplers import shafts_of
+from neeco.synthesis.states import Shaft
 from neeco.training.run import checkpoint_path, read_checkpoint, read_config
-from neeco.viewer.controls import Shaft, shafts_of
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene
 
 SCENE_FILE = "scene.safetensors"
 
@@ -104,7 +101,7 @@ class ViewedRun:
         self.distance = self.loaded.distance  # mm
         self.unit = VIEW.distance_units / self.distance  # viser's units per mm
         self.timeline = Timeline(self.loaded)
-        self._ended = threading.Event()
+        self.ended = threading.Event()  # of `watch`
 
     def refresh(self) -> bool:
         """Read the run again if its files have changed, and score its frames anew; whether anything new was read. A run
@@ -127,19 +124,15 @@ class ViewedRun:
 
     def watch(self, changed: Callable[[], None]) -> None:
         """Look at the run folder from time to time, in a thread of its own, and call `changed` where it changed or can
-        no longer be read; until `end_watch`."""
+        no longer be read; until `ended` is set."""
 
         def look() -> None:
-            while not self._ended.wait(VIEW.watch_s):
+            while not self.ended.wait(VIEW.watch_s):
                 trouble = self.trouble
                 if self.refresh() or trouble != self.trouble:
                     changed()
 
         threading.Thread(target=look, name="neeco-watcher", daemon=True).start()
-
-    def end_watch(self) -> None:
-        """Look at the run folder no more."""
-        self._ended.set()
 
     def advance_timeline(self) -> bool:
         """Score one more frame; False: all are."""
@@ -157,14 +150,12 @@ class ViewedRun:
         for file in (self.path / SCENE_FILE, checkpoint_path(self.path)):
             try:
                 status = file.stat()
+                return str(file), status.st_ino, status.st_mtime_ns, status.st_size
             except FileNotFoundError:
                 continue
             except OSError as error:
                 raise NeecoError(f"{file}: cannot read: {error.strerror or error}") from error
-            return str(file), status.st_ino, status.st_mtime_ns, status.st_size
-        raise NeecoError(
-            f"{self.path}: has neither a finished scene nor a checkpoint yet; wait until `neeco train` has written one"
-        )
+        raise NeecoError(f"{self.path}: has neither a finished scene nor a checkpoint yet; let `neeco train` write one")
 
     def _load(self) -> LoadedRun:
         config = read_config(self.path)

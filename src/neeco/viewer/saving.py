@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,9 +20,7 @@ from neeco.scene.gaussian_scene import require_gaussians
 from neeco.synthesis.samplers import DrawnCameras, moved_camera
 from neeco.synthesis.settings import RECORDED_SIZE, Settings, SizeSettings
 from neeco.synthesis.writers.folder import encoded_sample, load_record, record_path
-
-if TYPE_CHECKING:
-    from neeco.viewer.runs import LoadedRun
+from neeco.viewer.runs import LoadedRun
 
 FOLDER = "kept"  # of the run
 STATES, SAMPLES = "states.jsonl", "samples"

@@ -9,7 +9,7 @@ import contextlib
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -36,7 +36,7 @@ document.documentElement.addEventListener("keydown", event => {
 </script>"""
 
 
-class ViserPage:
+class ViserPage(contextlib.AbstractContextManager["ViserPage"]):
     """viser's running server; `address` is what to open. Use as a context manager, or call `stop`."""
 
     def __init__(self, host: str, port: int, cameras: Sequence[Camera], distance: float, unit: float) -> None:
@@ -53,9 +53,6 @@ class ViserPage:
         initial.look_at = tuple((pose[:3, 3] + distance * pose[:3, 2]) * unit)
         initial.up = tuple(-pose[:3, 1])
         initial.fov = field_of_view(cameras[0])
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
@@ -91,7 +88,7 @@ class ViewerServer(ViserPage):
 
     def stop(self) -> None:
         """End the rendering, then the server."""
-        self.run.end_watch()
+        self.run.ended.set()
         self.render_thread.stop()
         super().stop()
 
@@ -116,11 +113,8 @@ def _start_server(access: Access) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> None:
             return None
 
-    def with_slider_keys(page: bytes) -> bytes:
-        return page.replace(b"<head>", b"<head>" + SLIDER_KEYS, 1)
-
     # viser's own banner would name an address without the token
-    with controlled_sockets(access, with_slider_keys) as opened, contextlib.redirect_stdout(io.StringIO()):
+    with controlled_sockets(access, SLIDER_KEYS) as opened, contextlib.redirect_stdout(io.StringIO()):
         server = Server(host=access.host, port=access.port, label="neeco", verbose=False)
     if not opened:
         _stop_server(server)

@@ -10,7 +10,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import State
 from neeco.labels.drawing import to_numpy
 from neeco.viewer.controls import Controls, controlled_state, interpolated_state
-from neeco.viewer.panel import Actions, Panel, message_html, status_html
+from neeco.viewer.panel import Panel, message_html, status_html
 from neeco.viewer.runs import LoadedRun, ViewedRun
 from neeco.viewer.saving import SavedStates
 from neeco.viewer.views import Picture, RunPicture, render_run, scored
@@ -47,8 +48,7 @@ class ViewerSettings:
 
 
 VIEWER = ViewerSettings()
-
-
+T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 
@@ -144,11 +144,8 @@ class RenderThread:
             moments = self._tick()
             if self._do_most_urgent():
                 continue
-            try:
-                if self._when_idle():
-                    continue
-            except Exception:
-                log.exception("work while idle failed")
+            if _attempted(self._when_idle, False):
+                continue
             now = time.perf_counter()
             with self._lock:
                 moments += [since + VIEWER.settled_s for since in self._unsharp.values()]
@@ -156,13 +153,11 @@ class RenderThread:
 
     def _tick(self) -> list[float]:
         """Advance every session; return when each is to be called again."""
-        now = time.perf_counter()
-        moments = []
+        now, moments = time.perf_counter(), []
         for session in self.sessions:
             try:
                 moments.append(session.tick(now))
             except Exception:
-                # one browser's trouble must not end the others' pictures
                 log.exception("a session failed")
                 self.remove(session.key)
         return [moment for moment in moments if moment is not None]
@@ -179,15 +174,20 @@ class RenderThread:
             session = None if job is not None or key is None else self._sessions[key]
             if session is not None:
                 del (self._unsharp if sharp else self._requested)[session.key]
-        try:
-            if job is not None:
-                job()
-            elif session is not None:
-                session.render(sharp)
-        except Exception:
-            # one browser's trouble must not end the others' pictures
-            log.exception("rendering failed")
-        return job is not None or session is not None
+        if job is None and session is not None:
+            job = partial(session.render, sharp)
+        if job is not None:
+            _attempted(job, None)
+        return job is not None
+
+
+def _attempted(work: Callable[[], T], otherwise: T) -> T:
+    """Do something; log its failure: one browser's trouble must not end the others' pictures."""
+    try:
+        return work()
+    except Exception:
+        log.exception("rendering failed")
+        return otherwise
 
 
 class ClientSession:
@@ -216,7 +216,8 @@ class ClientSession:
         self._camera_frame = 0  # whose camera the window was sent to last
         self._followed: int | None = 0  # the frame that the camera went along to
         client.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self._loaded, self.overlays, self._panel = self._build(run.loaded)
+        self._loaded = run.loaded
+        self._build(run.loaded)
         self._go_to(0)
         client.camera.on_update(lambda _: self._request())
 
@@ -224,13 +225,12 @@ class ClientSession:
         """Render what is asked for now: coarsely, or sharp with its numbers."""
         if not self._connected():
             return
-        current = self._run.loaded
+        began, current = time.perf_counter(), self._run.loaded
         if current.signature != self._loaded.signature:
             self._client.gui.reset()
             self._client.scene.reset()
-            self._loaded, self.overlays, self._panel = self._build(current)
+            self._build(current)
         self._loaded = current
-        began = time.perf_counter()
         self._fit_window()
         controls, window = self._follow_recording(), self._client.camera
         height = self._resolution.height(sharp, window.image_height, aspect_of(window))
@@ -265,18 +265,15 @@ class ClientSession:
             self._request()
         return self._played_at + 1 / VIEWER.played_per_s
 
-    def _build(self, loaded: LoadedRun) -> tuple[LoadedRun, Overlays, Panel]:
-        """Return the run, and create overlays and panel for it."""
-        actions = Actions(
-            changed=self._request,
-            go_to=self._go_to,
-            toggle_gizmo=self._toggle_gizmo,
-            save_state=self._save_state,
-            save_image=self._save_image,
-        )
+    def _build(self, loaded: LoadedRun) -> None:
+        """Create overlays and panel for a run."""
         points = None if loaded.capture is None else loaded.capture.points
-        overlays = Overlays(self._client, loaded.recorded.cameras, points, self._run.unit, self._go_to, self._request)
-        return loaded, overlays, Panel(self._client, loaded, actions)
+        cameras, unit = loaded.recorded.cameras, self._run.unit
+        self.overlays = Overlays(self._client, cameras, points, unit, self._go_to, self._request)
+        self._loaded = loaded
+        self._panel: Panel = Panel(self._client, loaded, self._request, self._go_to, self._toggle_gizmo)
+        self._panel.keep.on_click(lambda _: self._save_state())
+        self._panel.save.on_click(lambda _: self._save_image())
 
     def _request(self) -> None:
         self._thread.request(self.key)

@@ -11,7 +11,7 @@ import gzip
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -28,9 +28,7 @@ from neeco.raster import depth_maps
 from neeco.raster.reference import brightened, headlight_factor, sh_basis
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
+from neeco.scene import GaussianScene
 
 Format = Literal["ply", "spz"]
 DIRECTIONS = 64  # by which harmonics are rotated: four times as many as there are harmonics
@@ -80,9 +78,7 @@ def splats_of(scene: GaussianScene, state: State, camera: Camera) -> Splats:
     scales = posed.scales.clamp_min(MIN_SCALE).log()
     tensors = (posed.means, normalize(posed.quats, dim=1), scales, torch.logit(opacities), sh)
     if not all(bool(tensor.isfinite().all()) for tensor in tensors):
-        raise NeecoError(
-            "the scene has Gaussians that are not finite in this state; give another state, or train again"
-        )
+        raise NeecoError("the scene's Gaussians are not finite in this state; give another state, or train again")
     return Splats(*(tensor.float().cpu().numpy() for tensor in tensors))
 
 
@@ -117,9 +113,7 @@ def spz_bytes(splats: Splats) -> bytes:
     degree = int(splats.sh.shape[1] ** 0.5) - 1
     header = struct.pack("<IIIBBBB", SPZ_MAGIC, SPZ_VERSION, len(splats.means), degree, SPZ_FRACTION, 0, 0)
     positions = (fixed & 0xFFFFFF).astype("<u4")[..., None].view(np.uint8)[..., :3]
-    quats = np.where(splats.quats[:, :1] < 0, -splats.quats, splats.quats)[
-        :, 1:
-    ]  # w follows from the rest, and is positive
+    quats = np.where(splats.quats[:, :1] < 0, -splats.quats, splats.quats)[:, 1:]  # w, positive, follows from them
     columns = (
         positions,
         to_uint8(255 / (1 + np.exp(-splats.logits.astype(np.float64)))),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,13 +16,11 @@ from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
 from neeco.raster.devices import readable_failures
 from neeco.raster.types import Rendering
+from neeco.scene import DrawableScene
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.viewer.controls import Controls, controlled_state
 from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRun, score_frame
 from neeco.viewer.viser_scene import stands_at
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene
 
 IMAGE, OVERLAY, PARTS = "image", "labels over image", "parts"
 DEPTH, UNOBSERVED, DIFFERENCE = "depth", "unobserved", "difference to the recorded image"
@@ -61,9 +58,7 @@ class RunPicture:
 
 def views_of(scene: DrawableScene, has_images: bool) -> tuple[str, ...]:
     """The VIEWS that a scene has; has_images: the capture is at hand."""
-    absent = set()
-    if not scene.label_names:
-        absent |= set(LABELLED)
+    absent = set[str]() if scene.label_names else set(LABELLED)
     if not scene.has_gaussians:
         absent.add(UNOBSERVED)
     if not has_images:

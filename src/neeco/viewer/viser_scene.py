@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -135,7 +134,7 @@ class Overlays:
                 wxyz=wxyz_of(pose),
                 position=pose[:3, 3] * unit,
             )
-            frustum.on_click(partial(_click, clicked, frame))
+            frustum.on_click(lambda _, frame=frame: clicked(frame))
         self.points = self._add_points(points)
         self._gizmos: dict[str, Any] = {}
 
@@ -164,9 +163,8 @@ class Overlays:
 
     def remove_gizmo(self, name: str) -> None:
         """Take an instrument's gizmo away."""
-        gizmo = self._gizmos.pop(name, None)
-        if gizmo is not None:
-            gizmo.remove()
+        if name in self._gizmos:
+            self._gizmos.pop(name).remove()
 
     def gizmo_pose(self, name: str) -> np.ndarray | None:
         """Pose [4, 4] in mm of an instrument's gizmo; None without one."""
@@ -188,14 +186,8 @@ class Overlays:
         )
 
 
-def _click(clicked: Callable[[int], None], frame: int, _: object) -> None:
-    clicked(frame)
-
-
 def _frustum_frames(cameras: Sequence[Camera]) -> list[int]:
     """Frames whose cameras are shown: some from everywhere, none twice in one place."""
-    chosen: dict[bytes, int] = {}
-    for frame in evenly_spaced(len(cameras), SCENE.max_frusta):
-        pose = to_numpy(cameras[frame].world_from_camera)
-        chosen.setdefault(pose.round(3).tobytes(), frame)
-    return list(chosen.values())
+    frames = evenly_spaced(len(cameras), SCENE.max_frusta)
+    poses = [to_numpy(cameras[frame].world_from_camera).round(3) for frame in frames]
+    return [frames[first] for first in np.unique(poses, axis=0, return_index=True)[1]]

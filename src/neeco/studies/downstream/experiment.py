@@ -182,24 +182,21 @@ class DownstreamJob:
 
     def check(self) -> None:
         """Raises NeecoError when the folder holds another job's result, or a test of another capture by this name."""
+        self.stored()
+
+    def stored(self) -> dict[str, Any] | None:
+        """Return the result of an earlier start, None where there is none of all tests. Raises NeecoError as `check`
+        does."""
         file = self.folder / JOB_FILE
         if not file.exists():
-            return
+            return None
         stored = require_like(read_json(file), {"schema": str}, str(file), REMEDY)
         now = {"schema": JOB_SCHEMA} | self.identity()
         require_same(str(file), ((key, stored.get(key), now[key]) for key in now), REMEDY)
         tested = require_like(stored, {"tests": {str: str}, "splits": dict}, str(file), REMEDY)["tests"]
-        for name, path in self.settings.tests.items():
-            require_same(
-                f"{file}: --test", [(name, tested.get(name, str(path.absolute())), str(path.absolute()))], REMEDY
-            )
-
-    def stored(self) -> dict[str, Any] | None:
-        """Return the result of an earlier start, None where there is none of all tests. Raises NeecoError."""
-        self.check()
-        file = self.folder / JOB_FILE
-        result = dict(read_json(file)) if file.exists() else None
-        return result if result and set(self.settings.all_tests) <= set(result["splits"]) else None
+        tests = {name: str(path.absolute()) for name, path in self.settings.tests.items()}
+        require_same(f"{file}: --test", ((name, tested.get(name, tests[name]), tests[name]) for name in tests), REMEDY)
+        return dict(stored) if set(self.settings.all_tests) <= set(stored["splits"]) else None
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
         """Train, test, write `folder`/job.json last, and return what it holds; at once when it is there already."""
@@ -265,12 +262,10 @@ class DownstreamJob:
         predictions = predict([example.image for example in truth])
         if self.fold == self.settings.kept_fold:
             write_predictions(self.folder, test, [sample.name for sample in samples], predictions)
-        frames: list[dict[str, float]] = []
-        for prediction, example in zip(predictions, truth, strict=True):
-            if isinstance(prediction, Detections):
-                frames.append({"box_iou": box_iou(prediction, example)})
-            else:
-                frames.append(mask_scores(prediction, example, names))
+        frames = [
+            {"box_iou": box_iou(found, true)} if isinstance(found, Detections) else mask_scores(found, true, names)
+            for found, true in zip(predictions, truth, strict=True)
+        ]
         boxes = [prediction for prediction in predictions if isinstance(prediction, Detections)]
         rows = [
             {"frame": sample.name}
@@ -363,11 +358,8 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
         labelled_count(word, 10**9)
     if any(REAL in condition for condition in conditions) and set(settings.num_real or "all") != {"0"}:
         labelled = len(recorded_samples(capture, "train", settings.classes, settings.labels))
-        wanted = settings.num_real or (
-            "0",
-            *(str(count) for count in settings.default_counts if count < labelled),
-            "all",
-        )
+        usual = (str(count) for count in settings.default_counts if count < labelled)
+        wanted = settings.num_real or ("0", *usual, "all")
         counts = sorted({labelled_count(word, labelled) for word in wanted})
     jobs = tuple(
         DownstreamJob(settings, model, condition, real, fold)
@@ -379,12 +371,12 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
     )
     trained = {job.condition.name for job in jobs}
     if missing := [item.name for item in conditions if item.name not in trained and (settings.conditions or not jobs)]:
-        raise NeecoError(
-            f"--num-real: leaves nothing to train {missing[0]} on; add 0 for sets alone, a number for real"
-        )
+        problem = f"leaves nothing to train {missing[0]} on"
+        raise NeecoError(f"--num-real: {problem}; add 0 for sets alone, a number for real")
     entries = [entry.name for entry in settings.output.iterdir()] if settings.output.is_dir() else []
     if [name for name in entries if not name.startswith(".")] != ["jobs"]:  # not just before its first result
-        check_output(settings.output, FILE, SCHEMA, settings.capture, "a downstream experiment")
+        same = {"schema": SCHEMA, "capture": str(settings.capture.absolute())}
+        check_output(settings.output, FILE, "a downstream experiment", **same)
     for job in jobs:
         job.check()
     return DownstreamPlan(

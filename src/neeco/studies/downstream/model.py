@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from neeco.base.errors import NeecoError, install_hint
+from neeco.base.errors import NeecoError
 from neeco.base.files import write_atomically
 from neeco.base.registry import plugins
 from neeco.studies.downstream.results import Prediction
@@ -66,9 +65,9 @@ class TorchModel(ABC):
     report_every: ClassVar[int] = 10  # steps between two reports of progress
 
     @classmethod
-    @abstractmethod
     def missing_requirement(cls) -> str | None:
         """Return what this machine lacks to train it, with the remedy; None when it can be trained."""
+        return None
 
     @classmethod
     def is_too_small(cls, size: tuple[int, int]) -> bool:
@@ -107,9 +106,8 @@ class TorchModel(ABC):
 
     def _train(self, module: nn.Module, task: TrainingTask) -> None:
         fused = task.device.type == "cuda"
-        optimizer = torch.optim.AdamW(
-            module.parameters(), self.learning_rate, weight_decay=self.weight_decay, fused=fused
-        )
+        decay = self.weight_decay
+        optimizer = torch.optim.AdamW(module.parameters(), self.learning_rate, weight_decay=decay, fused=fused)
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self._rate(step, task.steps))
         rng = torch.Generator(task.device).manual_seed(task.seed) if task.batches.augmented else None
         with_boxes = self.predicts == "boxes"
@@ -145,12 +143,6 @@ class TorchModel(ABC):
         return predictions
 
 
-def missing_packages(*packages: str) -> str | None:
-    """`missing_requirement` of a model that needs packages of the extra `downstream`."""
-    absent = [name for name in packages if importlib.util.find_spec(name) is None]
-    return f"needs {' and '.join(absent)}; {install_hint('downstream')}" if absent else None
-
-
 @cache
 def find_models() -> dict[str, type[TorchModel]]:
     """Return every class with a `model` name of its own, by that name: those of `models/`, and those of entry points in
@@ -162,9 +154,8 @@ def model_class(name: str) -> type[TorchModel]:
     """The model of that name. Raises NeecoError when there is none."""
     models = find_models()
     if name not in models:
-        raise NeecoError(
-            f"--models: {name!r} is unknown; choose of {', '.join(models)}, or install the package that has it"
-        )
+        known = ", ".join(models)
+        raise NeecoError(f"--models: {name!r} is unknown; choose of {known}, or install the package that has it")
     return models[name]
 
 

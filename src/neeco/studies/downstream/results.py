@@ -113,7 +113,7 @@ def box_iou(detections: Detections, truth: Example) -> float:
     return mean_of(values)
 
 
-def _coco_ap(found: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.ndarray]) -> tuple[float, float, float]:
+def _coco_ap(found: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.ndarray]) -> list[float]:
     """AP over IoU .5 to .95, at .5 and at .75, by pycocotools."""
     from pycocotools.coco import COCO
     from pycocotools.cocoeval import COCOeval
@@ -130,23 +130,18 @@ def _coco_ap(found: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.n
         for box, score in zip(boxes, scores, strict=True)
     ]
     if not detections:
-        return 0.0, 0.0, 0.0
+        return [0.0, 0.0, 0.0]
     with contextlib.redirect_stdout(io.StringIO()):
         truth = COCO()
-        truth.dataset = {
-            "info": {},
-            "images": [{"id": image} for image in range(1, len(true) + 1)],
-            "categories": [{"id": 1, "name": "instrument"}],
-            "annotations": [box | {"id": number, "iscrowd": 0} for number, box in enumerate(labelled, 1)],
-        }
+        images = [{"id": image} for image in range(1, len(true) + 1)]
+        boxes_of = [box | {"id": number, "iscrowd": 0} for number, box in enumerate(labelled, 1)]
+        truth.dataset = {"info": {}, "images": images, "categories": [{"id": 1}], "annotations": boxes_of}
         truth.createIndex()
         evaluation = COCOeval(truth, truth.loadRes(detections), "bbox")
-        evaluation.params.maxDets = [1, 10, 100]  # per image, as COCO
         evaluation.evaluate()
         evaluation.accumulate()
         evaluation.summarize()
-    ap, ap50, ap75 = (float(value) for value in evaluation.stats[:3])
-    return ap, ap50, ap75
+    return evaluation.stats[:3].tolist()
 
 
 class Arm(NamedTuple):

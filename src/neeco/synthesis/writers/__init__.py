@@ -10,13 +10,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from neeco.labels.labellers import Labeller, instruments_of
+from neeco.scene import GaussianScene
 from neeco.synthesis.writers.folder import Record
-
-if TYPE_CHECKING:
-    from neeco.scene import GaussianScene
 
 
 @dataclass(frozen=True, kw_only=True)

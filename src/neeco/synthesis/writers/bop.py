@@ -46,9 +46,7 @@ class Bop(Writer):
         for split in sorted({record["split"] for record in images.records}):
             folder = root / self.format / split / SCENE
             cameras, poses, infos = {}, {}, {}
-            for record in images.records:
-                if record["split"] != split:
-                    continue
+            for record in (record for record in images.records if record["split"] == split):
                 name, key = stem(record["index"]), str(record["index"])
                 link(root / record["image"], folder / "rgb" / Path(record["image"]).name)
                 link(root / "depth" / f"{name}.png", folder / "depth" / f"{name}.png")
@@ -98,8 +96,7 @@ def _masks(images: WrittenImages, folder: Path, record: Record) -> list[dict[str
         whole = extended[label["instrument"]]
         whole[height : 2 * height, width : 2 * width] = mask
         for kind, pixels in (("mask", mask), ("mask_visib", visible)):
-            path = folder / kind / f"{name}_{place:06d}.png"
-            write_unsynced(path, encoded_png(pixels.astype(np.uint8) * 255))
+            write_unsynced(folder / kind / f"{name}_{place:06d}.png", encoded_png(pixels.astype(np.uint8) * 255))
         seen, every = int(visible.sum()), int(whole.sum())
         infos.append(
             {

@@ -19,6 +19,8 @@ from neeco.base.files import write_json
 from neeco.synthesis.writers import Writer, WrittenImages
 from neeco.synthesis.writers.folder import Record, link
 
+Entry = dict[str, Any]
+
 
 class Coco(Writer):
     """Boxes, polygons, keypoints and poses of instruments and their parts.
@@ -38,11 +40,10 @@ class Coco(Writer):
         keypoints, records = images.keypoint_names, images.records
         bones = [pair for pair in images.bones if set(pair) <= set(keypoints)]
         skeleton = [[keypoints.index(a) + 1, keypoints.index(b) + 1] for a, b in bones]
-        instruments: list[dict[str, Any]] = [
-            {"id": k, "name": name, "supercategory": "instrument"} for k, name in enumerate(images.instruments, 1)
-        ]
-        for category in instruments if keypoints else []:
-            category |= {"keypoints": list(keypoints), "skeleton": skeleton}
+        shared: Entry = {"supercategory": "instrument"}
+        if keypoints:
+            shared |= {"keypoints": list(keypoints), "skeleton": skeleton}
+        instruments = [{"id": k, "name": name, **shared} for k, name in enumerate(images.instruments, 1)]
         parts = [
             {"id": k, "name": f"{instrument}/{part}", "supercategory": instrument}
             for k, (instrument, part) in enumerate(images.part_names, 1)
@@ -66,9 +67,7 @@ class Coco(Writer):
                 write_json(path, _document(chosen, categories, made), indent=None)
 
 
-def _document(
-    records: Sequence[Record], categories: list[dict[str, Any]], annotations: Iterable[dict[str, Any]]
-) -> dict[str, Any]:
+def _document(records: Sequence[Record], categories: list[Entry], annotations: Iterable[Entry]) -> Entry:
     images = [
         {
             "id": record["index"] + 1,  # some tools take 0 for "no image"
@@ -88,7 +87,7 @@ def _document(
     }
 
 
-def _annotation(record: Record, shape: dict[str, Any], category: int) -> dict[str, Any]:
+def _annotation(record: Record, shape: Entry, category: int) -> Entry:
     return {
         "image_id": record["index"] + 1,
         "category_id": category,
@@ -100,12 +99,10 @@ def _annotation(record: Record, shape: dict[str, Any], category: int) -> dict[st
     }
 
 
-def _instrument(
-    record: Record, label: dict[str, Any], numbers: dict[str, int], keypoints: Sequence[str]
-) -> dict[str, Any]:
+def _instrument(record: Record, label: Entry, numbers: dict[str, int], keypoints: Sequence[str]) -> Entry:
     annotation = _annotation(record, label, numbers[label["name"]])
-    points = [label["keypoints"].get(name, [0, 0, 0]) for name in keypoints]
     if keypoints:
+        points = [label["keypoints"].get(name, [0, 0, 0]) for name in keypoints]
         annotation["keypoints"] = [value for point in points for value in point]
         annotation["num_keypoints"] = sum(point[2] > 0 for point in points)
     annotation["visibility"] = label["visibility"]

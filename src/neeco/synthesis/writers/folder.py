@@ -19,14 +19,7 @@ import numpy as np
 import torch
 
 from neeco.base.errors import NeecoError
-from neeco.base.files import (
-    read_bytes,
-    read_text,
-    require_replaceable,
-    write_atomically,
-    write_text,
-    write_unsynced,
-)
+from neeco.base.files import read_bytes, read_text, require_replaceable, write_atomically, write_text, write_unsynced
 from neeco.capture.images import encoded_image, encoded_png
 from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.geometry.lens import Lens
@@ -41,9 +34,7 @@ IGNORED = 255
 RECORDS = ".records"
 CHECKSUM = "sha256"  # of the rest of a record
 LABELS = ("masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
-MAX_INSTRUMENTS = (
-    8  # in `silhouettes`, whose bit k is set where instrument k would be visible if nothing else were there
-)
+MAX_INSTRUMENTS = 8  # in `silhouettes`: bit k is set where instrument k would be visible if nothing else were there
 POLYGONS = ("polygons", "segmentation")  # of a label or part, left out of states.jsonl
 FOLDERS = ("images", *LABELS, RECORDS)
 VALIDATION_EVERY = 5  # every fifth image is for validation; by the index alone, so a data set can grow
@@ -176,10 +167,9 @@ def write_states(root: Path, records: list[Record]) -> None:
     """Write states.jsonl: a line per image, state and labels; readable again as `--states states.jsonl`."""
     lines = []
     for record in records:
-        line = public_record(record)
-        line["labels"] = [_without_polygons(label) for label in record["labels"]]
-        lines.append(json.dumps(line, allow_nan=False))
-    write_text(root / "states.jsonl", "".join(f"{line}\n" for line in lines))
+        labels = [_without_polygons(label) for label in record["labels"]]
+        lines.append(json.dumps(public_record(record) | {"labels": labels}, allow_nan=False) + "\n")
+    write_text(root / "states.jsonl", "".join(lines))
 
 
 def public_record(record: Record) -> dict[str, Any]:

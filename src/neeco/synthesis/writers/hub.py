@@ -95,9 +95,8 @@ def _write_shard(root: Path, records: Sequence[Record], path: Path) -> None:
             key = stem(record["index"])
             image = root / record["image"]
             contents = {image.suffix[1:]: read_bytes(image, "an image")}
-            contents |= {
-                ending: read_bytes(root / folder / f"{key}.png", "labels") for folder, ending in SHARDED.items()
-            }
+            for folder, ending in SHARDED.items():
+                contents[ending] = read_bytes(root / folder / f"{key}.png", "labels")
             contents["json"] = json.dumps(public_record(record), allow_nan=False).encode()
             for ending, content in contents.items():
                 entry = tarfile.TarInfo(f"{key}.{ending}")  # dated 1970 and nobody's: bytes depend on content alone
@@ -127,12 +126,11 @@ def push_to_hub(folder: Path, name: str) -> str:
 
         hub = HfApi(library_name="neeco")
         repository = hub.create_repo(name, repo_type="dataset", private=True, exist_ok=True)
-        message = "Add data set rendered by neeco"
         hub.upload_folder(
             repo_id=repository.repo_id,
             repo_type="dataset",
             folder_path=folder,
-            commit_message=message,
+            commit_message="Add data set rendered by neeco",
             ignore_patterns=list(LEFT_OUT),
         )
         return str(repository)
@@ -148,9 +146,8 @@ def _failures(name: str) -> Iterator[None]:
     try:
         yield
     except HFValidationError:
-        raise NeecoError(
-            f"{OPTION} {name}: is not a repository's name; give NAME or OWNER/NAME of letters, digits, '-', '_' and '.'"
-        ) from None
+        form = "give NAME or OWNER/NAME of letters, digits, '-', '_' and '.'"
+        raise NeecoError(f"{OPTION} {name}: is not a repository's name; {form}") from None
     except (HTTPError, OSError, ValueError) as error:  # no connection; refused, not logged in
         reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".: ")
         raise NeecoError(f"{OPTION} {name}: {reason}; log in with `hf auth login`, or try again") from error

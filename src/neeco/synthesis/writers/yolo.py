@@ -13,6 +13,7 @@ Classes are instruments; those of yolo/parts/ are the part ids of dataset.json, 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,9 +50,8 @@ class Yolo(Writer):
         names = {k: f"{instrument}/{part}" for k, (instrument, part) in enumerate(images.part_names)}
         _write_variant(images, folder / "parts", segment_row, {"names": names}, visible_parts)
         if keypoints:
-            mirrored = [
-                name.replace("left", "\0").replace("right", "left").replace("\0", "right") for name in keypoints
-            ]
+            swapped = {"left": "right", "right": "left"}
+            mirrored = [re.sub("left|right", lambda found: swapped[found[0]], name) for name in keypoints]
             flip = [keypoints.index(name) if name in keypoints else k for k, name in enumerate(mirrored)]
             extra: dict[str, Any] = {"kpt_shape": [len(keypoints), 3], "flip_idx": flip}
             extra["kpt_names"] = {k: list(keypoints) for k in range(len(images.instruments))}
@@ -97,8 +97,7 @@ def oriented_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
 
 def joined_polygon(polygons: list[np.ndarray]) -> np.ndarray:
     """Return one polygon [P, 2] out of several, joined by bridges of no width between their nearest corners."""
-    joined, *rest = polygons
-    remaining = list(rest)
+    joined, *remaining = polygons
     while remaining:
         gaps = [np.linalg.norm(joined[:, None] - other[None], axis=2) for other in remaining]
         nearest = int(np.argmin([gap.min() for gap in gaps]))
@@ -130,11 +129,10 @@ def _write_variant(
         ]
         write_unsynced(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines).encode())
         link(images.root / record["image"], folder / "images" / split / Path(record["image"]).name)
-    has_validation = any(record["split"] == "val" for record in records)
     # without "path", tools take the folder of data.yaml itself, wherever the data set is moved
     data = {
         "train": "images/train",
-        "val": "images/val" if has_validation else "images/train",
+        "val": "images/val" if any(record["split"] == "val" for record in records) else "images/train",
         "names": dict(enumerate(images.instruments)),
         **extra,
     }

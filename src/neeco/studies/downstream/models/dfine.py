@@ -3,6 +3,7 @@ refinement", ICLR 2025) as transformers has it."""
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neeco.studies.downstream.model import TorchModel, missing_packages
+from neeco.base.errors import install_hint
+from neeco.studies.downstream.model import TorchModel
 from neeco.studies.downstream.results import Detections, Prediction
 from neeco.studies.downstream.training_data import Batch
 
@@ -33,7 +35,8 @@ class DFine(TorchModel):
 
     @classmethod
     def missing_requirement(cls) -> str | None:
-        return missing_packages("transformers", "pycocotools")
+        absent = [name for name in ("transformers", "pycocotools") if importlib.util.find_spec(name) is None]
+        return f"needs {' and '.join(absent)}; {install_hint('downstream')}" if absent else None
 
     @classmethod
     def is_too_small(cls, size: tuple[int, int]) -> bool:

@@ -72,10 +72,6 @@ class UNet(TorchModel):
     learning_rate = 3e-3
     channels = (16, 32, 64, 128, 256)  # of the levels, each but the last half as large as the one before
 
-    @classmethod
-    def missing_requirement(cls) -> str | None:
-        return None
-
     def build(self, classes: int) -> nn.Module:
         return ResidualUNet(classes + 1, self.channels)
 
