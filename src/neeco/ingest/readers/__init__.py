@@ -252,11 +252,11 @@ def file_state(*files: Path) -> tuple[tuple[str, int, int], ...]:
         raise NeecoError(f"{error.filename}: cannot read: {error.strerror or error}; correct the path") from None
 
 
-def kept(read: _Read) -> _Read:
+def read_once(read: _Read) -> _Read:
     """Keep what a function reads of a file, its first argument, until that changes. Raises NeecoError where it is not
     there."""
-    read_once = lru_cache(maxsize=4)(lambda state, *given: read(*given))
-    return cast(_Read, wraps(read)(lambda path, *more: read_once(file_state(path), path, *more)))
+    cached = lru_cache(maxsize=4)(lambda state, *arguments: read(*arguments))
+    return cast(_Read, wraps(read)(lambda path, *more: cached(file_state(path), path, *more)))
 
 
 def reason_of(error: BaseException) -> str:

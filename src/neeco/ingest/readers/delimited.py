@@ -241,8 +241,9 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
         names = [*(source.position or ()), *(source.rotation or ()), source.state]
         places = {table.header.index(name) for name in names if name in table.header}
         if not any(places <= {*body.columns} for body in table.bodies):
-            what = f"{', '.join(table.header[place] for place in sorted(places))} are not all of one tool (markers are no tools)"
-            raise NeecoError(f"{table.path}: columns: {what}; name the tool instead, as `tool` in the recording")
+            what = f"{', '.join(table.header[place] for place in sorted(places))} are not all of one tool"
+            remedy = "name the tool instead, as `tool` in the recording"
+            raise NeecoError(f"{table.path}: columns: {what} (markers are no tools); {remedy}")
         return table
     wanted = None if source.tool is None else _canonical(source.tool)
     chosen = [body for body in table.bodies if wanted is None or wanted in {_canonical(body.name), *body.aliases}]

@@ -15,7 +15,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
-from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, kept, parse_number
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, parse_number, read_once
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.delimited import read_cells
 from neeco.ingest.readers.frame_names import NamedFrame
@@ -63,7 +63,7 @@ class JigsawsKinematics(RecordingFormat):
         return Table(path, HEADER, rows, lines, stream=arm, meaning=NamedFrame(BASE), image_hz=RATE_HZ)
 
 
-@kept
+@read_once
 def _lines(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return numbers [R, 76], NaN in lines that have not as many, and the lines [R] that they stand in."""
     text, count = read_cells(path), COLUMNS * len(ARMS)

@@ -19,7 +19,7 @@ import numpy as np
 from neeco.base.errors import NeecoError, counted
 from neeco.base.files import open_file, require_content
 from neeco.capture.documents import printable
-from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, kept, one_line, parse_number
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, one_line, parse_number, read_once
 from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_of, of_dvrk
 
@@ -121,7 +121,7 @@ class FrameSequence:
         return {frame: stated.get(frame, GOOD) for frame in self.fields[name + TRANSFORM]}
 
 
-@kept
+@read_once
 def read_sequence(path: Path) -> FrameSequence:
     """Read the header of a sequence. Raises NeecoError where it is none, is damaged, or says what the file does not
     hold."""

@@ -21,7 +21,7 @@ from neeco.base.files import FastYamlLoader, parse_yaml, read_text, visible_entr
 from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.stereo import read_stereo
-from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_lengths, kept
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_lengths, read_once
 from neeco.ingest.readers.rosbag import DVRK_HINT
 from neeco.ingest.readers.rows import SETTINGS as ROWS
 from neeco.ingest.readers.video import open_images, open_video
@@ -109,7 +109,7 @@ def _read(path: Path) -> tuple[_ByArm, _ByArm]:
     return _by_arm(poses, _pose, "R (3x3) and t"), of_joints
 
 
-@kept
+@read_once
 def _by_arm(file: Path, parse: Callable[[Any], np.ndarray], expected: str) -> _ByArm:
     """Read {frame: {arm: values}}."""
     document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", FastYamlLoader)
