@@ -37,8 +37,8 @@ class ForegroundSettings:
     residuals: tuple[float, float, int] = (-6.0, 1.0, 28)  # range of their logarithms, and bins
     shades: tuple[float, float, int] = (0.0, 1.5, 15)  # range, and bins
     smoothing: float = 1.0  # bins, standard deviation
-    # of the counts at the ridge of a shadow: most at the valley behind it, and most where there is none; rows by which
-    # it may lie above the bound of noise; shades without one, within it
+    # of the counts at the ridge of a shadow: most in the valley behind it, and where it ends in any case; rows above
+    # what noise makes of it, up to which it is looked for; shades without one, within it
     valley: float = 0.6
     foot: float = 0.1
     ridge_rows: int = 2
@@ -212,24 +212,24 @@ def _ridge(about: np.ndarray, bound: np.ndarray, settings: ForegroundSettings) -
     """Return by shade (column) the row of residuals below which pixels near instruments are tissue in a shadow; {}
     where no shadow is seen. about [R, S]: counts of these pixels; bound [R, S]: of `_shaded`.
 
-    Shadows darken by degrees: in the counts they are a ridge that begins at lit tissue, as high as noise has it, and a
+    Shadows darken by degrees: in the counts they are a ridge that begins at lit tissue and rises as noise does, and a
     valley parts it from an instrument. It is followed from light to dark, and ends where there is none.
     """
-    share, smooth = np.cumsum(bound, 0) - bound, gaussian_filter1d(about, settings.smoothing, 0)  # share up to each row
+    share = np.cumsum(bound, 0) - bound  # up to each row
+    smooth, of_noise = (gaussian_filter1d(counts, settings.smoothing, 0) for counts in (about, bound))
+    highest = of_noise.argmax(0)
+    columns = np.nonzero(bound.sum(0))[0][::-1].tolist()
     rows: dict[int, int] = {}
-    missed = 0
-    for column in np.nonzero(bound.sum(0))[0][::-1].tolist():
-        counts = smooth[:, column]
-        median, most = (
-            (share[:, column] < part).sum() + settings.ridge_rows for part in (0.5, settings.noise_quantile)
-        )
-        peak = row = int(counts[:median].argmax())
-        last = min(int(most), len(counts) - 2)
-        while row < last and counts[row + 1] <= counts[row]:
+    crest, before, missed = highest[columns[0]], columns[0], 0
+    for column in columns:
+        counts, reach = smooth[:, column], settings.ridge_rows
+        peak = row = int(counts[: crest + highest[column] - highest[before] + reach].argmax())
+        last = min(int((share[:, column] < settings.noise_quantile).sum()) + reach, len(counts) - 2)
+        while row < last and counts[row + 1] <= counts[row] > settings.foot * counts[peak]:
             row += 1
         deep = settings.valley if row < last else settings.foot
         if peak < row and counts[row] <= deep * counts[peak] and 4 * about[:, column].sum() >= settings.least_pixels:
-            rows[column], missed = row, 0
+            rows[column], crest, before, missed = row, peak, column, 0
         elif (missed := missed + 1) > settings.ridge_gap:
             break
     seen = sorted(rows)
