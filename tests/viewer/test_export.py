@@ -161,7 +161,7 @@ def test_the_policy_allows_the_pages_own_script_and_style_and_nothing_else() -> 
 
 @pytest.mark.parametrize("degree", [-1, 4])
 def test_degrees_that_are_none_are_refused(tmp_path: Path, degree: int) -> None:
-    with pytest.raises(NeecoError, match=r"--sh: "):
+    with pytest.raises(NeecoError, match=r"--sh must be 0 to 3"):
         export_page(tmp_path, tmp_path / "page.html", degree, CPU)
     assert not (tmp_path / "page.html").exists()
 
