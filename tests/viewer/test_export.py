@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scene_worlds import make_scene
+from scene_worlds import make_nerf, make_scene
+from viewer_world import write_recorded_images, write_run
 
 import neeco
 from neeco.base.errors import NeecoError
@@ -114,10 +115,13 @@ def test_lamps_that_were_found_are_packed_and_no_others() -> None:
     assert pack(scene, 0)[0]["light"]["lamps"] == [[7.0, -5.0, 1.0, 0.25]]
 
 
-@pytest.mark.parametrize("method", ["nps", "deformable-3dgs", "4dgs"])
-def test_a_network_for_every_state_is_refused_in_one_line(method: str) -> None:
+@pytest.mark.parametrize("method", ["nps", "deformable-3dgs", "4dgs", "nerfies"])
+def test_a_network_for_every_state_is_refused_in_one_line(method: str, tmp_path: Path) -> None:
+    scene = make_nerf() if method == "nerfies" else make_scene(method)
+    with torch.no_grad():
+        run = write_run(scene, tmp_path / "run", write_recorded_images(scene, tmp_path / "capture"))
     with pytest.raises(NeecoError, match=rf"--export: method {method} .*neeco view RUN") as refusal:
-        pack(make_scene(method), 3)
+        export_page(run, tmp_path / "page.html", 3, CPU)
     assert "\n" not in str(refusal.value)
 
 

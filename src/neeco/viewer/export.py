@@ -82,7 +82,7 @@ def embedded_page(run: TrainedRun) -> str | None:
 
 def page_of_run(run: TrainedRun, sh_degree: int) -> str:
     """The page of a run, harmonics up to `sh_degree`. Raises NeecoError where a page cannot hold it (`why_not`)."""
-    scene = run.scene
+    scene, packed = run.scene, pack(run.scene, sh_degree)
     facts = [
         ("capture", Path(run.config["capture"]).name),
         ("method", scene.method),
@@ -93,7 +93,7 @@ def page_of_run(run: TrainedRun, sh_degree: int) -> str:
     if isinstance(iterations, int):
         facts.append(("iterations", f"{iterations:,}"))
     facts.append(("made with", f"neeco {neeco.__version__}"))
-    return page_of(*pack(scene, sh_degree), Path(run.path).resolve().name, facts)
+    return page_of(*packed, Path(run.path).resolve().name, facts)
 
 
 def page_of(header: dict[str, Any], planes: bytes, title: str, facts: list[tuple[str, str]]) -> str:
