@@ -135,7 +135,7 @@ class Foreground:
             return None
         lit = _counts(views, far, settings)
         shaded, bound = _shaded(lit.sum(1) / lit.sum(), settings)
-        about = _counts(views, [view.usable & view.near(settings.far) for view in views], settings)
+        about = _counts(views, [view.usable & ~mask for view, mask in zip(views, far, strict=True)], settings)
         within = _counts(views, inside, settings)
         instrument = within.copy()
         for column, row in _ridge(about, bound, settings).items():

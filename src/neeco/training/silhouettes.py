@@ -22,7 +22,7 @@ class SilhouetteSettings:
     # frames, from which on it falls with their number: many frames show for themselves what is instrument
     few: int = 30
     min_share: float = 1e-4  # of rendered labels, in logarithms
-    sampled: int = 20  # frames from which densities are learned
+    n_views: int = 20  # training frames from which instruments and tissue are told apart
 
 
 SILHOUETTES = SilhouetteSettings()

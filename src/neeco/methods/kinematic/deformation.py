@@ -389,7 +389,7 @@ def observe_silhouettes(session: GaussianSession) -> None:
     if not session.scene.instruments:
         return
     count = len(session.views.frames)
-    sampled = {index: session.compared(index) for index in evenly_spaced(count, SILHOUETTES.sampled)}
+    sampled = {index: session.compared(index) for index in evenly_spaced(count, SILHOUETTES.n_views)}
     foreground, known = Foreground.learned(list(sampled.values())), session.silhouettes
     if foreground is None or (known is not None and foreground.noise >= known.noise):
         return
