@@ -118,6 +118,22 @@ def test_a_cell_without_an_image_says_how_to_write_the_data_set(tmp_path):
         list(video.read([7]))
 
 
+def test_images_larger_than_memory_should_hold_and_columns_without_images_are_refused(tmp_path: Path) -> None:
+    path = data_set(tmp_path, version="v2.1", embedded=True)
+    known = LeRobot()
+    video = known.open_images(path, f"episode 0/{CAMERA}")
+    assert len(list(video.read([0]))) == 1
+    known.limits = LeRobotLimits(pixels=64 * 48 - 1)
+    with pytest.raises(NeecoError, match="row 0 of episode 0: has 64x48 pixels; make it smaller"):
+        known.open_images(path, f"episode 0/{CAMERA}")
+    file = path / "data/chunk-000/episode_000001.parquet"
+    table = pyarrow.parquet.read_table(file)
+    names = pyarrow.array(["a.png"] * len(table))
+    pyarrow.parquet.write_table(table.set_column(table.column_names.index(CAMERA), CAMERA, names), file)
+    with pytest.raises(NeecoError, match=f"{CAMERA}: holds 'string', no images; name another feature"):
+        list(LeRobot().open_images(path, f"episode 1/{CAMERA}").read([0]))
+
+
 @pytest.mark.parametrize(
     ("given", "names"),
     [

@@ -297,6 +297,12 @@ def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Pat
     assert "its files are packed as a whole; unpack one with `zstd -d`" in refusal(lambda: read_arm(path))
 
 
+def test_metadata_larger_than_any_recorder_writes_is_refused(tmp_path: Path, bags: dict[str, Path]) -> None:
+    path, narrow = _copy(bags["recording-db3"], tmp_path), RosBag()
+    narrow.limits = _bagfile.BagLimits(metadata_bytes=100)
+    assert "metadata.yaml: is too large; write it anew with `ros2 bag reindex`" in refusal(lambda: narrow.streams(path))
+
+
 def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path) -> None:
     """The limit is lowered: a bomb of its real size would take seconds to make."""
     narrow = RosBag()

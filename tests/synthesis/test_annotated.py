@@ -246,7 +246,7 @@ def test_bad_input_is_told_in_one_line_and_leaves_nothing(made: Path, recorded: 
     with pytest.raises(NeecoError, match=r"instruments: rod: no joint 'jaw_angle'"):
         annotate_capture(recorded, output, capture=still)
     hidden = replace(capture, frames=(capture.frames[HIDDEN],))
-    with pytest.raises(NeecoError, match=r"--min-trust: no frame of .* is trusted by 0.8; the best by 0\.\d+"):
+    with pytest.raises(NeecoError, match=r"--min-trust: no frame of .* is trusted by 0.8; the best is by 0\.\d+"):
         annotate_capture(recorded, output, capture=hidden)
     assert not output.exists()
     with pytest.raises(NeecoError, match=r"not empty"):

@@ -104,7 +104,7 @@ def test_a_refused_resume_changes_nothing(run, tmp_path):
     for settings, told in (
         (replace(SETTINGS, seed=4), "settings.seed: begun with 3, now 4"),
         (replace(SETTINGS, states="nowhere.jsonl"), "nowhere.jsonl: no such file; --states takes"),
-        (replace(SETTINGS, count=2), "--count: .* holds more than 2 images; give more"),
+        (replace(SETTINGS, count=2), "--count: .* holds more than 2 images already"),
     ):
         with pytest.raises(NeecoError, match=told):
             synthesize(run, output, settings, resume=True)

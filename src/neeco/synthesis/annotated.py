@@ -120,7 +120,9 @@ def annotate_capture(
             on_progress(done, len(in_time))
         if not with_image(records.values()):
             best = max(record["trust"]["value"] for record in records.values())
-            raise NeecoError(f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best by {best}")
+            raise NeecoError(
+                f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best is by {best}"
+            )
     return Annotated(output, capture, [records[index] for index in sorted(records)])
 
 

@@ -115,7 +115,9 @@ def synthesize(
     info = description(run, identity, instrument_runs)
     begun = check_output(output, info, resume)
     if begun and record_path(output, settings.count).exists():
-        raise NeecoError(f"--count: {output} holds more than {settings.count} images; give more, or a new folder")
+        raise NeecoError(
+            f"--count: {output} holds more than {settings.count} images already; give more, or a new folder"
+        )
     generator = SampleGenerator.of(scene, settings, instrument_scenes)
     info["tissue_tolerance_mm"] = generator.acceptance.tolerance_mm
     if generator.gains:

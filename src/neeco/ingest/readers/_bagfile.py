@@ -71,6 +71,7 @@ class BagLimits:
     """Limits on what is read of a bag."""
 
     chunk_bytes: int = 256 << 20  # limit on the unpacked bytes of a chunk; recorders write some MiB
+    metadata_bytes: int = 16 << 20
     joints: int = 400  # limit on the joints of one topic
     bodies: int = 2000  # limit on the bodies of all transforms
     pixels: int = 90_000_000  # limit on the pixels of an image, as for files of images
@@ -184,7 +185,10 @@ def open_bag(path: Path, limits: BagLimits) -> Iterator[Bag]:
     it cannot be read, as `Bag.messages` does."""
     for file in visible_entries(path) if path.is_dir() else [path]:
         require_content(file)
-    if re.search(rb"compression_mode: [\"']?file", read_head(path / "metadata.yaml", 1 << 20), re.I):
+    metadata = path / "metadata.yaml"
+    if metadata.is_file() and metadata.stat().st_size > limits.metadata_bytes:
+        raise NeecoError(f"{metadata}: is too large; write it anew with `ros2 bag reindex`")
+    if re.search(rb"compression_mode: [\"']?file", read_head(metadata, 1 << 20), re.I):
         raise NeecoError(f"{path}: its files are packed as a whole; unpack one with `zstd -d` and give that")
     kinds = {"": DirectoryReader, ".bag": Ros1Reader, ".mcap": _McapReader, ".db3": Sqlite3Reader}
     with ExitStack() as stack:
@@ -482,6 +486,8 @@ class BagImages(VideoSource):
                         where = f"{self.path}: {self.topic}: message {number + 1}"
                         with one_line(where, "cannot be decoded", "cut it out with `rosbag filter`"):
                             pixels = decode(message)
+                        if pixels.shape[1::-1] != self.size:
+                            raise NeecoError(f"{where}: has another size than it had; do not change the bag")
                         yield numbers.pop(number), pixels
                 if numbers:
                     raise NeecoError(f"{self.path}: {self.topic}: is shorter than before; do not change the bag")

@@ -19,7 +19,7 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes
 from neeco.capture.documents import printable
-from neeco.ingest.readers import DELIMITED, MISSING, Body, RecordingFormat, Table, one_line, parse_number
+from neeco.ingest.readers import DELIMITED, MISSING, Body, RecordingFormat, Table, parse_number
 from neeco.ingest.readers.columns import UNITS, PoseColumns, canonical_unit
 
 EXPECTED = "CSV with a header line"
@@ -106,12 +106,14 @@ def read_cells(path: Path) -> Cells:
     if len(columns) * len(lines) > LIMITS.padding * int(counts.sum()) + 10**6:
         raise NeecoError(f"{path}: most lines are much shorter than the longest one; expected the rows of one table")
     is_open = any(line.count('"') % 2 for line in lines)  # a quote left open must not swallow the rest of the file
-    with one_line(path, "not readable as CSV", "repair it"):
+    try:
         frame = pandas.read_csv(
             StringIO("\n".join(lines)), sep=r"\s+" if sign == " " else sign, header=None, names=columns,
             index_col=False, dtype=str, na_filter=False, skip_blank_lines=False, low_memory=False,
             quoting=csv.QUOTE_NONE if is_open else csv.QUOTE_MINIMAL,
         )  # fmt: skip
+    except (ValueError, OverflowError) as error:
+        raise NeecoError(f"{path}: not readable as CSV ({' '.join(str(error).split())[:100]}); repair it") from None
     frame = frame.fillna("")  # where a line has fewer cells
     stripped = [cell.strip(' \t"') for cell in frame.to_numpy(object).ravel().tolist()]
     if sign in ";\t" and any("," in text for text in plain[:49]):
@@ -238,12 +240,7 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
             raise NeecoError(f"{table.path}: tool: there are no columns of tools or rigid bodies; leave it out")
         return table
     if source.tool is None and (source.position or source.rotation):
-        names = [*(source.position or ()), *(source.rotation or ()), source.state]
-        places = {table.header.index(name) for name in names if name in table.header}
-        if not any(places <= {*body.columns} for body in table.bodies):
-            what = f"{', '.join(table.header[place] for place in sorted(places))} are not all of one tool"
-            remedy = "name the tool instead, as `tool` in the recording"
-            raise NeecoError(f"{table.path}: columns: {what} (markers are no tools); {remedy}")
+        _refuse_mixed(table, source)
         return table
     wanted = None if source.tool is None else _canonical(source.tool)
     chosen = [body for body in table.bodies if wanted is None or wanted in {_canonical(body.name), *body.aliases}]
@@ -261,6 +258,17 @@ def tool_names(table: Table) -> tuple[str, ...]:
     """Return the name of each body of an export of several; () for other tables, and for NDI's with one tool."""
     single = len(table.bodies) == 1 and table.bodies[0].aliases
     return () if single else tuple(body.name for body in table.bodies)
+
+
+def _refuse_mixed(table: Table, source: PoseColumns) -> None:
+    """Raise NeecoError where the columns that the recording names are not all one tool's own."""
+    named = [*(source.position or ()), *(source.rotation or ()), *([source.state] if source.state else [])]
+    places = {name: table.header.index(name) for name in named if name in table.header}
+    owners = {name: [body.name for body in table.bodies if place in body.columns] for name, place in places.items()}
+    strangers = [name for name, bodies in owners.items() if not bodies]
+    if strangers or len({bodies[0] for bodies in owners.values()}) > 1:
+        what = f"{strangers[0]} is a marker's, no tool's" if strangers else f"{', '.join(places)} are of several tools"
+        raise NeecoError(f"{table.path}: columns: {what}; name the tool instead, as `tool` in the recording")
 
 
 def _canonical(name: str) -> str:

@@ -23,6 +23,7 @@ from PIL import Image
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
+from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
 from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, one_line
@@ -200,17 +201,22 @@ class _Stored(VideoSource):
         columns = ["episode_index", self.key]
         for part in batches(self.path, columns, self.limits, self.episode, self.limits.images_at_once):
             column = part.column(self.key)
-            with one_line(f"{self.path}: {self.key}", "holds no images", "name another feature"):
-                column = column.field("bytes") if pyarrow.types.is_struct(column.type) else column
-                cells = column.cast(pyarrow.large_binary()).to_pylist()
-            yield cells
+            if pyarrow.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0:
+                column = column.field("bytes")
+            if not (pyarrow.types.is_binary(column.type) or pyarrow.types.is_large_binary(column.type)):
+                kind = printable(str(column.type))
+                raise NeecoError(f"{self.path}: {self.key}: holds {kind}, no images; name another feature")
+            yield column.to_pylist()
 
     def _decoded(self, row: int, cell: bytes | None) -> np.ndarray:
         where = f"{self.path}: {self.key}: row {row} of episode {self.episode}"
         if cell is None:
             raise NeecoError(f"{where}: has no image in it; write the data set with its images")
         with one_line(where, "cannot be decoded", "download the episode again"):
-            pixels = np.array(Image.open(BytesIO(cell), formats=FORMATS).convert("RGB"))
+            image = Image.open(BytesIO(cell), formats=FORMATS)
+            if image.size[0] * image.size[1] > self.limits.pixels:
+                raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
+            pixels = np.array(image.convert("RGB"))
         if self.size not in ((0, 0), pixels.shape[1::-1]):
             height, width = pixels.shape[:2]
             raise NeecoError(f"{where}: is {width}x{height}, the first {self.size[0]}x{self.size[1]}; repair it")
@@ -223,10 +229,12 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.
     table = data.columns(episode, {"timestamp": 1, "frame_index": 1})
     order = np.argsort(table["frame_index"][:, 0], kind="stable")
     frames, stamps = table["frame_index"][order, 0], table["timestamp"][order, 0]
-    rows = np.arange(episode.length)
+    if len(frames) != episode.length:
+        what = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}"
+        raise NeecoError(f"{episode.data}: {what}; download the data set again")
+    rows = np.arange(len(frames))
     if not np.array_equal(frames, rows):
-        what = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}, counted by frame_index"
-        raise NeecoError(f"{episode.data}: {what} from 0; download the data set again")
+        raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")
     title = f"{data.path.name}: episode {episode.number}: its timestamps"
     if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
         return frames / data.fps, order, rows, (f"{title} do not increase; taken as {data.fps:g} a second",)

@@ -35,6 +35,7 @@ class LeRobotLimits:
     numbers: int = 4096  # limit on the numbers of one feature in a row; more are an image or a point cloud
     group_bytes: int = 1 << 30  # limit on the unpacked bytes of the columns read of a row group
     buffer_bytes: int = 1 << 20  # bytes of a column read at a time
+    pixels: int = 90_000_000  # limit on the pixels of an image, as for files of images
     images_at_once: int = 16  # images decoded at once, where Parquet holds them
     film_images: int = 10**7  # limit on the images of a video; larger timestamps are a clock's
     unit_tolerance: float = 1e-3  # tolerance of a quaternion's length and of R^T R - I: rounding of float32 and text
@@ -124,10 +125,12 @@ class DataSet:
         one."""
         if self.version == 2:
             return self._file("video_path", {**place, "video_key": key}), None
-        of_film = {name: record.get(f"videos/{key}/{name}", np.nan) for name in FILM_COLUMNS}
+        of_film = {name: record.get(f"videos/{key}/{name}") for name in FILM_COLUMNS}
         start, end = of_film["from_timestamp"], of_film["to_timestamp"]
-        if not 0 <= start < end < 1e9:  # NaN compares false
+        if None in of_film.values() or start is None or end is None:
             raise _NotThere(f"{self.path / EPISODES_3}: states no images of {printable(key)}; download it again")
+        if not 0 <= start < end < 1e9:  # NaN compares false
+            raise NeecoError(f"{self.path}: {key}: from {start:g} to {end:g} s is no part of a video; correct meta")
         return self._file("video_path", {**of_film, "video_key": key}), (start, end)
 
     def absent(self, episode: Episode) -> dict[str, str]:
