@@ -283,6 +283,7 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
             intrinsics=evidence.intrinsics[rows],
             own=views.own[rows],
             exchanged=views.exchanged[0][rows],
+            world=torch.linalg.inv(evidence.camera_from_world[rows].double()) @ views.own[rows].double(),
             distance=evidence.distance,
             width=width,
         )

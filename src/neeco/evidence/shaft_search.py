@@ -4,8 +4,10 @@ Points that lie on evidence in every frame fill the visual hull, which is far fr
 they lie along lines of sight as well. A cylinder is told from these by its silhouettes. The line through a pair of such
 points is a candidate; it gains the evidence that its silhouettes cover and loses what they cover without evidence, and
 ends where it gains most. What it gains with poses exchanged among the frames is evidence that does not move with the
-instrument, and counts against it. The best candidates are improved by random steps. A shaft leaves the image at its
-rear, so that the two directions of a line differ.
+instrument, and counts against it. The best candidates are improved by random steps.
+
+A shaft turns about its trocar, so that it moves less there than where it is seen. A line that does gains more, and its
+rear is where it moves least. Where nothing holds the shaft, that hardly prefers a line.
 
 Where no cylinder explains much of the evidence, which other instruments leave, too, or where a wrist bends the shaft in
 the tracked frame of its tip, the line is the principal axis of these points.
@@ -44,6 +46,8 @@ class ShaftSettings:
     n_steps: int = 24  # tried in a round for each candidate
     shift: float = 0.02  # standard deviation of the first steps
     turn: float = 0.08  # rad, the same of directions
+    trocar_weight: float = 0.4  # what a line that rests at a trocar gains more, as a share
+    trocar: tuple[float, float, int] = (0.4, 2.6, 12)  # from the line's origin: least, most, and how many between
 
 
 SETTINGS = ShaftSettings()
@@ -52,8 +56,7 @@ SETTINGS = ShaftSettings()
 @dataclass(frozen=True, eq=False)
 class Shaft:
     """A line in an instrument's frame: a point [3] mm, a unit direction [3], and the radius, mm; None: not known.
-    `lead`: by how much more of the evidence is explained with the tip in that direction than in the other, as a
-    share."""
+    `lead`: by how much less it moves behind its origin than ahead, as a share; negative: more."""
 
     origin: Tensor
     direction: Tensor
@@ -64,19 +67,21 @@ class Shaft:
 @dataclass(frozen=True, eq=False)
 class CylinderViews:
     """Evidence of F frames for cylinders: unit rays [F, P, 3] of the cameras, what each pixel is worth [F, P],
-    camera_from_instrument [F, 4, 4] as recorded, and with poses exchanged among the frames. `distance`: mm, that
-    settings are shares of."""
+    camera_from_instrument [F, 4, 4] as recorded, and with poses exchanged among the frames, and world_from_instrument
+    [F, 4, 4]. `distance`: mm, that settings are shares of."""
 
     rays: Tensor
     worth: Tensor
     own: Tensor
     exchanged: Tensor
+    world: Tensor
     distance: float
 
     @staticmethod
     def of(
-        *, hits: Tensor, sizes: Tensor, intrinsics: Tensor, own: Tensor, exchanged: Tensor, distance: float, width: int
-    ) -> CylinderViews:
+        *, hits: Tensor, sizes: Tensor, intrinsics: Tensor, own: Tensor, exchanged: Tensor, world: Tensor,
+        distance: float, width: int,
+    ) -> CylinderViews:  # fmt: skip
         """Reduce evidence [F, H, W] in [0, 1] of images of `sizes` [F, 2] px to about `width` pixels."""
         pool = max(1, round(hits.shape[2] / width))
         small = avg_pool2d(hits[:, None], pool)[:, 0]
@@ -89,27 +94,32 @@ class CylinderViews:
         worth = torch.where(inside & moves, small - SETTINGS.threshold, 0.0)
         count = len(hits)
         rays = normalize(rays.reshape(count, -1, 3), dim=-1)
-        return CylinderViews(rays, worth.reshape(count, -1), own, exchanged, distance)
+        return CylinderViews(rays, worth.reshape(count, -1), own, exchanged, world, distance)
 
-    def contrast(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Return what lines gain more than with exchanged poses [C] (see `gains`)."""
-        own, exchanged = (self.gains(poses, origins, directions)[0] for poses in (self.own, self.exchanged))
-        return own - exchanged
-
-    def gains(
-        self, transforms: Tensor, origins: Tensor, directions: Tensor, chunk: int = 64
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def gains(self, transforms: Tensor, origins: Tensor, directions: Tensor, chunk: int = 64) -> tuple[Tensor, Tensor]:
         """Return what the lines through origins [C, 3] along unit directions [C, 3] gain under camera_from_instrument
-        [F, 4, 4] with the best radius and tip [C], what they gain more than in the opposite direction, as a share [C],
-        and the radius [C], mm."""
+        [F, 4, 4] with the best radius and tip [C], and the radius [C], mm."""
         parts = [
             self._gains(transforms, *lines)
             for lines in zip(origins.split(chunk), directions.split(chunk), strict=True)
         ]  # fmt: skip
-        gains, leads, radii = (torch.cat(values) for values in zip(*parts, strict=True))
-        return gains, leads, radii
+        return torch.cat([gains for gains, _ in parts]), torch.cat([radii for _, radii in parts])
 
-    def _gains(self, transforms: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def about_trocar(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return by what the gains of lines [C] are multiplied, as somewhere they move less than at their origins, and
+        their leads [C] (see `Shaft`). How far a point moves is its distance from its middle, in the median frame."""
+        least, most, count = SETTINGS.trocar
+        far = torch.linspace(least, most, count, device=origins.device) * self.distance
+        places = torch.cat([-far, far.new_zeros(1), far])
+        points = (origins[:, None] + places[:, None] * directions[:, None]).to(self.world)  # [C, L, 3]
+        moved = (self.world[:, None, None, :3, :3] * points[..., None, :]).sum(-1) + self.world[:, None, None, :3, 3]
+        away = (moved - moved.median(0).values).norm(dim=-1).median(0).values.to(origins)  # [C, L] mm
+        behind, here, ahead = away[:, :count].amin(1), away[:, count], away[:, count + 1 :].amin(1)
+        rests = 1 - (torch.minimum(behind, ahead) / here.clamp_min(1e-6)).clamp_max(1.0)
+        lead = (ahead - behind) / torch.maximum(ahead, behind).clamp_min(1e-6)
+        return 1 + SETTINGS.trocar_weight * rests, lead
+
+    def _gains(self, transforms: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         rotation, shift = transforms[:, :3, :3], transforms[:, :3, 3]
         point = (rotation * origins[:, None, None]).sum(-1) + shift  # [C, F, 3]
         along = (rotation * directions[:, None, None]).sum(-1)
@@ -131,8 +141,7 @@ class CylinderViews:
         by_radius = sums.view(-1, n_radii, n_bins).cumsum(1)
         forward, backward = by_radius.cumsum(2).amax(2), by_radius.flip(2).cumsum(2).amax(2)
         gains, best = torch.maximum(forward, backward).max(1)
-        row = torch.arange(len(origins), device=origins.device)
-        return gains, (forward - backward)[row, best] / gains.clamp_min(1e-6), radii[best]
+        return gains, radii[best]
 
     def _on_rays(self, vectors: Tensor) -> Tensor:
         """Return the products [C, F, P] of vectors [C, F, 3] and the rays. Without a matrix product, whose last bits
@@ -158,10 +167,10 @@ def find_shaft(
     if not bool(apart.any()):
         return None
     origins, directions = points[firsts][apart], normalize(arms[apart], dim=1)
-    gains, _, _ = coarse.gains(coarse.own, origins, directions)
+    gains = coarse.gains(coarse.own, origins, directions)[0] * coarse.about_trocar(origins, directions)[0]
     best = gains.topk(min(settings.n_likely, len(gains))).indices
     origins, directions = origins[best], directions[best]
-    contrast = coarse.contrast(origins, directions)
+    contrast = gains[best] - coarse.gains(coarse.exchanged, origins, directions)[0]
     best = contrast.topk(min(settings.n_best, len(contrast))).indices
     origins, directions = origins[best], directions[best]
     for number in range(settings.n_rounds):
@@ -171,22 +180,26 @@ def find_shaft(
         tried = origins.repeat_interleave(settings.n_steps, 0) + settings.shift * distance * noise[:, :3]
         turned = directions.repeat_interleave(settings.n_steps, 0) + settings.turn * noise[:, 3:]
         turned = normalize(turned, dim=1)
-        gains, leads, radii = fine.gains(fine.own, tried, turned)
+        evident, radii = fine.gains(fine.own, tried, turned)
+        gains = evident * fine.about_trocar(tried, turned)[0]
         best = gains.view(-1, settings.n_steps).argmax(1)
         best += torch.arange(len(origins), device=best.device) * settings.n_steps
         best = best[gains[best].argsort(descending=True)][: max(3, len(best) // 2)]
-        origins, directions, leads, radii = tried[best], turned[best], leads[best], radii[best]
-        gained = float(gains[best[0]])
+        origins, directions, radii = tried[best], turned[best], radii[best]
+        gained = float(evident[best[0]])
     if gained < settings.least_share * float(fine.worth.clamp_min(0).sum()):
-        return _principal_axis(points, scores)
-    return Shaft(origins[0], directions[0], float(radii[0]), float(leads[0]))
+        origin, direction, radius = *_principal_axis(points, scores), None
+    else:
+        origin, direction, radius = origins[0], directions[0], float(radii[0])
+    return Shaft(origin, direction, radius, float(fine.about_trocar(origin[None], direction[None])[1]))
 
 
-def _principal_axis(points: Tensor, scores: Tensor) -> Shaft:
-    """Return the principal axis of the points [Q, 3] whose mean evidence [Q] is nearly the largest."""
+def _principal_axis(points: Tensor, scores: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the principal axis of the points [Q, 3] whose mean evidence [Q] is nearly the largest: a point on it [3],
+    and its direction [3]."""
     solid = points[scores >= SETTINGS.solid * scores.max()]
     center = solid.mean(0)
     arm = (solid - center).double()
     covariance = (arm[:, :, None] * arm[:, None, :]).sum(0)
     direction = torch.from_numpy(np.linalg.eigh(covariance.cpu().numpy())[1][:, -1].copy()).to(solid)
-    return Shaft(center, direction, None, 0.0)
+    return center, direction
