@@ -26,7 +26,7 @@ ROOMS = {
     "methods": (5061, 3500),
     "training": (2040, 1700),
     "states": (3361, 2600),
-    "evidence": (955, 1200),
+    "evidence": (962, 1200),
     "scene": (1997, 1800),
     "capture": (4972, 3900),
     "raster": (4055, 3800),

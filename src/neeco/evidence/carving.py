@@ -294,7 +294,7 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
         return None
     direction, along = shaft.direction, (points - shaft.origin) @ shaft.direction
     away = float((views.own[:, 2, :3] * direction).sum(1).mean())  # cosine to the view: tips point away from the camera
-    if shaft.lead + away < 0:
+    if (shaft.rest if abs(shaft.rest) > SHAFT.least_rest else shaft.lead + away) < 0:
         direction = -direction
     origin = shaft.origin + float((scores * along).sum() / scores.sum()) * shaft.direction
     shape = carve_along(evidence, name, frame_along(origin, direction), level, generator, settings)

@@ -6,8 +6,8 @@ points is a candidate; it gains the evidence that its silhouettes cover and lose
 ends where it gains most. What it gains with poses exchanged among the frames is evidence that does not move with the
 instrument, and counts against it. The best candidates are improved by random steps.
 
-A shaft turns about its trocar, so that it moves less there than where it is seen. A line that does gains more, and its
-rear is where it moves least. Where nothing holds the shaft, that hardly prefers a line.
+A shaft turns about its trocar, so that it moves less there than where it is seen. A line that does gains more, and the
+trocar is behind the tip. Where nothing holds the shaft, its two directions differ as it leaves the image at its rear.
 
 Where no cylinder explains much of the evidence, which other instruments leave, too, or where a wrist bends the shaft in
 the tracked frame of its tip, the line is the principal axis of these points.
@@ -47,7 +47,8 @@ class ShaftSettings:
     shift: float = 0.02  # standard deviation of the first steps
     turn: float = 0.08  # rad, the same of directions
     trocar_weight: float = 0.4  # what a line that rests at a trocar gains more, as a share
-    trocar: tuple[float, float, int] = (0.4, 2.6, 12)  # from the line's origin: least, most, and how many between
+    least_rest: float = 0.2  # share by which a line moves less at a trocar, which then tells where its rear is
+    trocar: tuple[float, float, int] = (0.4, 2.6, 12)  # from the evidence's middle: least, most, how many between
 
 
 SETTINGS = ShaftSettings()
@@ -56,12 +57,14 @@ SETTINGS = ShaftSettings()
 @dataclass(frozen=True, eq=False)
 class Shaft:
     """A line in an instrument's frame: a point [3] mm, a unit direction [3], and the radius, mm; None: not known.
-    `lead`: by how much less it moves behind its origin than ahead, as a share; negative: more."""
+    `lead`: by how much more of the evidence is explained with the tip in that direction than in the other, as a share.
+    `rest`: by how much less than where it is seen it moves at a trocar behind, as a share; negative: ahead."""
 
     origin: Tensor
     direction: Tensor
     radius: float | None
     lead: float
+    rest: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,30 +99,33 @@ class CylinderViews:
         rays = normalize(rays.reshape(count, -1, 3), dim=-1)
         return CylinderViews(rays, worth.reshape(count, -1), own, exchanged, world, distance)
 
-    def gains(self, transforms: Tensor, origins: Tensor, directions: Tensor, chunk: int = 64) -> tuple[Tensor, Tensor]:
+    def gains(
+        self, transforms: Tensor, origins: Tensor, directions: Tensor, chunk: int = 64
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return what the lines through origins [C, 3] along unit directions [C, 3] gain under camera_from_instrument
-        [F, 4, 4] with the best radius and tip [C], and the radius [C], mm."""
+        [F, 4, 4] with the best radius and tip [C], what they gain more than in the opposite direction, as a share [C],
+        and the radius [C], mm."""
         parts = [
             self._gains(transforms, *lines)
             for lines in zip(origins.split(chunk), directions.split(chunk), strict=True)
         ]  # fmt: skip
-        return torch.cat([gains for gains, _ in parts]), torch.cat([radii for _, radii in parts])
+        gains, leads, radii = (torch.cat(values) for values in zip(*parts, strict=True))
+        return gains, leads, radii
 
-    def about_trocar(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return by what the gains of lines [C] are multiplied, as somewhere they move less than at their origins, and
-        their leads [C] (see `Shaft`). How far a point moves is its distance from its middle, in the median frame."""
+    def rests(self, origins: Tensor, directions: Tensor, center: Tensor) -> Tensor:
+        """Return by how much less lines move somewhere behind than where they pass a `center` [3], as a share, negative
+        where ahead [C]. How far a point moves is its distance from its middle in the world, in the median frame."""
         least, most, count = SETTINGS.trocar
         far = torch.linspace(least, most, count, device=origins.device) * self.distance
-        places = torch.cat([-far, far.new_zeros(1), far])
-        points = (origins[:, None] + places[:, None] * directions[:, None]).to(self.world)  # [C, L, 3]
+        places = ((center - origins) * directions).sum(-1)[:, None] + torch.cat([-far, far.new_zeros(1), far])
+        points = (origins[:, None] + places[..., None] * directions[:, None]).to(self.world)  # [C, L, 3]
         moved = (self.world[:, None, None, :3, :3] * points[..., None, :]).sum(-1) + self.world[:, None, None, :3, 3]
         away = (moved - moved.median(0).values).norm(dim=-1).median(0).values.to(origins)  # [C, L] mm
-        behind, here, ahead = away[:, :count].amin(1), away[:, count], away[:, count + 1 :].amin(1)
-        rests = 1 - (torch.minimum(behind, ahead) / here.clamp_min(1e-6)).clamp_max(1.0)
-        lead = (ahead - behind) / torch.maximum(ahead, behind).clamp_min(1e-6)
-        return 1 + SETTINGS.trocar_weight * rests, lead
+        shares = 1 - away / away[:, count, None].clamp_min(1e-6)
+        behind, ahead = shares[:, :count].amax(1).clamp_min(0.0), shares[:, count + 1 :].amax(1).clamp_min(0.0)
+        return torch.where(behind >= ahead, behind, -ahead)
 
-    def _gains(self, transforms: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    def _gains(self, transforms: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         rotation, shift = transforms[:, :3, :3], transforms[:, :3, 3]
         point = (rotation * origins[:, None, None]).sum(-1) + shift  # [C, F, 3]
         along = (rotation * directions[:, None, None]).sum(-1)
@@ -141,7 +147,8 @@ class CylinderViews:
         by_radius = sums.view(-1, n_radii, n_bins).cumsum(1)
         forward, backward = by_radius.cumsum(2).amax(2), by_radius.flip(2).cumsum(2).amax(2)
         gains, best = torch.maximum(forward, backward).max(1)
-        return gains, radii[best]
+        row = torch.arange(len(origins), device=origins.device)
+        return gains, (forward - backward)[row, best] / gains.clamp_min(1e-6), radii[best]
 
     def _on_rays(self, vectors: Tensor) -> Tensor:
         """Return the products [C, F, P] of vectors [C, F, 3] and the rays. Without a matrix product, whose last bits
@@ -157,7 +164,8 @@ def find_shaft(
 ) -> Shaft | None:
     """Return the shaft of an instrument by points [Q, 3] mm on evidence, instrument frame, and their mean evidence [Q];
     None where these are no two apart. coarse, fine: the evidence for all candidates, and for the best of them."""
-    settings, distance = SETTINGS, coarse.distance
+    center = (scores[:, None] * points).sum(0) / scores.sum()
+    settings, distance, weight = SETTINGS, coarse.distance, SETTINGS.trocar_weight
     firsts, seconds = (
         torch.multinomial(scores.to(generator.device), settings.n_pairs, True, generator=generator).to(points.device)
         for _ in range(2)
@@ -167,7 +175,8 @@ def find_shaft(
     if not bool(apart.any()):
         return None
     origins, directions = points[firsts][apart], normalize(arms[apart], dim=1)
-    gains = coarse.gains(coarse.own, origins, directions)[0] * coarse.about_trocar(origins, directions)[0]
+    gains, _, _ = coarse.gains(coarse.own, origins, directions)
+    gains = gains * (1 + weight * coarse.rests(origins, directions, center).abs())
     best = gains.topk(min(settings.n_likely, len(gains))).indices
     origins, directions = origins[best], directions[best]
     contrast = gains[best] - coarse.gains(coarse.exchanged, origins, directions)[0]
@@ -180,18 +189,18 @@ def find_shaft(
         tried = origins.repeat_interleave(settings.n_steps, 0) + settings.shift * distance * noise[:, :3]
         turned = directions.repeat_interleave(settings.n_steps, 0) + settings.turn * noise[:, 3:]
         turned = normalize(turned, dim=1)
-        evident, radii = fine.gains(fine.own, tried, turned)
-        gains = evident * fine.about_trocar(tried, turned)[0]
+        evident, leads, radii = fine.gains(fine.own, tried, turned)
+        gains = evident * (1 + weight * fine.rests(tried, turned, center).abs())
         best = gains.view(-1, settings.n_steps).argmax(1)
         best += torch.arange(len(origins), device=best.device) * settings.n_steps
         best = best[gains[best].argsort(descending=True)][: max(3, len(best) // 2)]
-        origins, directions, radii = tried[best], turned[best], radii[best]
+        origins, directions, leads, radii = tried[best], turned[best], leads[best], radii[best]
         gained = float(evident[best[0]])
     if gained < settings.least_share * float(fine.worth.clamp_min(0).sum()):
-        origin, direction, radius = *_principal_axis(points, scores), None
+        origin, direction, radius, lead = *_principal_axis(points, scores), None, 0.0
     else:
-        origin, direction, radius = origins[0], directions[0], float(radii[0])
-    return Shaft(origin, direction, radius, float(fine.about_trocar(origin[None], direction[None])[1]))
+        origin, direction, radius, lead = origins[0], directions[0], float(radii[0]), float(leads[0])
+    return Shaft(origin, direction, radius, lead, float(fine.rests(origin[None], direction[None], center)))
 
 
 def _principal_axis(points: Tensor, scores: Tensor) -> tuple[Tensor, Tensor]:
