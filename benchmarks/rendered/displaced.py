@@ -194,7 +194,7 @@ class _Nodes:
 
 
 def _contact_at(trajectory: TouchedTrajectory, time: float) -> Contact | None:
-    return next((contact for contact in trajectory.contacts if contact.weight(time) > 0.2), None)
+    return next((contact for contact in trajectory.contacts if contact.weight(time) > 0.5), None)
 
 
 def _pressed(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -104,7 +104,7 @@ def ease(share: float) -> float:
 
 # of a contact's progress: when the tips are down, when they hold, and when they let go
 DOWN = {"press": (0.35, 0.65), "slide": (0.2, 0.8), "grasp": (0.2, 0.88), "pull": (0.2, 0.88)}
-HELD, RELEASED, MOVING = 0.4, 0.88, (0.4, 0.68)
+HELD, RELEASED, MOVING = 0.4, 0.93, (0.4, 0.68)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,11 +137,11 @@ class TouchedTrajectory(Trajectory):
         return travel * ease((progress - first) / (last - first))
 
     def grip(self, contact: Contact, time: float) -> float:
-        """How far the jaws hold tissue, 0 to 1; they have let go after `RELEASED` of the contact."""
+        """How far the jaws hold tissue, 0 to 1; at `RELEASED` of the contact they are half open."""
         if not self.touch.grasps:
             return 0.0
         progress = contact.progress(time)
-        return ease((progress - 0.2) / (HELD - 0.2)) * (1 - ease((progress - RELEASED) / 0.1))
+        return ease((progress - 0.2) / (HELD - 0.2)) * (1 - ease((progress - RELEASED) / 0.1 + 0.5))
 
     def _held(self, free: Moment, contact: Contact, time: float) -> Moment:
         """The moment in or near a contact."""
@@ -191,26 +191,44 @@ class TouchedTrajectory(Trajectory):
 
 
 def with_contacts(
-    free: Trajectory, place: Place, touch: Touch, train: Sequence[float], unseen: Sequence[float]
+    free: Trajectory, place: Place, touch: Touch, times: Mapping[str, Sequence[float]]
 ) -> TouchedTrajectory:
-    """A motion with contacts: some while frames to train on are taken (at the times `train`), one about the middle half
-    of the times `unseen`."""
+    """A motion with contacts: some while frames to train on are taken, and one about the middle half of the unseen
+    ones. `times`: of the frames by split."""
     own = {field.name: getattr(free, field.name) for field in fields(free)}
     trajectory = TouchedTrajectory(**own, place=place, touch=touch)
-    first, last = min(train), max(train)
-    count = max(1, min(touch.contacts, int((1 - touch.share) * (last - first) / LEAST_FREE_S)))
-    every = (last - first) / count
-    spans = [(first + (n + 0.5 - touch.share / 2) * every, touch.share * every) for n in range(count)]
-    ramps = [min(MOST_RAMP_S, 0.48 * (1 - touch.share) * every)] * count
-    if len(unseen):
-        begin, end = np.quantile(unseen, (0.25, 0.75))
-        begin, end = max(begin - 0.15, free.times[free.splits.index("unseen")] + 0.4), min(end + 0.15, free.times[-1])
-        spans.append((float(begin), float(end - begin)))
-        ramps.append(min(MOST_RAMP_S, float(begin - sum(spans[-2]) - ramps[-1])))
-    contacts = [
-        _contact(trajectory, begin, begin + length, ramp) for (begin, length), ramp in zip(spans, ramps, strict=True)
-    ]
+    spans = _spans(touch, times["train"], times["test"])
+    if len(times["unseen"]):
+        begin, end = np.quantile(times["unseen"], (0.25, 0.75))
+        begin, end = max(begin - 0.15, spans[-1][1] + 0.6), min(end + 0.15, free.times[-1])
+        spans.append((float(begin), float(end)))
+    gaps = [2 * MOST_RAMP_S, *(after - before for (_, before), (after, _) in itertools.pairwise(spans))]
+    gaps.append(2 * MOST_RAMP_S)
+    ramps = [min(MOST_RAMP_S, 0.49 * min(pair)) for pair in itertools.pairwise(gaps)]
+    contacts = [_contact(trajectory, *span, ramp) for span, ramp in zip(spans, ramps, strict=True)]
     return replace(trajectory, contacts=tuple(contacts))
+
+
+def _spans(touch: Touch, train: Sequence[float], test: Sequence[float]) -> list[tuple[float, float]]:
+    """When contacts begin and end: at regular intervals, about as many as drawn, so placed that frames to train on and
+    to test with see them in about half of their number."""
+    first, last = min(train), max(train)
+    most = max(1, int((1 - touch.share) * (last - first) / LEAST_FREE_S))
+
+    def placed(count: int, shift: float) -> list[tuple[float, float]]:
+        every, half = (last - first) / count, touch.share / 2
+        middles = [first + (n + 0.5 + shift * (1 - touch.share)) * every for n in range(count)]
+        return [(middle - half * every, middle + half * every) for middle in middles]
+
+    def cost(plan: tuple[int, float]) -> float:
+        spans = placed(*plan)
+        seen = [
+            np.mean([any(a + 0.08 * (b - a) < time < b - 0.08 * (b - a) for a, b in spans) for time in frames])
+            for frames in (train, test)
+        ]
+        return abs(seen[0] - 0.48) + abs(seen[1] - 0.5) + 0.05 * abs(plan[0] - min(touch.contacts, most))
+
+    return placed(*min(itertools.product(range(1, most + 1), (0.0, -0.15, 0.15, -0.3, 0.3)), key=cost))
 
 
 def _contact(trajectory: TouchedTrajectory, begin: float, end: float, ramp: float) -> Contact:
@@ -222,7 +240,7 @@ def _contact(trajectory: TouchedTrajectory, begin: float, end: float, ramp: floa
     seen = trajectory.splits[int(np.searchsorted(trajectory.times, begin))] != "unseen"
     most = 0.95 * (path.opening_train if seen else path.opening_most)
     rolls = path.roll_train * np.array([-0.95, -0.5, 0.0, 0.5, 0.95])
-    wrists = [width * np.array([-0.9, -0.45, 0.0, 0.45, 0.9]) for width in path.wrist_train]
+    wrists = [width * np.array([-0.8, 0.0, 0.8]) for width in path.wrist_train]
     openings = most * np.array([0.35, 0.6, 1.0]) if touch.grasps else [free.opening]
     if not seen and not touch.grasps:
         rolls = [free.roll]  # such frames are rolled farther than any that is learned from

@@ -52,8 +52,9 @@ def write_world(world: World, path: Path) -> Capture:
     spec, shots, trajectory = _visible(world, place)
     moved: dict[int, Displaced] = {}
     if world.touch is not None:
-        train, unseen = ([shot.time for shot in shots if shot.split == split] for split in ("train", "unseen"))
-        trajectory = touched = with_contacts(trajectory, place, world.touch, train, unseen)
+        splits = ("train", "test", "unseen")
+        times = {split: [shot.time for shot in shots if shot.split == split] for split in splits}
+        trajectory = touched = with_contacts(trajectory, place, world.touch, times)
         shots = [replace(shot, moment=_at(touched, shot.number)) for shot in shots]
         moved = displacements(touched, shots)
         write_json(path / "truth" / "contact.json", describe_contact(shots, moved))
