@@ -209,11 +209,19 @@ def _pressed(
     y, x = torch.meshgrid(nodes.y[rows] + carried[1], nodes.x[columns] + carried[0], indexing="ij")
     area = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
     points = torch.stack([x, y, nodes.rest[area].double()], -1).reshape(-1, 3)
-    deep = sunk(trajectory.place, moment, points.float()).view_as(x)
+    below = np.c_[tips[:, :2], trajectory.rest(tips[:, :2] - carried)]  # tips may lie between nodes
+    deep, own = sunk(trajectory.place, moment, torch.cat([points, torch.from_numpy(below)]).float()).split(
+        (len(points), len(tips))
+    )
+    deep = deep.view_as(x)
+    depth = float(own.max())
+    for tip, depth_of_tip in zip(tips, own, strict=True):
+        squared = (x - tip[0]).square() + (y - tip[1]).square()
+        deep = torch.where(squared == squared.min(), deep.clamp_min(float(depth_of_tip)), deep)
+        depth = max(depth, float(torch.where(squared < TIP**2, deep, 0.0).max()))
     pressed = torch.zeros(nodes.shape)
-    pressed[area] = deep.float()
-    near = torch.stack([(x - tip[0]).square() + (y - tip[1]).square() < TIP**2 for tip in tips]).any(0)
-    return pressed, float(torch.where(near, deep, 0.0).max())
+    pressed[area] = deep
+    return pressed, depth
 
 
 def _spread(pressed: Tensor, radius: float) -> Tensor:

@@ -16,6 +16,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
 from rendered import draws, world_capture
+from rendered.displaced import TOUCHING
 from rendered.draws import World, draw_world
 from rendered.touch import KINDS
 from rendered.world_capture import write_world
@@ -72,7 +73,7 @@ def test_the_tips_are_below_the_resting_surface_where_they_touch(captures: tuple
     depths = [entry["depth_mm"] for entry in contact.values() if entry["contact"] == "touching"]
     assert min(depths) > 0
     assert 0.5 * world.touch.depth < max(depths) < world.touch.depth + 2
-    assert all(entry["depth_mm"] == 0 for entry in contact.values() if entry["contact"] == "none")
+    assert all(entry["depth_mm"] <= TOUCHING for entry in contact.values() if entry["contact"] == "none")
 
 
 def test_the_surface_moves_near_the_instrument_and_comes_back(captures: tuple[World, Path, Path]) -> None:
