@@ -35,6 +35,8 @@ SEARCH = "import neeco.methods.kinematic.discovery as m; "
 SESSION = "import neeco.training.session as m; "
 FINISH = "import neeco.methods.kinematic.finish as m; "
 NOTHING = "lambda *_, **__: None"
+TOUCHED = "-touched"  # ends the names of worlds whose instrument touches the tissue
+Name = int | str  # of a world: its seed, or that with TOUCHED
 
 
 def always(world: World) -> bool:
@@ -190,6 +192,12 @@ def _checked_out(commit: str, folder: Path) -> Path:
     return path
 
 
+def world_of(name: Name) -> World:
+    """The world of a name."""
+    seed = str(name).removesuffix(TOUCHED)
+    return draw_world(int(seed), touched=seed != str(name))
+
+
 def worlds_of(mechanism: str, first: int, count: int) -> list[int]:
     """Seeds, from `first` on, of as many worlds that have what the mechanism works on."""
     suited = (seed for seed in itertools.count(first) if WITHOUT[mechanism].applies_to(draw_world(seed)))
@@ -197,9 +205,9 @@ def worlds_of(mechanism: str, first: int, count: int) -> list[int]:
 
 
 def run_all(
-    worlds: Mapping[int, Sequence[Build]], work: Path, options: Sequence[str], workers: int, *, quick: bool
+    worlds: Mapping[Name, Sequence[Build]], work: Path, options: Sequence[str], workers: int, *, quick: bool
 ) -> None:
-    """Run what is not there yet: `worlds` has the builds by seed. Says each result as it comes."""
+    """Run what is not there yet: `worlds` has the builds by name. Says each result as it comes."""
     jobs = [
         (build, seed)
         for seed, builds in worlds.items()
@@ -224,12 +232,12 @@ def run_all(
             print(f"{count} of {len(jobs)}, {left / 60:.0f} min left: world {seed}, {build.title}: {score}", flush=True)
 
 
-def result_path(work: Path, title: str, seed: int) -> Path:
+def result_path(work: Path, title: str, seed: Name) -> Path:
     """Where the result of a job lies."""
     return work / "results" / _name(title) / f"{seed}.json"
 
 
-def run_path(work: Path, title: str, seed: int) -> Path:
+def run_path(work: Path, title: str, seed: Name) -> Path:
     """The run folder of a job."""
     return work / "runs" / _name(title) / str(seed)
 
@@ -238,12 +246,12 @@ def _name(title: str) -> str:
     return "here" if title == "." else re.sub(r"[^\w.-]+", "-", title).strip("-")
 
 
-def capture_path(work: Path, seed: int) -> Path:
+def capture_path(work: Path, seed: Name) -> Path:
     """Where a world lies."""
     return work / "worlds" / str(seed)
 
 
-def _drawn(seed: int, work: Path, quick: bool) -> str | None:
+def _drawn(seed: Name, work: Path, quick: bool) -> str | None:
     """Draw a world where it is absent; return why it cannot be drawn."""
     torch.set_num_threads(1)
     path = capture_path(work, seed)
@@ -251,14 +259,14 @@ def _drawn(seed: int, work: Path, quick: bool) -> str | None:
         return None
     shutil.rmtree(path, ignore_errors=True)
     try:
-        world = draw_world(seed)
+        world = world_of(seed)
         write_world(replace(world, size=SIZES[0], scale=1.0) if quick else world, path)
     except NeecoError as error:
         return str(error)
     return None
 
 
-def _run(build: Build, seed: int, work: Path, options: tuple[str, ...]) -> dict[str, Any]:
+def _run(build: Build, seed: Name, work: Path, options: tuple[str, ...]) -> dict[str, Any]:
     """One job; writes and returns its result."""
     capture, run = capture_path(work, seed), run_path(work, build.title, seed)
     world = read_json(capture / "world.json")

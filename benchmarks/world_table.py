@@ -105,7 +105,7 @@ def table_of(by_build: dict[str, list[Result]]) -> str:
     return "\n".join(lines)
 
 
-def ablations_of(reference: dict[int, Result], without: dict[str, dict[int, Result]]) -> str:
+def ablations_of(reference: dict[int | str, Result], without: dict[str, dict[int | str, Result]]) -> str:
     """Markdown: a row for each mechanism, over the worlds it applies to, the largest gain first. Results by seed: of
     the build that has all, and of those that lack one mechanism each."""
     rows = []
@@ -202,7 +202,7 @@ def worst_of(results: Sequence[Result], count: int) -> str:
     return "\n".join(lines)
 
 
-def pictures_of(seed: int, capture: Path, runs: dict[str, Path], path: Path, frames: int = 4) -> None:
+def pictures_of(seed: int | str, capture: Path, runs: dict[str, Path], path: Path, frames: int = 4) -> None:
     """Write a sheet of held-out frames at given poses, a row a build: outlines of truth (green) and label (magenta)."""
     import torch
     from PIL import Image, ImageDraw

@@ -1,7 +1,7 @@
 """A random world: one capture's properties, each drawn from a stated distribution, and the scene that they make.
 
-`draw_world(seed)` draws; `World.scene()` and `World.place()` say what to render. Lengths mm, angles rad unless named.
-Two worlds of one seed are equal.
+`draw_world(seed)` draws, `touched` the same world with contact (`touch.py`); `World.scene()` and `World.place()` say
+what to render. Lengths mm, angles rad unless named. Two worlds of one seed are equal.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from rendered.motion import Path
 from rendered.render import Lamps, Lens, Place
 from rendered.scenes import DEGREE, Joint, Mount, SceneSpec
 from rendered.tissue import ORGANS, Tissue
+from rendered.touch import Touch, draw_touch
 from rendered.wristed import Encoders, WristedDesign
 
 Triple = tuple[float, float, float]
@@ -109,10 +110,14 @@ class World:
     frame_off: float  # mm along the shaft, of stated links in the tracked frame
     # how it is trained
     scale: float  # --scale
+    touch: Touch | None = None  # how the instrument touches the tissue, where it does
 
     def describe(self) -> dict[str, Any]:
         """world.json."""
-        return {"schema": "neeco-world/1", **asdict(self)}
+        own = asdict(self)
+        if self.touch is None:
+            del own["touch"]
+        return {"schema": "neeco-world/1", **own}
 
     @property
     def lens(self) -> Lens:
@@ -228,8 +233,8 @@ class World:
         return Design(hinge=3.0 * self.radius, collar=2.2 * self.radius, **common)
 
 
-def draw_world(seed: int) -> World:
-    """The world of a seed."""
+def draw_world(seed: int, *, touched: bool = False) -> World:
+    """The world of a seed; touched: its instrument touches the tissue, all else is the same."""
     rng = np.random.default_rng((seed, 11))
 
     def one_of(choices: Any, shares: Any = None) -> Any:
@@ -279,7 +284,9 @@ def draw_world(seed: int) -> World:
         base=float(one_of((1.0, 4.0))) if states == "encoders" else 0.0,
         frame_off=0.0,
     )
-    return replace(world, frame_off=float(one_of((0.0, -8.0, 8.0)))) if world.links == "off" else world
+    if world.links == "off":
+        world = replace(world, frame_off=float(one_of((0.0, -8.0, 8.0))))
+    return replace(world, touch=draw_touch(seed, kind != "straight")) if touched else world
 
 
 def recoloured(tissue: Tissue, color: Triple, contrast: float, wet: float) -> Tissue:

@@ -109,6 +109,15 @@ class Design:
             radii.append(torch.full((9,), 0.6 * gap + max(blade.half_x) + max(blade.half_y) + slack))
         return torch.cat(centers), torch.cat(radii)
 
+    def tips(self, opening: float) -> Tensor:
+        """Middles [2, 3] of the ends of both jaws, mechanical frame."""
+        ends = []
+        for blade, angle in zip(self.jaws, self.jaw_angles(opening), strict=True):
+            x = blade.shift_x * blade.half_x[1] / blade.half_x[0] + blade.bend_x
+            y = blade.shift_y * blade.half_y[1] / blade.half_y[0] + blade.bend_y
+            ends.append(turn_x(torch.tensor([[x, y, blade.length]]), angle) + torch.tensor([0.0, 0.0, self.hinge]))
+        return torch.cat(ends)
+
     def jaw_angles(self, opening: float) -> tuple[float, float]:
         """rad about +x by which the jaws stand from the wrist: a positive turn takes z towards -y, so that the first
         turns by minus its share."""

@@ -87,7 +87,7 @@ class Trajectory:
         opening, roll = float(self._opening(time)), float(self._roll(time))
         return Moment(
             look(center, target, self.path.camera_roll),
-            _aim(np.array(self.path.trocar), hinge, self.path.roll_middle + roll, self.hinge_mm),
+            aim(np.array(self.path.trocar), hinge, self.path.roll_middle + roll, self.hinge_mm),
             opening,
             roll,
             hinge,
@@ -202,7 +202,7 @@ def look(center: Array, target: Array, roll: float) -> Array:
     return rigid(np.stack([np.cross(down, forward), down, forward], -1), center)
 
 
-def _aim(trocar: Array, hinge: Array, roll: float, hinge_mm: float) -> Array:
+def aim(trocar: Array, hinge: Array, roll: float, hinge_mm: float) -> Array:
     """Pose [4, 4] of the mechanical frame of an instrument through `trocar` whose hinge is at `hinge`."""
     z = _unit(hinge - trocar)
     x = _unit(np.cross(np.array([0.0, 0.0, 1.0]), z))

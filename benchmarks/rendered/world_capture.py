@@ -15,6 +15,7 @@ from state_errors import USUAL, with_errors, with_outliers
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_json
 from neeco.capture import Capture, Frame, InstrumentState, evenly_spaced, write_capture
+from rendered.displaced import Displaced, describe_contact, describe_points, displaced, displacements
 from rendered.draws import World
 from rendered.exposure import meter
 from rendered.frames import (
@@ -30,6 +31,7 @@ from rendered.motion import Array, Moment, Trajectory, is_unseen, plan, rigid
 from rendered.points import PointSampler
 from rendered.render import Lens, Place, meet_instrument, view_of
 from rendered.scenes import SceneSpec
+from rendered.touch import with_contacts
 from rendered.truth import World as TrueWorld
 from rendered.truth import truth_document
 from rendered.writing import LEAST_GAP_MM, SEEN, UNSEEN, clearance, recorded
@@ -48,6 +50,16 @@ def write_world(world: World, path: Path) -> Capture:
         raise NeecoError(f"{path}: already holds a capture; choose another folder")
     place = world.place()
     spec, shots, trajectory = _visible(world, place)
+    moved: dict[int, Displaced] = {}
+    if world.touch is not None:
+        splits = ("train", "test", "unseen")
+        times = {split: [shot.time for shot in shots if shot.split == split] for split in splits}
+        trajectory = touched = with_contacts(trajectory, place, world.touch, times)
+        shots = [replace(shot, moment=_at(touched, shot.number)) for shot in shots]
+        moved = displacements(touched, shots)
+        write_json(path / "truth" / "contact.json", describe_contact(shots, moved))
+        points = describe_points(touched, shots, moved, spec.world_from_scene())
+        write_json(path / "truth" / "points.json", points)
     exposure = meter(place, _thinned(trajectory, shots)) if world.automatic else None
     gains = {}
     for index, shot in enumerate(shots):
@@ -60,6 +72,9 @@ def write_world(world: World, path: Path) -> Capture:
     generator = np.random.default_rng((world.seed, 1))
     sampler = PointSampler(len(shots), generator)
     for shot in shots:
+        if moved:
+            tissue = displaced(place.tissue, moved[shot.number])
+            renderer = replace(renderer, place=replace(place, tissue=tissue))
         rendered = renderer.render(shot)
         sampler.take(shot.moment, rendered.drawing, rendered.pixels, world.lens)
     true = TrueWorld(spec, shots)

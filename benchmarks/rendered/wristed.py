@@ -41,6 +41,10 @@ class WristedDesign(Design):
         wrist = torch.full((5,), end / 8 + self.wrist_radius + 1.5)
         return self._about_pitch(torch.cat([middle, centers]), bend.pitch), torch.cat([wrist, radii])
 
+    def tips(self, bend: Bend) -> Tensor:
+        """Middles [2, 3] of the ends of both jaws, mechanical frame."""
+        return self._about_pitch(super().tips(bend), bend.pitch)
+
     def jaw_angles(self, bend: Bend) -> tuple[float, float]:
         """rad about +x by which the jaws stand from the clevis."""
         first, second = self.shares
