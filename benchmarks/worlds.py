@@ -96,7 +96,6 @@ def main() -> int:
         print(f"{arguments.output}: {len(capture.frames)} frames")
         return 0
     first = fresh_seed() if arguments.seed == "fresh" else int(arguments.seed)
-
     ending = TOUCHED if arguments.touched else ""
 
     def name_of(seed: int) -> Name:

@@ -44,6 +44,13 @@ class Displaced:
         """The largest displacement, mm."""
         return float(self.values.norm(dim=0).max())
 
+    def whole(self, size: int) -> Tensor:
+        """The displacement [3, size, size] of all nodes, 0 beyond those that move."""
+        (top, left), (_, high, wide) = self.corner, self.values.shape
+        whole = torch.zeros(3, size, size)
+        whole[:, top : top + high, left : left + wide] = self.values
+        return whole
+
 
 def displacements(trajectory: TouchedTrajectory, shots: list[Shot]) -> dict[int, Displaced]:
     """What the tissue does in each frame of a motion, by the frame's number.
@@ -86,9 +93,7 @@ def displaced(tissue: Tissue, change: Displaced) -> Tissue:
     first = (moved.amin(0) - margin).clamp_min(0) + torch.tensor(change.corner)
     last = (moved.amax(0) + margin + 1 + torch.tensor(change.corner)).clamp_max(size)
     rows, columns = (slice(int(a), int(b)) for a, b in zip(first, last, strict=True))
-    whole = torch.zeros(3, size, size)
-    (top, left), (_, high, wide) = change.corner, change.values.shape
-    whole[:, top : top + high, left : left + wide] = change.values
+    whole = change.whole(size)
     # where what lies at a place has come from: x with x + shift(x) the place
     y, x = torch.meshgrid(_axis(size)[rows], _axis(size)[columns], indexing="ij")
     place = torch.stack([x, y])
@@ -150,10 +155,7 @@ def describe_points(
     rotation, size = world_from_scene[:3, :3], tissue.height.shape[0]
     moved = []
     for shot in shots:
-        (top, left), values = found[shot.number].corner, found[shot.number].values
-        whole = torch.zeros(3, size, size)
-        whole[:, top : top + values.shape[1], left : left + values.shape[2]] = values
-        own = _sampled(whole, torch.stack([x, y])[:, None])[:, 0].T.double().numpy()
+        own = _sampled(found[shot.number].whole(size), torch.stack([x, y])[:, None])[:, 0].T.double().numpy()
         moved.append((own @ rotation.T).round(4).tolist())
     return {
         "units": "mm",

@@ -276,6 +276,7 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
     if int((scores > level).sum()) < CARVING.min_solid_points:
         return None
     rows = torch.tensor(evenly_spaced(len(evidence.frames), SHAFT.n_frames), device=evidence.device)
+    world = torch.linalg.inv(evidence.camera_from_world[rows].double()) @ views.own[rows].double()
     coarse, fine = (
         CylinderViews.of(
             hits=evidence.hits[rows],
@@ -283,7 +284,7 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
             intrinsics=evidence.intrinsics[rows],
             own=views.own[rows],
             exchanged=views.exchanged[0][rows],
-            world=torch.linalg.inv(evidence.camera_from_world[rows].double()) @ views.own[rows].double(),
+            world=world,
             distance=evidence.distance,
             width=width,
         )

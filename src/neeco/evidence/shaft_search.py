@@ -204,8 +204,7 @@ def find_shaft(
 
 
 def _principal_axis(points: Tensor, scores: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the principal axis of the points [Q, 3] whose mean evidence [Q] is nearly the largest: a point on it [3],
-    and its direction [3]."""
+    """Return a point [3] and the direction [3] of the principal axis of points [Q, 3] with nearly the most evidence."""
     solid = points[scores >= SETTINGS.solid * scores.max()]
     center = solid.mean(0)
     arm = (solid - center).double()
