@@ -213,7 +213,7 @@ def test_the_format_is_that_of_the_ending(tmp_path: Path, capsys: pytest.Capture
     for name, begin in (("a.spz", b"\x1f\x8b"), ("a.usdc", b"PXR-USDC"), ("a.PLY", b"ply"), ("a", b"ply")):
         assert main(["export", str(run), "--output", str(tmp_path / name)]) == 0
         assert (tmp_path / name).read_bytes().startswith(begin)
-    for words, ends in ((["b.splat"], ".ply or .spz or .usdc"), (["b.ply", "--format", "spz"], ".spz")):
+    for words, ends in ((["b.splat"], ".ply or .spz or .usdc or .glb"), (["b.ply", "--format", "spz"], ".spz")):
         assert main(["export", str(run), "--output", *words]) == 1
         assert f"--output: {words[0]}: wrong file name extension; use {ends}\n" in capsys.readouterr().err
 

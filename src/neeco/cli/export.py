@@ -11,25 +11,24 @@ import tyro
 from neeco.base.errors import NeecoError
 from neeco.base.settings import Device
 
-Format = Literal["ply", "spz", "usdc"]
+Format = Literal["ply", "spz", "usdc", "glb"]
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write a run's scene in one state as a file that other viewers of Gaussians open. They know neither joints nor
-    lamps nor labels: nothing moves there, and the light is that of one camera."""
+    """Write a run's scene for other viewers, in the light of one camera: in one state, or (glb) moving."""
 
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote."""
     format: Format | None = None
     """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser. usdc: OpenUSD (needs the
-    extra usd). Default: as --output ends, else ply."""
+    extra usd). glb: glTF, a node for every part, recorded states as animation. Default: as --output ends, or ply."""
     output: Path | None = None
-    """File to write, .ply, .spz or .usdc. Default: scene.ply (.spz, .usdc) in the run folder."""
+    """File to write, .ply, .spz, .usdc or .glb. Default: scene.ply (or as --format) in the run folder."""
     frame: int = 0
     """Number of the frame, of those trained on, whose state and light are taken."""
     states: Path | None = None
-    """The first state of this states.jsonl instead, in the light of its own camera where it names one."""
+    """The first state of this states.jsonl instead (glb: all), in the light of its own camera where it names one."""
     device: Device = "auto"
 
 
@@ -38,6 +37,7 @@ def run(arguments: Arguments) -> int:
     from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run
+    from neeco.viewer.gltf import exported_states, write_glb
     from neeco.viewer.splats import exported_state, require_usd, splats_of, write_splats, write_usd
 
     format = arguments.format or "ply"
@@ -53,11 +53,13 @@ def run(arguments: Arguments) -> int:
         frames = len(scene.recorded.states)
         if not 0 <= arguments.frame < frames:
             raise NeecoError(f"--frame: {arguments.frame}: the scene was trained on frames 0 to {frames - 1}")
-        splats = splats_of(scene, *exported_state(scene, arguments.frame, arguments.states))
-    output = arguments.output or arguments.run / f"scene.{format}"
-    if format == "usdc":
-        write_usd(splats, output)
-    else:
-        write_splats(splats, output, format)
-    print(f"{output}: {len(splats.means):,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, without joints and labels")
+        state, camera = exported_state(scene, arguments.frame, arguments.states)
+        output = arguments.output or arguments.run / f"scene.{format}"
+        if format == "glb":
+            note = write_glb(scene, exported_states(scene, state, arguments.states), camera, output)
+        else:
+            note = "without joints and labels"
+            splats = splats_of(scene, state, camera)
+            write_usd(splats, output) if format == "usdc" else write_splats(splats, output, format)
+    print(f"{output}: {scene.num_gaussians:,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, {note}")
     return 0

@@ -71,8 +71,7 @@ class Recorded:
         return cls(names, splits, tuple(states), cameras, lens=lens, scale=scale, still=still)
 
     def as_fitted(self, capture: Capture) -> Capture:
-        """Return `capture`, which the scene learned from, with the states of training frames as fitted to their images,
-        where they were."""
+        """Return `capture`, which the scene learned from, with training frames' states as fitted to their images."""
         fitted = dict(zip(self.names, self.states, strict=True))
         frames = []
         for frame in capture.frames:
@@ -98,8 +97,7 @@ class Recorded:
         return replace(capture, frames=tuple(frames))
 
     def with_unrecorded(self, state: State, instruments: Sequence[Instrument]) -> State:
-        """Return `state` with the unrecorded joints of `instruments`, interpolated from the training frames nearest to
-        it by pose and time."""
+        """Return `state` with the unrecorded joints of `instruments`, interpolated from the nearest training frames."""
         if not any(item.unrecorded for item in instruments) or not self.states:
             return state
         filled = dict(state.instruments)
@@ -157,6 +155,7 @@ class ArticulatedMotion:
     log_scales: Tensor  # [N, 3], as rendered
     amounts: Tensor  # [N, A, 2] rad or mm by which axis a moves a Gaussian: at a reading of 0, and per unit of it
     axes: tuple[tuple[JointMotion, ...], ...]  # of every moving instrument, in the order in which they move
+    links: tuple[tuple[Tensor, Tensor], ...] = ()  # of every instrument: weights [M, L], links' amounts [L, A, 2]
 
 
 class DrawableScene(Protocol):

@@ -69,17 +69,22 @@ def exported_state(scene: GaussianScene, frame: int, states: Path | None) -> tup
 def splats_of(scene: GaussianScene, state: State, camera: Camera) -> Splats:
     """The scene in `state`, lit as `camera` has it."""
     posed = shadowed(scene.at(state), camera, depth_maps)
-    sh = _in_world(posed)
-    if posed.headlight is not None:
-        view = camera.world_from_camera.to(posed.means)
-        in_camera = (posed.means - view[:3, 3]) @ view[:3, :3]
-        sh = brightened(sh, headlight_factor(posed.headlight, camera, in_camera)[:, None, None])
+    sh = lit_harmonics(replace(posed, sh=_in_world(posed)), camera)
     opacities = posed.opacities.clamp(1e-6, 1 - 1e-6)
     scales = posed.scales.clamp_min(MIN_SCALE).log()
     tensors = (posed.means, normalize(posed.quats, dim=1), scales, torch.logit(opacities), sh)
     if not all(bool(tensor.isfinite().all()) for tensor in tensors):
         raise NeecoError("the scene's Gaussians are not finite in this state; give another state, or train again")
     return Splats(*(tensor.float().cpu().numpy() for tensor in tensors))
+
+
+def lit_harmonics(posed: Gaussians, camera: Camera) -> Tensor:
+    """Return the harmonics [N, K, 3] with the light that `camera` carries baked in."""
+    if posed.headlight is None:
+        return posed.sh
+    view = camera.world_from_camera.to(posed.means)
+    in_camera = (posed.means - view[:3, 3]) @ view[:3, :3]
+    return brightened(posed.sh, headlight_factor(posed.headlight, camera, in_camera)[:, None, None])
 
 
 def write_splats(splats: Splats, path: Path, format: Format) -> None:

@@ -219,8 +219,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return labels
 
     def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
-        """Return the change from canonical to posed; 0 for tissue, so that the thresholds of the paper's labels
-        separate exactly."""
+        """Return the change from canonical to posed; 0 for tissue, so that the paper's thresholds separate exactly."""
         deltas = super().deltas(canonical, state)
         tissue = canonical.body(0)
         for tensor in (deltas.means, deltas.quats, deltas.scales):
@@ -242,10 +241,11 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
 
     def motion(self, canonical: CanonicalGaussians) -> ArticulatedMotion:
         log_scales = canonical.log_scales.clone()
-        axes, moved = [], []
+        axes, moved, links = [], [], []
         for index, articulation in enumerate(self.articulations):
             rows = canonical.body(index + 1)
             weights = self.link_weights(canonical, index)
+            links.append((weights, articulation.motion(torch.eye(weights.shape[1], device=weights.device))[1]))
             if articulation.jointed:
                 log_scales[rows] = torch.minimum(log_scales[rows], articulation.longest(weights).log())
             own, amounts = articulation.motion(weights)
@@ -255,7 +255,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         amounts = canonical.means.new_zeros(len(canonical), most, 2)
         for rows, own_amounts in moved:
             amounts[rows, : own_amounts.shape[1]] = own_amounts
-        return ArticulatedMotion(log_scales, amounts, tuple(axes))
+        return ArticulatedMotion(log_scales, amounts, tuple(axes), tuple(links))
 
     @classmethod
     def combined(cls, deformations: Sequence[Deformation]) -> Kinematic:
