@@ -66,7 +66,7 @@ def test_nothing_is_said_of_images_without_an_instrument() -> None:
 
 
 def test_labels_of_pixels_that_tell_nothing_are_less_certain() -> None:
-    """Off outlines, most of these are shadows and fringes; at outlines they show what covers them by half."""
+    """At outlines they show what covers them by half; elsewhere, with nothing certain nearby, either is as likely."""
     views = [view(SHAFT, seed) for seed in range(3)]
     foreground = Foreground.learned(views)
     assert foreground is not None
@@ -78,7 +78,25 @@ def test_labels_of_pixels_that_tell_nothing_are_less_certain() -> None:
         assert partly[:2].tolist() == [0, 0]
         assert partly.sum() == pytest.approx(certain[[0, 2, 3]].sum())
         shares.append(partly[3] / partly.sum())
-    assert shares == pytest.approx([0.2, 0.8, 0.4])
+    assert shares == pytest.approx([0.2, 0.8, 0.5])
+
+
+def test_labelled_pixels_that_tell_nothing_show_what_certain_ones_nearby_do() -> None:
+    views = [view(SHAFT, seed) for seed in range(3)]
+    foreground = Foreground.learned(views)
+    assert foreground is not None
+    ratio = foreground.ratio.copy()
+    ratio[-1, 0] = 0  # of the largest residual and the darkest shade
+    foreground = replace(foreground, ratio=ratio)
+    shares = []
+    for column in (60, 20):  # in the shaft, and in labelled tissue
+        wide = view(slice(10, SHAFT.stop), 0)
+        both = label_counts(wide, foreground)
+        residual, shade, block = wide.residual.copy(), wide.shade.copy(), (slice(40, 43), slice(column, column + 3))
+        residual[block], shade[block] = 10.0, 0.0
+        unsure = label_counts(replace(wide, residual=residual, own=residual, shade=shade), foreground)
+        shares.append((unsure[3] - both[3]) / 9)
+    assert shares == pytest.approx([1, 0], abs=0.05)
 
 
 def test_highlights_apart_from_the_instrument_are_no_unlabelled_part_of_it() -> None:

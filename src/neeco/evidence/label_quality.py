@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,7 +24,7 @@ class QualitySettings:
     reach: float = 0.2  # of the images' width: how far from a rendered instrument one may show that is not labelled
     labelled: float = 0.5  # rendered share of a pixel from which it is labelled
     certain: float = 0.25  # certainty from which a pixel counts
-    unknown: float = 0.4  # share of labelled pixels, of which nothing is certain off outlines, that show an instrument
+    nearby: float = 0.02  # of the images' width: how far certain pixels tell what uncertain ones show
     least_body: float = 0.25  # of an image's largest body in area: an unlabelled smaller one is a highlight or a shadow
     least_iou: float = 0.8  # estimated, below which labels are doubtful
     least_recall: float = 0.9  # the same of the recall
@@ -77,7 +78,8 @@ def learned_foreground(scene: GaussianScene, frames: Sequence[Frame]) -> Foregro
 def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     """Count pixels of a view [4]: certain instrument that is labelled, that is not, and of the other labelled pixels
     tissue, and instrument. Of those that are neither for certain, each counts as both: at outlines, as an instrument by
-    how near it is to being covered by half. Certain instrument is no isolated patch: see `least_body`."""
+    how near it is to being covered by half, elsewhere by the share of instrument among certain pixels nearby. Certain
+    instrument is no isolated patch: see `least_body`."""
     certainty, label = foreground.certainty(view, QUALITY.reach), view.usable & (view.label > QUALITY.labelled)
     instrument, tissue = certainty > QUALITY.certain, certainty < -QUALITY.certain
     across = np.ones((2 * foreground.settings.outline_px + 1,) * 2, np.uint8)  # outlines do not divide a body
@@ -87,7 +89,9 @@ def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     shown[bodies[instrument & label]] = True
     missed = instrument & ~label & shown[bodies]
     share = view.covered / foreground.settings.covered
-    share = np.where(tissue, 0, np.where(share > 1, QUALITY.unknown, share))
+    window = (2 * math.ceil(QUALITY.nearby * label.shape[1]) + 1,) * 2
+    near_instrument, near_tissue = (1e-6 + cv2.blur(kind.astype(float), window) for kind in (instrument, tissue))
+    share = np.where(tissue, 0, np.where(share > 1, near_instrument / (near_instrument + near_tissue), share))
     other = share[label & ~instrument]
     return np.array([(instrument & label).sum(), missed.sum(), (1 - other).sum(), other.sum()])
 
