@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neeco.evidence.foreground import Comparison, Foreground
-from neeco.evidence.label_quality import label_counts, quality_of
+from neeco.evidence.label_quality import LabelQuality, label_counts, quality_of
 
 HEIGHT, WIDTH = 96, 128
 SHAFT = slice(50, 74)  # columns
@@ -42,7 +42,7 @@ def test_the_estimated_iou_of_labels_is_near_the_true_one(label: slice, dark: bo
     views = [view(label, seed, dark=dark) for seed in range(3)]
     foreground = Foreground.learned(views)
     assert foreground is not None
-    quality = quality_of(sum((label_counts(shown, foreground) for shown in views), np.zeros(4)))
+    quality = quality_of([label_counts(shown, foreground) for shown in views])
     assert quality is not None
     missed = label.start >= SHAFT.start and label.stop <= SHAFT.stop
     assert quality.iou == pytest.approx(
@@ -55,7 +55,7 @@ def test_labels_that_leave_out_a_dark_shaft_are_doubtful_and_right_ones_are_not(
         views = [view(label, seed, dark=True) for seed in range(3)]
         foreground = Foreground.learned(views)
         assert foreground is not None
-        quality = quality_of(sum((label_counts(shown, foreground) for shown in views), np.zeros(4)))
+        quality = quality_of([label_counts(shown, foreground) for shown in views])
         assert quality is not None
         assert (quality.doubt is not None) == doubtful
 
@@ -66,7 +66,7 @@ def test_nothing_is_said_of_images_without_an_instrument() -> None:
 
 
 def test_labels_of_pixels_that_tell_nothing_are_less_certain() -> None:
-    """Off outlines, most of these are shadows and fringes; at outlines they show what covers them by half."""
+    """At outlines they show what covers them by half; elsewhere, with nothing certain nearby, either is as likely."""
     views = [view(SHAFT, seed) for seed in range(3)]
     foreground = Foreground.learned(views)
     assert foreground is not None
@@ -78,4 +78,48 @@ def test_labels_of_pixels_that_tell_nothing_are_less_certain() -> None:
         assert partly[:2].tolist() == [0, 0]
         assert partly.sum() == pytest.approx(certain[[0, 2, 3]].sum())
         shares.append(partly[3] / partly.sum())
-    assert shares == pytest.approx([0.2, 0.8, 0.4])
+    assert shares == pytest.approx([0.2, 0.8, 0.5])
+
+
+def test_labelled_pixels_that_tell_nothing_show_what_certain_ones_nearby_do() -> None:
+    views = [view(SHAFT, seed) for seed in range(3)]
+    foreground = Foreground.learned(views)
+    assert foreground is not None
+    ratio = foreground.ratio.copy()
+    ratio[-1, 0] = 0  # of the largest residual and the darkest shade
+    foreground = replace(foreground, ratio=ratio)
+    shares = []
+    for column in (60, 20):  # in the shaft, and in labelled tissue
+        wide = view(slice(10, SHAFT.stop), 0)
+        both = label_counts(wide, foreground)
+        residual, shade, block = wide.residual.copy(), wide.shade.copy(), (slice(40, 43), slice(column, column + 3))
+        residual[block], shade[block] = 10.0, 0.0
+        unsure = label_counts(replace(wide, residual=residual, own=residual, shade=shade), foreground)
+        shares.append((unsure[3] - both[3]) / 9)
+    assert shares == pytest.approx([1, 0], abs=0.05)
+
+
+def test_highlights_apart_from_the_instrument_are_no_unlabelled_part_of_it() -> None:
+    views = [view(SHAFT, seed) for seed in range(3)]
+    foreground = Foreground.learned(views)
+    assert foreground is not None
+    right = label_counts(views[0], foreground)
+    for rows, part_of_it in ((slice(20, 32), False), (slice(0, 80), True)):
+        residual, shade = views[0].residual.copy(), views[0].shade.copy()
+        residual[rows, 30:42], shade[rows, 30:42] = residual[rows, SHAFT][:, :12], shade[rows, SHAFT][:, :12]
+        missed = label_counts(replace(views[0], residual=residual, own=residual, shade=shade), foreground)[1]
+        assert (missed > right[1] + 100) == part_of_it
+
+
+def test_labels_lost_in_one_image_are_doubtful_though_it_shows_little_of_the_instrument() -> None:
+    right, lost = np.array([4000.0, 0, 0, 0]), np.array([100.0, 300, 0, 0])
+    quality = quality_of([right, right, right, lost])
+    assert quality is not None
+    assert quality.recall == pytest.approx(0.8125)
+    assert quality.doubt is not None
+    assert quality_of([np.array([0.0, 0, 50, 0])]) is None
+
+
+def test_labels_that_leave_out_an_eighth_of_the_instrument_are_doubtful_however_precise() -> None:
+    assert LabelQuality(0.875, 1.0).doubt is not None
+    assert LabelQuality(0.92, 0.95).doubt is None

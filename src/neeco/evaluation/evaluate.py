@@ -116,7 +116,7 @@ class _Tally:
     parts: PartTally
     rows: list[dict[str, Any]] = field(default_factory=list)  # of every frame: its name, fit and scores
     scores: list[dict[str, float | None]] = field(default_factory=list)
-    counts: np.ndarray = field(default_factory=lambda: np.zeros(4))  # of `label_counts`, over all frames
+    counts: list[np.ndarray] = field(default_factory=list)  # of `label_counts`, by frame
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
             row["world_from_instrument"] = {name: item.pose.tolist() for name, item in state.instruments.items()}
         if context.foreground is not None and is_gaussian(scene):
             view = Comparison.of(scene, state, scene.recorded.as_learned(camera), target, mask)
-            tally.counts += label_counts(view, context.foreground)
+            tally.counts.append(label_counts(view, context.foreground))
         drawing = draw(scene, state, camera)
         image = drawing.image
         shadow = true_shadow

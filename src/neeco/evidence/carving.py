@@ -10,7 +10,6 @@ the shaft's axis (which need not be the sensor's z), the tip, and seeds for the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -134,7 +133,12 @@ def gather_evidence(
     hits: list[Tensor] = []
     without_shadows: list[Tensor] = []
     depths: list[Tensor] = []
-    exposure = _exposure(views, picked)
+    means = []  # brightness of images, without what masks leave out
+    for index in picked:
+        image, mask = views.target(index), views.mask(index)
+        counted = image if mask is None else image[mask]
+        means += [float(counted.mean())] if counted.numel() else []
+    exposure = min(1.0, max(sum(means) / max(len(means), 1), 1 / 255) / CARVING.brightness)
     for index in picked:
         frame = frames[index]
         rendering = rasterize(scene.at(frame.state), frame.camera)
@@ -159,17 +163,6 @@ def gather_evidence(
         tuple(frames[i] for i in picked),
         pad_and_stack(without_shadows, 0.0) if unshaded else None,
     )
-
-
-def _exposure(views: TrainingViews, picked: Sequence[int]) -> float:
-    """Return how bright images are, without what masks leave out, as a share of `brightness`, in (0, 1]."""
-    means = []
-    for index in picked:
-        image, mask = views.target(index), views.mask(index)
-        counted = image if mask is None else image[mask]
-        means += [float(counted.mean())] if counted.numel() else []
-    mean = sum(means) / max(len(means), 1)
-    return min(1.0, max(mean, 1 / 255) / CARVING.brightness)
 
 
 def pad_and_stack(images: list[Tensor], padding: float) -> Tensor:
@@ -309,22 +302,19 @@ def carve_along(
     along it."""
     reach = 0.6 * evidence.distance
     views = posed_views(evidence, name, settings).in_frame(base)
-    line, radius = _solid_line(views, 2 * reach / (settings.fine_grid - 1), 0.09 * evidence.distance, level)
+    spacing = 2 * reach / (settings.fine_grid - 1)
+    line = _slice_centers(views, spacing, 0.09 * evidence.distance, level)
     if len(line) < 4:
         return None
+    radius = max(math.sqrt(float(line[:, 3].median()) / math.pi), spacing / 4)
     near, tip = float(line[0, 0]), float(line[-1, 0])
     points = _sample_seeds(views, near, tip, max(3 * radius, 0.08 * reach), settings.seeds, generator)
-    return _shape(base, line[:, :3], radius, points, level)
-
-
-def _shape(base: Tensor, line: Tensor, radius: float, points: Tensor, level: float) -> CarvedShape:
-    """Return the shape of a centre line [Z, 3] and points [M, 3], both in the frame of the shaft, `base`."""
     return CarvedShape(
         instrument_from_shaft=base,
-        near=float(line[0, 0]),
-        tip=float(line[-1, 0]),
+        near=near,
+        tip=tip,
         radius=radius,
-        center_line=line,
+        center_line=line[:, :3],
         seeds=points @ base[:3, :3].T + base[:3, 3],
         level=level,
     )
@@ -357,13 +347,6 @@ def frame_along(origin: Tensor, direction: Tensor) -> Tensor:
     frame[:3, 0], frame[:3, 1], frame[:3, 2] = x, torch.linalg.cross(direction, x), direction
     frame[:3, 3] = origin
     return frame
-
-
-def _solid_line(views: PosedViews, spacing: float, half: float, level: float) -> tuple[Tensor, float]:
-    """Return the rows [Z, 5] of `_slice_centers`, and the solid's radius in mm by their median area."""
-    rows = _slice_centers(views, spacing, half, level)
-    area = float(rows[:, 3].median()) if len(rows) else 0.0
-    return rows, max(math.sqrt(area / math.pi), spacing / 4)
 
 
 def center_line(evidence: Evidence, name: str, shape: CarvedShape, settings: CarvingSettings) -> Tensor:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from neeco.capture.model import Frame, evenly_spaced
@@ -22,8 +24,10 @@ class QualitySettings:
     reach: float = 0.2  # of the images' width: how far from a rendered instrument one may show that is not labelled
     labelled: float = 0.5  # rendered share of a pixel from which it is labelled
     certain: float = 0.25  # certainty from which a pixel counts
-    unknown: float = 0.4  # share of labelled pixels, of which nothing is certain off outlines, that show an instrument
+    nearby: float = 0.02  # of the images' width: how far certain pixels tell what uncertain ones show
+    least_body: float = 0.25  # of an image's largest body in area: an unlabelled smaller one is a highlight or a shadow
     least_iou: float = 0.8  # estimated, below which labels are doubtful
+    least_recall: float = 0.9  # the same of the recall
     least_shown: int = 600  # px of an instrument in one image; of a smaller one, edges are too large a part
 
 
@@ -48,7 +52,7 @@ class LabelQuality:
     @property
     def doubt(self) -> str | None:
         """Reason to doubt these labels, if there is one."""
-        if self.iou >= QUALITY.least_iou:
+        if self.iou >= QUALITY.least_iou and self.recall >= QUALITY.least_recall:
             return None
         return (
             f"labels cover {self.recall:.0%} of what the images show of the instrument, and {1 - self.precision:.0%} "
@@ -74,19 +78,31 @@ def learned_foreground(scene: GaussianScene, frames: Sequence[Frame]) -> Foregro
 def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     """Count pixels of a view [4]: certain instrument that is labelled, that is not, and of the other labelled pixels
     tissue, and instrument. Of those that are neither for certain, each counts as both: at outlines, as an instrument by
-    how near it is to being covered by half."""
+    how near it is to being covered by half, elsewhere by the share of instrument among certain pixels nearby. Certain
+    instrument is no isolated patch: see `least_body`."""
     certainty, label = foreground.certainty(view, QUALITY.reach), view.usable & (view.label > QUALITY.labelled)
     instrument, tissue = certainty > QUALITY.certain, certainty < -QUALITY.certain
+    across = np.ones((2 * foreground.settings.outline_px + 1,) * 2, np.uint8)  # outlines do not divide a body
+    bodies = cv2.connectedComponents(cv2.dilate(instrument.astype(np.uint8), across))[1]
+    areas = np.bincount(bodies[instrument], minlength=1)
+    shown = areas >= QUALITY.least_body * areas.max()
+    shown[bodies[instrument & label]] = True
+    missed = instrument & ~label & shown[bodies]
     share = view.covered / foreground.settings.covered
-    share = np.where(tissue, 0, np.where(share > 1, QUALITY.unknown, share))
+    window = (2 * math.ceil(QUALITY.nearby * label.shape[1]) + 1,) * 2
+    near_instrument, near_tissue = (1e-6 + cv2.blur(kind.astype(float), window) for kind in (instrument, tissue))
+    share = np.where(tissue, 0, np.where(share > 1, near_instrument / (near_instrument + near_tissue), share))
     other = share[label & ~instrument]
-    return np.array([(instrument & label).sum(), (instrument & ~label).sum(), (1 - other).sum(), other.sum()])
+    return np.array([(instrument & label).sum(), missed.sum(), (1 - other).sum(), other.sum()])
 
 
-def quality_of(counts: np.ndarray, least: int = SETTINGS.least_pixels) -> LabelQuality | None:
-    """Return the quality of labels with such counts [4], summed over their images; None where these show fewer than
-    `least` pixels of an instrument for certain."""
-    both, missed, wrong, likely = counts.tolist()
-    if both + missed < least:
+def quality_of(images: Sequence[np.ndarray], least: int = SETTINGS.least_pixels) -> LabelQuality | None:
+    """Return the quality of labels with such counts [4] of each image: the mean over images that show at least their
+    share of `least` pixels of an instrument for certain; None where all together show fewer."""
+    counts = np.reshape(images, (-1, 4))
+    certain = counts[:, :2].sum(1)
+    if certain.sum() < least:
         return None
-    return LabelQuality(both / (both + missed), (both + likely) / max(1, both + wrong + likely))
+    both, missed, wrong, likely = counts[certain >= least / len(counts)].T
+    precisions = (both + likely) / np.maximum(1, both + wrong + likely)
+    return LabelQuality(float((both / (both + missed)).mean()), float(precisions.mean()))

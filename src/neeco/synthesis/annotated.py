@@ -198,7 +198,7 @@ class _Annotator:
         trust = estimate_trust(drawing, image, mask, self.typical)
         if self.foreground is not None:
             view = Comparison.of(scene, fit.state, scene.recorded.as_learned(fit.camera), image, mask)
-            quality = quality_of(label_counts(view, self.foreground), QUALITY.least_shown)
+            quality = quality_of([label_counts(view, self.foreground)], QUALITY.least_shown)
             if quality is not None:
                 trust = replace(trust, value=min(trust.value, quality.iou))
         return fit, drawing, trust

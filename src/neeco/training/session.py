@@ -376,7 +376,7 @@ class GaussianSession(Session):
         foreground = Foreground.learned(views)
         if foreground is None:
             return
-        quality = quality_of(sum((label_counts(view, foreground) for view in views), np.zeros(4)))
+        quality = quality_of([label_counts(view, foreground) for view in views])
         if quality is not None:
             self.scene.diagnostics[LABEL_QUALITY] = quality.as_json()
 
