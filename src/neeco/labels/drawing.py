@@ -20,7 +20,7 @@ from neeco.geometry.camera import Camera
 from neeco.labels.labellers import Labeller, composited_parts, instruments_of, threshold_of
 from neeco.labels.settings import LABELS
 from neeco.raster import rasterize
-from neeco.raster.types import Layer, Rendering
+from neeco.raster.types import Gaussians, Layer, Rendering
 
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
@@ -51,6 +51,7 @@ class LayeredDrawing(Drawing):
     parts: Tensor  # [H, W] uint8, 0 tissue, else index into the labeller's names + 1
     share: Tensor  # [H, W] in [0, 1]: share of a pixel that is instrument; 0 in components that are not labelled
     state: State
+    posed: Gaussians
     camera: Camera
     depth: np.ndarray
     tissue_depth: np.ndarray  # of the tissue alone
@@ -108,6 +109,7 @@ def draw_layers(
         parts=parts,
         share=share,
         state=state,
+        posed=gaussians,
         camera=camera,
         depth=surface_depth(rendering),
         tissue_depth=surface_depth(rendering.alone[-1]),

@@ -30,6 +30,7 @@ from neeco.labels.labellers import CompositedLabels, Labeller, instruments_of
 from neeco.raster.resampling import of_rendered_size, resampled
 from neeco.scene import GaussianScene
 from neeco.states.alignment import AlignConfig, AlignedFrame, align_frame, pose_changes
+from neeco.synthesis.contact import labels_of
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
 from neeco.synthesis.samplers import DrawnCameras
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings, parse_class_names
@@ -154,14 +155,14 @@ class _Annotator:
         }
         scene, names, output = self.folder.scene, self.folder.labeller.names, self.folder.output
         if trust.value < self.min_trust:
-            facts["labels"] = [label.to_json() for label in annotate(scene, drawing, names)]
+            facts["labels"] = labels_of(scene, drawing, annotate(scene, drawing, names))
             return skipped_sample(index, {NOT_TRUSTED: 1}, facts).write(output)
         drawing, missing = self._as_written(drawing, image)
         labels = annotate(scene, drawing, names)
         if missing is not None:
             labels = [_without_keypoints_in(missing, label) for label in labels]
-        encoded = encoded_sample(index, drawing, labels, facts=facts, quality=self.images.jpeg_quality)
-        return encoded.write(output)
+        plain, quality = labels_of(scene, drawing, labels), self.images.jpeg_quality
+        return encoded_sample(index, drawing, plain, facts=facts, quality=quality).write(output)
 
     def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> tuple[LayeredDrawing, Tensor | None]:
         """The recorded `image` with the labels of `drawing`, at the requested size and lens, and where it shows nothing

@@ -38,6 +38,7 @@ from neeco.synthesis.camera_effects import (
     read_effects,
     subframes,
 )
+from neeco.synthesis.contact import labels_of
 from neeco.synthesis.mixing import MixedSampler, Mixture
 from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler
 from neeco.synthesis.settings import Settings
@@ -314,7 +315,7 @@ def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
             return skipped_sample(index, error.refused)
         raise
     how: dict[str, Any] = {"refused": sample.refused, "facts": sample.facts, "quality": generator.settings.jpeg_quality}
-    return encoded_sample(index, sample.drawing, sample.labels, **how)
+    return encoded_sample(index, sample.drawing, labels_of(generator.scene, sample.drawing, sample.labels), **how)
 
 
 def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:

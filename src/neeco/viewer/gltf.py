@@ -34,11 +34,21 @@ from neeco.viewer.splats import lit_harmonics
 
 EXTENSION = "KHR_gaussian_splatting"
 ROTATION = f"{EXTENSION}:ROTATION"
-METRES = 0.001  # per mm
-FRAME_S = 1 / 15  # of states without increasing times
-NEAR_M = 0.001  # the camera's near plane
-SURE = 0.9  # weight of a link, below which a Gaussian blends links
-FLOAT, BYTE, POINTS, MAGIC = 5126, 5121, 0, b"glTF"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GltfSettings:
+    """Settings of the file."""
+
+    metres: float = 0.001  # per mm
+    frame_s: float = 1 / 15  # between states without increasing times
+    near_m: float = 0.001  # the camera's near plane
+    least_weight: float = 0.9  # of a link, below which a Gaussian blends links
+
+
+GLTF = GltfSettings()
+MAGIC = b"glTF"
+COMPONENTS = {"float32": 5126, "uint8": 5121}
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 TURN = np.array([0.0, 0.0, 1.0, 0.0])  # xyzw: 180 degrees about z, from the capture's axes to glTF's
 CAMERA_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # glTF's cameras look along -z
@@ -60,7 +70,7 @@ class _Document:
         self.binary += values.tobytes() + bytes(-values.nbytes % 4)
         accessor = {
             "bufferView": len(views) - 1,
-            "componentType": FLOAT if values.dtype == np.float32 else BYTE,
+            "componentType": COMPONENTS[str(values.dtype)],
             "count": len(values),
             "type": TYPES[1 if values.ndim == 1 else values.shape[1]],
         }
@@ -114,7 +124,7 @@ def write_glb(scene: GaussianScene, states: Sequence[State], camera: Camera, pat
     except ValueError:
         raise NeecoError("the scene's Gaussians are not finite; give another state, or train again") from None
     write_atomically(path, lambda temporary: temporary.write_bytes(data))
-    blended = [weights.max(1).values < SURE for weights, _ in motion.links]
+    blended = [weights.max(1).values < GLTF.least_weight for weights, _ in motion.links]
     share = float(torch.cat(blended).float().mean()) if blended else 0.0
     return f"{len(states)} states; {share:.0%} of the instruments' Gaussians blend links and follow one of them"
 
@@ -133,7 +143,7 @@ def _described(scene: GaussianScene, motion: ArticulatedMotion, states: Sequence
 
     def animate(node: int, poses: np.ndarray) -> None:
         """Give a node its poses [T, 4, 4] mm: the first at rest, all of them as an animation."""
-        rotations, places = _rotations(poses), (poses[:, :3, 3] * METRES).astype(np.float32)
+        rotations, places = _rotations(poses), (poses[:, :3, 3] * GLTF.metres).astype(np.float32)
         document.nodes[node] |= {"rotation": rotations[0].tolist(), "translation": places[0].tolist()}
         for target, values in (("rotation", rotations), ("translation", places)):
             if clock is not None and np.ptp(values, axis=0).max() > 0:
@@ -175,7 +185,7 @@ def _attributes(scene: GaussianScene, state: State, camera: Camera) -> dict[str,
     found = {
         "POSITION": posed.means,
         "ROTATION": normalize(posed.quats, dim=1)[:, [1, 2, 3, 0]],
-        "SCALE": posed.scales * METRES,
+        "SCALE": posed.scales * GLTF.metres,
         "OPACITY": posed.opacities.clamp(0, 1),
     }
     degrees = int(sh.shape[1] ** 0.5)
@@ -196,13 +206,13 @@ def _mesh_node(
     """Give a node, at world_from_node [4, 4] mm in the first state, the Gaussians `rows`."""
     own = {name: values[rows] for name, values in splats.items()}
     rotation, translation = world_from_node[:3, :3], world_from_node[:3, 3]
-    own["POSITION"] = (((own["POSITION"] - translation) @ rotation) * METRES).astype(np.float32)
+    own["POSITION"] = (((own["POSITION"] - translation) @ rotation) * GLTF.metres).astype(np.float32)
     back = matrix_to_quat(torch.from_numpy(rotation.T.copy())).expand(len(rows), 4)
     turned = quat_multiply(back, torch.from_numpy(own[ROTATION][:, [3, 0, 1, 2]]).double())
     own[ROTATION] = turned.numpy()[:, [1, 2, 3, 0]].astype(np.float32)
     attributes = {name: document.add(values, bounds=name == "POSITION") for name, values in own.items()}
     settings = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: settings}}
+    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: settings}}
     meshes = document.content["meshes"]
     meshes.append({"name": document.nodes[node]["name"], "primitives": [primitive]})
     document.nodes[node]["mesh"] = len(meshes) - 1
@@ -249,10 +259,10 @@ def _rotations(poses: np.ndarray) -> np.ndarray:
 
 
 def times_of(states: Sequence[State]) -> np.ndarray:
-    """Return the states' times [T] s from 0 on; FRAME_S apart where they state none that increase."""
+    """Return the states' times [T] s from 0 on; GLTF.frame_s apart where they state none that increase."""
     times = np.array([float(state.time) for state in states])
     if not (np.diff(times) > 0).all():
-        times = FRAME_S * np.arange(len(states))
+        times = GLTF.frame_s * np.arange(len(states))
     return (times - times[0]).astype(np.float32)
 
 
@@ -262,11 +272,11 @@ def _add_camera(document: _Document, camera: Camera, root: int) -> None:
     lens = {
         "yfov": 2 * math.atan(camera.height / (2 * camera.fy)),
         "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
-        "znear": NEAR_M,
+        "znear": GLTF.near_m,
     }
     document.content["cameras"] = [{"name": "laparoscope", "type": "perspective", "perspective": lens}]
     rotation = _rotations(
         np.stack([np.block([[(pose[:3, :3] @ CAMERA_TURN).numpy(), np.zeros((3, 1))], [np.eye(4)[3:]]])])
     )
-    place = (pose[:3, 3] * METRES).tolist()
+    place = (pose[:3, 3] * GLTF.metres).tolist()
     document.node("laparoscope", root, camera=0, rotation=rotation[0].tolist(), translation=place)

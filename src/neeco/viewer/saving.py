@@ -17,6 +17,7 @@ from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene.gaussian_scene import require_gaussians
+from neeco.synthesis.contact import labels_of
 from neeco.synthesis.samplers import DrawnCameras, moved_camera
 from neeco.synthesis.settings import RECORDED_SIZE, Settings, SizeSettings
 from neeco.synthesis.writers.folder import encoded_sample, load_record, record_path
@@ -63,7 +64,7 @@ class SavedStates:
         camera = DrawnCameras(self.size)(moved_camera(loaded.recorded.cameras[0], world_from_camera))
         with scene.torch_threads(), torch.no_grad():
             drawing = draw_layers(scene, labeller, state, camera, Settings.min_component)
-            labels = annotate(scene, drawing, labeller.names)
+            labels = labels_of(scene, drawing, annotate(scene, drawing, labeller.names))
         root = self.folder / SAMPLES
         with self._lock, own_folder(root, wait_s=LOCK_WAIT_S):
             index = 0

@@ -17,7 +17,7 @@ import numpy as np
 
 from neeco.base.files import write_json
 from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import Record, link
+from neeco.synthesis.writers.folder import CONTACT, Record, link
 
 Entry = dict[str, Any]
 
@@ -26,7 +26,7 @@ class Coco(Writer):
     """Boxes, polygons, keypoints and poses of instruments and their parts.
 
     Instruments have all keypoints, absent ones as 0 0 0, and, beyond COCO's own fields, `visibility`, `rectangle`
-    (minimum-area, 4 corners) and `camera_from_instrument` (4x4, mm, OpenCV axes).
+    (minimum-area, 4 corners), `camera_from_instrument` (4x4, mm, OpenCV axes) and `attributes` (contact with tissue).
     """
 
     format = "coco"
@@ -106,5 +106,6 @@ def _instrument(record: Record, label: Entry, numbers: dict[str, int], keypoints
         annotation["keypoints"] = [value for point in points for value in point]
         annotation["num_keypoints"] = sum(point[2] > 0 for point in points)
     annotation["visibility"] = label["visibility"]
+    annotation["attributes"] = {key: label[key] for key in CONTACT if key in label}
     annotation["camera_from_instrument"] = label["camera_from_instrument"]
     return annotation

@@ -23,7 +23,6 @@ from neeco.base.files import read_bytes, read_text, require_replaceable, write_a
 from neeco.capture.images import encoded_image, encoded_png
 from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.geometry.lens import Lens
-from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy
 
 Record = dict[str, Any]
@@ -35,6 +34,7 @@ RECORDS = ".records"
 CHECKSUM = "sha256"  # of the rest of a record
 LABELS = ("masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
 MAX_INSTRUMENTS = 8  # in `silhouettes`: bit k is set where instrument k would be visible if nothing else were there
+CONTACT = ("contact", "contact_confidence", "penetration_mm", "contact_box")  # of a label
 POLYGONS = ("polygons", "segmentation")  # of a label or part, left out of states.jsonl
 FOLDERS = ("images", *LABELS, RECORDS)
 VALIDATION_EVERY = 5  # every fifth image is for validation; by the index alone, so a data set can grow
@@ -69,14 +69,14 @@ class Encoded:
 def encoded_sample(
     index: int,
     drawing: LayeredDrawing,
-    labels: list[InstrumentLabel],
+    labels: list[Record],
     *,
     refused: Mapping[str, int] = MappingProxyType({}),
     facts: Mapping[str, Any] = MappingProxyType({}),
     quality: int | None = None,
 ) -> Encoded:
-    """Encode one image, as JPEG of `quality` or as PNG, with all that its pixels say, and its record, to which `facts`
-    are added."""
+    """Encode one image with its `labels` as JSON, as JPEG of `quality` or as PNG, with all that its pixels say, and its
+    record, to which `facts` are added."""
     name = f"{stem(index)}.png"
     silhouettes = np.zeros(drawing.depth.shape, np.uint8)
     for k, layer in enumerate(list(drawing.layers.values())[:MAX_INSTRUMENTS]):
@@ -104,7 +104,7 @@ def encoded_sample(
         "camera": camera_to_json(to_numpy(camera.world_from_camera)),
         "intrinsics": Lens.of(camera).intrinsics_json(),
         "made_up": round(float(drawing.unobserved.mean()), 4),
-        "labels": [label.to_json() for label in labels],
+        "labels": labels,
         **facts,
         "refused": dict(sorted(refused.items())),
     }
