@@ -29,7 +29,8 @@ from playwright.sync_api import sync_playwright
 
 from neeco.evaluation.image_metrics import psnr, to_uint8
 from neeco.training.run import open_gaussian_run
-from neeco.viewer.gltf import exported_states, times_of, write_glb
+from neeco.viewer.gltf import write_glb
+from neeco.viewer.moving import exported_states, times_of
 
 ENGINE = "playcanvas@2.23.3"
 SETTLE_MS = 6000  # until the engine has sorted the Gaussians of a new state
@@ -101,7 +102,7 @@ def main() -> None:
         states = exported_states(scene, scene.recorded.states[0], None)
         recorded = scene.recorded.cameras[0]
         camera = replace(recorded, cx=recorded.width / 2, cy=recorded.height / 2)  # glTF has no other
-        print(write_glb(scene, states, camera, folder / "scene.glb"))
+        write_glb(scene, states, camera, folder / "scene.glb")
         subprocess.run(["npm", "install", "--silent", "--prefix", scratch, ENGINE], check=True)
         (folder / "page.html").write_text(PAGE)
         aspect = camera.width * camera.fy / (camera.height * camera.fx)

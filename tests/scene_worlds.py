@@ -87,6 +87,19 @@ def make_scene(method: str) -> GaussianScene:
     return scene
 
 
+STATES = [grasper_state(pose_of(0.3 * k - 1, 0.2 * k, 0.1, k, 2 * k, 60 - k), 0.2 * k, 0.5 * k**2) for k in range(5)]
+
+
+def rigid_scene() -> GaussianScene:
+    """A scene whose Gaussians belong to one link each."""
+    scene = make_scene("kinematic")
+    logits = scene.canonical.extras[LINK_LOGITS]
+    sure = torch.where(logits == logits.max(1, keepdim=True).values, SURE, -SURE)
+    scene.canonical = scene.canonical.with_extras(**{LINK_LOGITS: sure})
+    scene.deformation.articulations[0].wrist_start.fill_(-1e3)
+    return scene.requires_grad_(False)
+
+
 SMALL_NERF = {"rays": 16, "coarse_samples": 6, "width": 8, "depth": 2, "warp_width": 8, "warp_depth": 3, "chunk": 7}
 NERF_TIMES = (0.0, 1.0, 3.0)
 

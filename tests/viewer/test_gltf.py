@@ -11,21 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scene_worlds import CAMERA, SURE, TISSUE, grasper_state, make_scene, pose_of
+from scene_worlds import CAMERA, STATES, TISSUE, make_scene, rigid_scene
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.evaluation.image_metrics import psnr
 from neeco.geometry.rotations import quat_to_matrix
-from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
-from neeco.scene import GaussianScene
-from neeco.viewer.gltf import exported_states, write_glb
+from neeco.viewer.gltf import write_glb
+from neeco.viewer.moving import blended_share, exported_states
 
 PREFIX = "KHR_gaussian_splatting:"
 AXES = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))  # glTF's from the capture's
-STATES = [grasper_state(pose_of(0.3 * k - 1, 0.2 * k, 0.1, k, 2 * k, 60 - k), 0.2 * k, 0.5 * k**2) for k in range(5)]
 
 
 @dataclass
@@ -111,16 +109,6 @@ class Glb:
         return Gaussians(*tensors[:5], sh_frames=tensors[5])
 
 
-def rigid_scene() -> GaussianScene:
-    """A scene whose Gaussians belong to one link each."""
-    scene = make_scene("kinematic")
-    logits = scene.canonical.extras[LINK_LOGITS]
-    sure = torch.where(logits == logits.max(1, keepdim=True).values, SURE, -SURE)
-    scene.canonical = scene.canonical.with_extras(**{LINK_LOGITS: sure})
-    scene.deformation.articulations[0].wrist_start.fill_(-1e3)
-    return scene.requires_grad_(False)
-
-
 def in_gltf(posed: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
     """Means and covariances [N, 3, 3] of posed Gaussians in glTF's axes, mm."""
     turn = AXES[:3, :3].float()
@@ -189,10 +177,10 @@ def test_the_tissue_stays_and_instruments_move_between_states_as_well(tmp_path: 
     assert (half > 0.1 * (moved[2] - moved[0])[TISSUE:].norm(dim=1)).all()
 
 
-def test_what_blends_links_is_said_and_methods_without_joints_are_refused(tmp_path: Path) -> None:
-    said = write_glb(make_scene("kinematic").requires_grad_(False), STATES, CAMERA, tmp_path / "a.glb")
-    assert "5 states" in said
-    assert " 0% of" in write_glb(rigid_scene(), STATES[:1], CAMERA, tmp_path / "b.glb")
+def test_what_blends_links_is_counted_and_methods_without_joints_are_refused(tmp_path: Path) -> None:
+    assert blended_share(make_scene("kinematic")) > 0.1
+    assert blended_share(rigid_scene()) == 0
+    write_glb(rigid_scene(), STATES[:1], CAMERA, tmp_path / "b.glb")
     assert "animations" not in Glb.read(tmp_path / "b.glb").content
     with pytest.raises(NeecoError, match="4dgs asks a network for every state"):
         write_glb(make_scene("4dgs").requires_grad_(False), STATES, CAMERA, tmp_path / "c.glb")

@@ -5,10 +5,8 @@ from __future__ import annotations
 import gzip
 import json
 import struct
-import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +20,7 @@ from neeco.cli import main
 from neeco.evaluation.image_metrics import psnr
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
-from neeco.viewer.splats import exported_state, ply_bytes, splats_of, spz_bytes, write_usd
+from neeco.viewer.splats import exported_state, ply_bytes, splats_of, spz_bytes
 
 TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=CAMERA.world_from_camera.dtype))
 TURNED = replace(CAMERA, world_from_camera=TURN @ CAMERA.world_from_camera)  # in axes right, up, back
@@ -126,44 +124,6 @@ def test_a_ball_survives_in_both_formats_and_the_same_bytes_come_twice() -> None
     assert len(small) < len(large) / 5
     turned = replace(camera, world_from_camera=TURN.to(camera.world_from_camera) @ camera.world_from_camera)
     assert decibels(rasterize(gaussians_of_spz(small), turned).color, truth) > 38
-
-
-def test_openusd_reads_the_same_gaussians_from_a_prim_of_its_own_schema(tmp_path: Path) -> None:
-    pxr = pytest.importorskip("pxr", reason="the extra usd")
-    scene = lit_scene()
-    splats = splats_of(scene, STATE, CAMERA)
-    write_usd(splats, tmp_path / "scene.usdc")
-    stage = pxr.Usd.Stage.Open(str(tmp_path / "scene.usdc"))
-    assert pxr.UsdGeom.GetStageMetersPerUnit(stage) == 0.001
-    assert pxr.UsdGeom.GetStageUpAxis(stage) == "Y"
-    placed = pxr.UsdGeom.Xformable(stage.GetDefaultPrim()).ComputeLocalToWorldTransform(0)
-    assert np.allclose(np.array(placed), TURN)
-    field = pxr.UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
-    assert field.GetPrim().IsA("ParticleField3DGaussianSplat")
-    means, scales, opacities = (
-        torch.from_numpy(np.array(attribute.Get()))
-        for attribute in (field.GetPositionsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr())
-    )
-    quats = torch.tensor([[q.GetReal(), *q.GetImaginary()] for q in field.GetOrientationsAttr().Get()])
-    degree = field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
-    coefficients = torch.from_numpy(np.array(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()))
-    read = Gaussians(means, quats, scales, opacities, coefficients.reshape(len(means), (degree + 1) ** 2, 3))
-    with torch.no_grad():
-        assert decibels(rasterize(read, CAMERA).color, scene.render(STATE, CAMERA).color) > 60
-    lowest, highest = np.array(field.GetExtentAttr().Get())
-    assert (lowest < means.numpy()).all()
-    assert (means.numpy() < highest).all()
-
-
-def test_a_missing_or_old_openusd_is_refused_with_what_to_install(tmp_path, monkeypatch):
-    scene = ball_scene("ball", [(0.0, 0.0, 60.0)])
-    splats = splats_of(scene, *exported_state(scene, 0, None))
-    old = SimpleNamespace(Usd=SimpleNamespace(GetVersion=lambda: (0, 25, 5)), UsdVol=SimpleNamespace())
-    for module, why in ((None, "usdc needs usd-core"), (old, "26.03 or newer, this is 25.5")):
-        monkeypatch.setitem(sys.modules, "pxr", module)
-        with pytest.raises(NeecoError, match=rf"{why}; pip install '.\[usd\]'"):
-            write_usd(splats, tmp_path / "a.usdc")
-    assert not list(tmp_path.iterdir())
 
 
 def test_positions_that_spz_cannot_hold_are_refused() -> None:

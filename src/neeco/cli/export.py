@@ -16,19 +16,19 @@ Format = Literal["ply", "spz", "usdc", "glb"]
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write a run's scene for other viewers, in the light of one camera: in one state, or (glb) moving."""
+    """Write a run's scene for other viewers, in the light of one camera: in one state, or (glb, usdc) moving."""
 
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote."""
     format: Format | None = None
-    """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser. usdc: OpenUSD (needs the
-    extra usd). glb: glTF, a node for every part, recorded states as animation. Default: as --output ends, or ply."""
+    """ply: as 3D Gaussian splatting's code writes it. spz: a tenth of the size, coarser. glb (glTF), usdc (OpenUSD,
+    extra usd): a node for every part, recorded states as animation. Default: as --output ends, or ply."""
     output: Path | None = None
     """File to write, .ply, .spz, .usdc or .glb. Default: scene.ply (or as --format) in the run folder."""
     frame: int = 0
     """Number of the frame, of those trained on, whose state and light are taken."""
     states: Path | None = None
-    """The first state of this states.jsonl instead (glb: all), in the light of its own camera where it names one."""
+    """The first state of this states.jsonl instead (glb, usdc: all), in its own camera's light where it names one."""
     device: Device = "auto"
 
 
@@ -37,8 +37,10 @@ def run(arguments: Arguments) -> int:
     from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run
-    from neeco.viewer.gltf import exported_states, write_glb
-    from neeco.viewer.splats import exported_state, require_usd, splats_of, write_splats, write_usd
+    from neeco.viewer.gltf import write_glb
+    from neeco.viewer.moving import blended_share, exported_states
+    from neeco.viewer.splats import exported_state, splats_of, write_splats
+    from neeco.viewer.usd import write_usd
 
     format = arguments.format or "ply"
     if arguments.output is not None:
@@ -46,8 +48,6 @@ def run(arguments: Arguments) -> int:
         require_ending("--output", arguments.output, *(f".{ending}" for ending in endings))
         if arguments.format is None and arguments.output.suffix:
             format = cast(Format, arguments.output.suffix[1:].lower())
-    if format == "usdc":
-        require_usd()
     with open_gaussian_run(arguments.run, "export", device_of(arguments.device)) as trained:
         scene = trained.scene
         frames = len(scene.recorded.states)
@@ -55,11 +55,12 @@ def run(arguments: Arguments) -> int:
             raise NeecoError(f"--frame: {arguments.frame}: the scene was trained on frames 0 to {frames - 1}")
         state, camera = exported_state(scene, arguments.frame, arguments.states)
         output = arguments.output or arguments.run / f"scene.{format}"
-        if format == "glb":
-            note = write_glb(scene, exported_states(scene, state, arguments.states), camera, output)
+        if format == "glb" or format == "usdc":
+            states = exported_states(scene, state, arguments.states)
+            (write_glb if format == "glb" else write_usd)(scene, states, camera, output)
+            note = f"{len(states)} states; {blended_share(scene):.0%} of the instruments' Gaussians blend links"
         else:
             note = "without joints and labels"
-            splats = splats_of(scene, state, camera)
-            write_usd(splats, output) if format == "usdc" else write_splats(splats, output, format)
+            write_splats(splats_of(scene, state, camera), output, format)
     print(f"{output}: {scene.num_gaussians:,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, {note}")
     return 0

@@ -1,10 +1,8 @@
 """`neeco export --format glb`: a scene that moves, as binary glTF 2.0 with the extension KHR_gaussian_splatting.
 
 One node per part of each link, with which its Gaussians and their harmonics turn; the poses and joints of a sequence of
-states are animation channels. Gaussians that blend links follow the link of most weight from the first state on.
-Positions are in metres; the root turns the capture's world (right, down, front) by 180 degrees about z to glTF's axes.
-Lamps and shadows are not part of glTF: light is baked into the colours as one camera observes the first state, without
-shadows. Moving tissue rests.
+states are animation channels (`neeco.viewer.moving`). Positions are in metres; the root turns the capture's world
+(right, down, front) by 180 degrees about z to glTF's axes.
 """
 
 from __future__ import annotations
@@ -19,21 +17,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.nn.functional import normalize
 
-from neeco.base.errors import NeecoError
 from neeco.base.files import write_atomically
-from neeco.capture.model import Camera, Instrument, State
-from neeco.capture.readers import read_states
+from neeco.capture.model import Camera, State
 from neeco.evaluation.image_metrics import to_uint8
-from neeco.geometry.rotations import matrix_to_quat, quat_multiply, rotate_about
+from neeco.geometry.rotations import matrix_to_quat
 from neeco.raster.reference import SH_C0
 from neeco.scene import GaussianScene
-from neeco.scene.drawable import ArticulatedMotion
-from neeco.viewer.splats import lit_harmonics
+from neeco.viewer.moving import local_splats, moving_instruments, times_of
+from neeco.viewer.splats import Splats, splats_of
 
 EXTENSION = "KHR_gaussian_splatting"
-ROTATION = f"{EXTENSION}:ROTATION"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +35,7 @@ class GltfSettings:
     """Settings of the file."""
 
     metres: float = 0.001  # per mm
-    frame_s: float = 1 / 15  # between states without increasing times
     near_m: float = 0.001  # the camera's near plane
-    least_weight: float = 0.9  # of a link, below which a Gaussian blends links
 
 
 GLTF = GltfSettings()
@@ -99,45 +91,22 @@ class _Document:
         return struct.pack("<4sII", MAGIC, 2, size) + b"".join(chunks) + bytes(self.binary)
 
 
-def exported_states(scene: GaussianScene, first: State, states: Path | None) -> list[State]:
-    """Return the states of a file, or those recorded for training in the order of their times; `first` alone where no
-    instrument moves."""
-    if not scene.instruments:
-        return [first]
-    if states is not None:
-        return [line.state for line in read_states(states, scene.recorded.with_limits(scene.instruments))]
-    return sorted(scene.recorded.states, key=lambda state: state.time)
-
-
-def write_glb(scene: GaussianScene, states: Sequence[State], camera: Camera, path: Path) -> str:
-    """Write the scene, moving through `states`, lit as `camera` observes the first one; return what to tell of it.
+def write_glb(scene: GaussianScene, states: Sequence[State], camera: Camera, path: Path) -> None:
+    """Write the scene, moving through `states`, lit as `camera` observes the first one.
 
     Raises NeecoError where the scene's method has no joints to move by, its numbers are not finite, or the disk
     refuses.
     """
-    motion = scene.motion()
-    if motion is None:
-        raise NeecoError(f"--format: method {scene.method} asks a network for every state, which glb cannot; use ply")
-    document = _described(scene, motion, states, camera)
-    try:
-        data = document.packed()
-    except ValueError:
-        raise NeecoError("the scene's Gaussians are not finite; give another state, or train again") from None
-    write_atomically(path, lambda temporary: temporary.write_bytes(data))
-    blended = [weights.max(1).values < GLTF.least_weight for weights, _ in motion.links]
-    share = float(torch.cat(blended).float().mean()) if blended else 0.0
-    return f"{len(states)} states; {share:.0%} of the instruments' Gaussians blend links and follow one of them"
+    document = _described(scene, states, camera)
+    write_atomically(path, lambda temporary: temporary.write_bytes(document.packed()))
 
 
-@torch.no_grad()
-def _described(scene: GaussianScene, motion: ArticulatedMotion, states: Sequence[State], camera: Camera) -> _Document:
-    document, splats = _Document(), _attributes(scene, states[0], camera)
+def _described(scene: GaussianScene, states: Sequence[State], camera: Camera) -> _Document:
+    document, splats = _Document(), splats_of(scene, states[0], camera, moving=True)
     root = document.node("neeco", rotation=TURN.tolist())
-    counts = scene.canonical.counts
-    _mesh_node(document, splats, np.arange(counts[0]), np.eye(4), document.node("tissue", root))
-    corrected = [scene.registered(state) for state in states]
-    times = times_of(states)
-    clock = document.add(times, bounds=True) if len(states) > 1 else None
+    tissue = np.arange(scene.canonical.counts[0])
+    _add_mesh(document, document.node("tissue", root), local_splats(splats, tissue, np.eye(4)))
+    clock = document.add(times_of(states), bounds=True) if len(states) > 1 else None
     channels: list[dict[str, Any]] = []
     samplers: list[dict[str, Any]] = []
 
@@ -150,25 +119,14 @@ def _described(scene: GaussianScene, motion: ArticulatedMotion, states: Sequence
                 samplers.append({"input": clock, "output": document.add(values), "interpolation": "LINEAR"})
                 channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": target}})
 
-    labels = scene.label_channels().cpu().numpy()
-    for number, instrument in enumerate(scene.instruments):
-        rows = np.arange(len(scene.canonical))[scene.canonical.body(number + 1)]
-        held = [state.instruments[instrument.name] for state in corrected]
-        body = document.node(instrument.name, root, extras=_facts(instrument, motion, number))
-        bodies = np.stack([item.pose.double().cpu().numpy() for item in held])
-        animate(body, bodies)
-        columns = [k for k, (name, _) in enumerate(scene.label_names) if name == instrument.name]
-        links = motion.links[number][0].argmax(1).cpu().numpy()
-        for link in np.unique(links):
-            own = rows[links == link]
-            parts = labels[np.ix_(own, columns)].argmax(1) if columns else np.zeros(len(own), int)
-            poses = np.stack([_link_pose(motion, number, int(link), item.joints) for item in held])
-            for part in np.unique(parts):
-                title = scene.label_names[columns[part]][1] if columns else f"link {link}"
-                extras = {"instrument": instrument.name, "part": title, "link": int(link)}
-                node = document.node(title, body, extras=extras)
-                animate(node, poses)
-                _mesh_node(document, splats, own[parts == part], bodies[0] @ poses[0], node)
+    for instrument in moving_instruments(scene, states):
+        body = document.node(instrument.name, root, extras=instrument.facts)
+        animate(body, instrument.poses)
+        for part in instrument.parts:
+            extras = {"instrument": instrument.name, "part": part.name, "link": part.link}
+            node = document.node(part.name, body, extras=extras)
+            animate(node, part.poses)
+            _add_mesh(document, node, local_splats(splats, part.rows, instrument.poses[0] @ part.poses[0]))
     _add_camera(document, camera, root)
     document.content |= {"asset": {"version": "2.0", "generator": "neeco"}, "extensionsUsed": [EXTENSION]}
     document.content |= {"scene": 0, "scenes": [{"nodes": [root]}]}
@@ -177,76 +135,23 @@ def _described(scene: GaussianScene, motion: ArticulatedMotion, states: Sequence
     return document
 
 
-def _attributes(scene: GaussianScene, state: State, camera: Camera) -> dict[str, np.ndarray]:
-    """Return the vertex attributes [N, …] of all Gaussians in `state`: positions (mm) and rotations in the world,
-    harmonics in the frames that they turn with."""
-    posed = scene.at(state)
-    sh = lit_harmonics(posed, camera)
-    found = {
-        "POSITION": posed.means,
-        "ROTATION": normalize(posed.quats, dim=1)[:, [1, 2, 3, 0]],
-        "SCALE": posed.scales * GLTF.metres,
-        "OPACITY": posed.opacities.clamp(0, 1),
-    }
-    degrees = int(sh.shape[1] ** 0.5)
-    for degree in range(degrees):
+def _add_mesh(document: _Document, node: int, splats: Splats) -> None:
+    """Give a node its Gaussians, in its own frame, mm."""
+    opacities = 1 / (1 + np.exp(-splats.logits))
+    shown = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, opacities[:, None]], 1)
+    columns = {"ROTATION": splats.quats[:, [1, 2, 3, 0]], "SCALE": np.exp(splats.log_scales) * GLTF.metres}
+    columns["OPACITY"] = opacities
+    for degree in range(int(splats.sh.shape[1] ** 0.5)):
         for order in range(2 * degree + 1):
-            found[f"SH_DEGREE_{degree}_COEF_{order}"] = sh[:, degree**2 + order]
-    arrays = {name: tensor.float().cpu().numpy() for name, tensor in found.items()}
-    if not all(np.isfinite(values).all() for values in arrays.values()):
-        raise NeecoError("the scene's Gaussians are not finite; give another state, or train again")
-    shown = np.concatenate([arrays["SH_DEGREE_0_COEF_0"] * SH_C0 + 0.5, arrays["OPACITY"][:, None]], 1)
-    prefixed = {name if name == "POSITION" else f"{EXTENSION}:{name}": values for name, values in arrays.items()}
-    return prefixed | {"COLOR_0": to_uint8(255 * shown)}
-
-
-def _mesh_node(
-    document: _Document, splats: dict[str, np.ndarray], rows: np.ndarray, world_from_node: np.ndarray, node: int
-) -> None:
-    """Give a node, at world_from_node [4, 4] mm in the first state, the Gaussians `rows`."""
-    own = {name: values[rows] for name, values in splats.items()}
-    rotation, translation = world_from_node[:3, :3], world_from_node[:3, 3]
-    own["POSITION"] = (((own["POSITION"] - translation) @ rotation) * GLTF.metres).astype(np.float32)
-    back = matrix_to_quat(torch.from_numpy(rotation.T.copy())).expand(len(rows), 4)
-    turned = quat_multiply(back, torch.from_numpy(own[ROTATION][:, [3, 0, 1, 2]]).double())
-    own[ROTATION] = turned.numpy()[:, [1, 2, 3, 0]].astype(np.float32)
-    attributes = {name: document.add(values, bounds=name == "POSITION") for name, values in own.items()}
+            columns[f"SH_DEGREE_{degree}_COEF_{order}"] = splats.sh[:, degree**2 + order]
+    attributes = {"POSITION": document.add((splats.means * GLTF.metres).astype(np.float32), bounds=True)}
+    attributes["COLOR_0"] = document.add(to_uint8(255 * shown))
+    attributes |= {f"{EXTENSION}:{name}": document.add(v.astype(np.float32)) for name, v in columns.items()}
     settings = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: settings}}
     meshes = document.content["meshes"]
     meshes.append({"name": document.nodes[node]["name"], "primitives": [primitive]})
     document.nodes[node]["mesh"] = len(meshes) - 1
-
-
-def _facts(instrument: Instrument, motion: ArticulatedMotion, number: int) -> dict[str, Any]:
-    """Return joints, their limits (rad or mm) and the axes (mm, instrument frame) that they move links by: a link's
-    turn or shift about an axis is at_zero + per_unit * joint."""
-    axes = [
-        {
-            "joint": axis.reading,
-            "type": "prismatic" if axis.slides else "revolute",
-            "pivot_mm": axis.pivot.tolist(),
-            "axis": axis.axis.tolist(),
-            "at_zero": motion.links[number][1][:, k, 0].tolist(),
-            "per_unit": motion.links[number][1][:, k, 1].tolist(),
-        }
-        for k, axis in enumerate(motion.axes[number])
-    ]
-    joints = {name: {"limits": None if limits is None else list(limits)} for name, limits in instrument.joints.items()}
-    return {"instrument": instrument.name, "joints": joints, "axes": axes}
-
-
-def _link_pose(motion: ArticulatedMotion, number: int, link: int, joints: Any) -> np.ndarray:
-    """Return instrument_from_link [4, 4] mm: all axes in their order, by this link's amounts."""
-    points = torch.cat([torch.zeros(1, 3), torch.eye(3)]).double()
-    for axis, amounts in zip(motion.axes[number], motion.links[number][1][link].double().cpu(), strict=True):
-        moved = amounts[0] + amounts[1] * float(joints[axis.reading])
-        direction, pivot = axis.axis.double().cpu(), axis.pivot.double().cpu()
-        points = points + moved * direction if axis.slides else rotate_about(points, direction, pivot, moved.expand(4))
-    pose = np.eye(4)
-    pose[:3, 3] = points[0].numpy()
-    pose[:3, :3] = (points[1:] - points[0]).T.numpy()
-    return pose
 
 
 def _rotations(poses: np.ndarray) -> np.ndarray:
@@ -256,14 +161,6 @@ def _rotations(poses: np.ndarray) -> np.ndarray:
         if quats[k] @ quats[k - 1] < 0:
             quats[k] = -quats[k]
     return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
-
-
-def times_of(states: Sequence[State]) -> np.ndarray:
-    """Return the states' times [T] s from 0 on; GLTF.frame_s apart where they state none that increase."""
-    times = np.array([float(state.time) for state in states])
-    if not (np.diff(times) > 0).all():
-        times = GLTF.frame_s * np.arange(len(states))
-    return (times - times[0]).astype(np.float32)
 
 
 def _add_camera(document: _Document, camera: Camera, root: int) -> None:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from neeco.base.errors import NeecoError, install_hint
+from neeco.base.errors import NeecoError
 from neeco.base.files import write_atomically
 from neeco.capture.model import Camera, State
 from neeco.capture.readers import read_states
@@ -66,25 +66,20 @@ def exported_state(scene: GaussianScene, frame: int, states: Path | None) -> tup
 
 
 @torch.no_grad()
-def splats_of(scene: GaussianScene, state: State, camera: Camera) -> Splats:
-    """The scene in `state`, lit as `camera` has it."""
-    posed = shadowed(scene.at(state), camera, depth_maps)
-    sh = lit_harmonics(replace(posed, sh=_in_world(posed)), camera)
+def splats_of(scene: GaussianScene, state: State, camera: Camera, *, moving: bool = False) -> Splats:
+    """The scene in `state`, lit as `camera` has it; moving: without shadows, harmonics in the frames of their parts."""
+    posed = scene.at(state) if moving else shadowed(scene.at(state), camera, depth_maps)
+    sh = posed.sh if moving else _in_world(posed)
+    if posed.headlight is not None:
+        view = camera.world_from_camera.to(posed.means)
+        in_camera = (posed.means - view[:3, 3]) @ view[:3, :3]
+        sh = brightened(sh, headlight_factor(posed.headlight, camera, in_camera)[:, None, None])
     opacities = posed.opacities.clamp(1e-6, 1 - 1e-6)
     scales = posed.scales.clamp_min(MIN_SCALE).log()
     tensors = (posed.means, normalize(posed.quats, dim=1), scales, torch.logit(opacities), sh)
     if not all(bool(tensor.isfinite().all()) for tensor in tensors):
         raise NeecoError("the scene's Gaussians are not finite in this state; give another state, or train again")
     return Splats(*(tensor.float().cpu().numpy() for tensor in tensors))
-
-
-def lit_harmonics(posed: Gaussians, camera: Camera) -> Tensor:
-    """Return the harmonics [N, K, 3] with the light that `camera` carries baked in."""
-    if posed.headlight is None:
-        return posed.sh
-    view = camera.world_from_camera.to(posed.means)
-    in_camera = (posed.means - view[:3, 3]) @ view[:3, :3]
-    return brightened(posed.sh, headlight_factor(posed.headlight, camera, in_camera)[:, None, None])
 
 
 def write_splats(splats: Splats, path: Path, format: Format) -> None:
@@ -149,53 +144,3 @@ def _in_world(posed: Gaussians) -> Tensor:
     local = torch.einsum("fij,di->fdj", quat_to_matrix(frames), directions)  # [F, D, 3]
     turned = back @ sh_basis(local.reshape(-1, 3), count).reshape(*local.shape[:2], count)  # [F, K, K]
     return torch.einsum("nkl,nlc->nkc", turned[which], posed.sh)
-
-
-# UsdVol of OpenUSD 26.03 and newer: openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html
-SCHEMA = "ParticleField3DGaussianSplat"
-PRIM = "/Scene"
-METERS_PER_UNIT = 0.001
-EXTENT_SD = 3.0  # standard deviations to which a Gaussian counts for the stage's extent
-
-
-def require_usd() -> None:
-    """Raise NeecoError where OpenUSD is missing, or older than the schema."""
-    try:
-        from pxr import Usd, UsdVol
-    except ImportError:
-        raise NeecoError(f"--format: usdc needs usd-core; {install_hint('usd')}") from None
-    if not hasattr(UsdVol, SCHEMA):
-        version = ".".join(map(str, Usd.GetVersion()[1:]))
-        raise NeecoError(f"--format: usdc needs OpenUSD 26.03 or newer, this is {version}; {install_hint('usd')}")
-
-
-def write_usd(splats: Splats, path: Path) -> None:
-    """Write a binary file, .usdc. Raises NeecoError where OpenUSD is missing or too old, or the disk refuses."""
-    require_usd()
-    from pxr import Sdf, Tf, Usd, UsdGeom, UsdVol, Vt
-
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageMetersPerUnit(stage, METERS_PER_UNIT)
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, Sdf.Path(PRIM))
-    stage.SetDefaultPrim(field.GetPrim())
-    field.AddRotateXOp().Set(180.0)
-    scales = np.exp(splats.log_scales)
-    reach = EXTENT_SD * scales.max(1, keepdims=True)
-    extent = np.stack([(splats.means - reach).min(0), (splats.means + reach).max(0)])
-    degree = int(splats.sh.shape[1] ** 0.5) - 1
-    field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(splats.means))
-    field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(splats.quats[:, [1, 2, 3, 0]]))  # stored with w last
-    field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
-    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(1 / (1 + np.exp(-splats.logits))))
-    field.CreateRadianceSphericalHarmonicsDegreeAttr(degree)
-    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(splats.sh.reshape(-1, 3)))
-    field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
-
-    def write(temporary: Path) -> None:
-        try:
-            stage.GetRootLayer().Export(str(temporary))
-        except Tf.ErrorException as error:
-            raise OSError(f"OpenUSD: {str(error).splitlines()[-1]}") from error
-
-    write_atomically(path, write)

@@ -1,0 +1,147 @@
+"""Instruments of a scene that moves, for files that other viewers open: the parts of their links, and their poses.
+
+Each part's Gaussians are rigid: those that blend links follow the link of most weight from the first state on. Lamps
+and shadows are left out: light is baked into the colours as one camera observes the first state. Tissue rests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neeco.base.errors import NeecoError
+from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.capture.readers import read_states
+from neeco.geometry.rotations import matrix_to_quat, quat_multiply, rotate_about
+from neeco.scene import GaussianScene
+from neeco.scene.drawable import ArticulatedMotion
+from neeco.viewer.splats import Splats
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovingSettings:
+    """Settings of scenes that move."""
+
+    frame_s: float = 1 / 15  # between states without increasing times
+    least_weight: float = 0.9  # of a link, below which a Gaussian blends links
+
+
+MOVING = MovingSettings()
+
+
+@dataclass(frozen=True)
+class MovingPart:
+    """A part of one link of an instrument."""
+
+    name: str
+    link: int
+    rows: np.ndarray  # [M] its Gaussians
+    poses: np.ndarray  # [T, 4, 4] instrument_from_part in every state, mm
+
+
+@dataclass(frozen=True)
+class MovingInstrument:
+    """An instrument in every state."""
+
+    name: str
+    poses: np.ndarray  # [T, 4, 4] world_from_instrument, mm
+    parts: tuple[MovingPart, ...]
+    facts: dict[str, Any]  # joints, their limits, and the axes by which they move links
+
+
+def exported_states(scene: GaussianScene, first: State, states: Path | None) -> list[State]:
+    """Return the states of a file, or those recorded for training in the order of their times; `first` alone where no
+    instrument moves."""
+    if not scene.instruments:
+        return [first]
+    if states is not None:
+        return [line.state for line in read_states(states, scene.recorded.with_limits(scene.instruments))]
+    return sorted(scene.recorded.states, key=lambda state: state.time)
+
+
+def times_of(states: Sequence[State]) -> np.ndarray:
+    """Return the states' times [T] s from 0 on; `frame_s` apart where they state none that increase."""
+    times = np.array([float(state.time) for state in states])
+    if not (np.diff(times) > 0).all():
+        times = MOVING.frame_s * np.arange(len(states))
+    return (times - times[0]).astype(np.float32)
+
+
+@torch.no_grad()
+def moving_instruments(scene: GaussianScene, states: Sequence[State]) -> list[MovingInstrument]:
+    """Return every instrument in these states. Raises NeecoError where the scene's method has no joints to move by."""
+    motion = scene.motion()
+    if motion is None:
+        raise NeecoError(
+            f"--format: method {scene.method} asks a network for every state, which no file holds; use ply"
+        )
+    corrected = [scene.registered(state) for state in states]
+    labels, found = scene.label_channels().cpu().numpy(), []
+    for number, instrument in enumerate(scene.instruments):
+        rows = np.arange(len(scene.canonical))[scene.canonical.body(number + 1)]
+        given = [state.instruments[instrument.name] for state in corrected]
+        columns = [k for k, (name, _) in enumerate(scene.label_names) if name == instrument.name]
+        links, parts = motion.links[number][0].argmax(1).cpu().numpy(), []
+        for link in np.unique(links).tolist():
+            own = rows[links == link]
+            shown = labels[np.ix_(own, columns)].argmax(1) if columns else np.zeros(len(own), int)
+            poses = np.stack([_link_pose(motion, number, link, item) for item in given])
+            for part in np.unique(shown).tolist():
+                name = scene.label_names[columns[part]][1] if columns else f"link {link}"
+                parts.append(MovingPart(name, link, own[shown == part], poses))
+        bodies = np.stack([item.pose.double().cpu().numpy() for item in given])
+        found.append(MovingInstrument(instrument.name, bodies, tuple(parts), _facts(instrument, motion, number)))
+    return found
+
+
+def blended_share(scene: GaussianScene) -> float:
+    """Return the share of the instruments' Gaussians that blend links: right in the first state only."""
+    motion = scene.motion()
+    blended = [weights.max(1).values < MOVING.least_weight for weights, _ in motion.links] if motion else []
+    return float(torch.cat(blended).float().mean()) if blended else 0.0
+
+
+def local_splats(splats: Splats, rows: np.ndarray, world_from_part: np.ndarray) -> Splats:
+    """Return the Gaussians `rows` in the frame of a part at world_from_part [4, 4] mm; harmonics turn with it."""
+    rotation, translation = world_from_part[:3, :3], world_from_part[:3, 3]
+    back = matrix_to_quat(torch.from_numpy(rotation.T.copy())).expand(len(rows), 4)
+    quats = quat_multiply(back, torch.from_numpy(splats.quats[rows]).double()).numpy().astype(np.float32)
+    own = {name: values[rows] for name, values in vars(splats).items()}
+    means = ((own["means"] - translation) @ rotation).astype(np.float32)
+    return replace(Splats(**own), means=means, quats=quats)
+
+
+def _facts(instrument: Instrument, motion: ArticulatedMotion, number: int) -> dict[str, Any]:
+    """Return joints, their limits (rad or mm) and the axes (mm, instrument frame) that they move links by: a link's
+    turn or shift about an axis is at_zero + per_unit * joint."""
+    axes = [
+        {
+            "joint": axis.reading,
+            "type": "prismatic" if axis.slides else "revolute",
+            "pivot_mm": axis.pivot.tolist(),
+            "axis": axis.axis.tolist(),
+            "at_zero": motion.links[number][1][:, k, 0].tolist(),
+            "per_unit": motion.links[number][1][:, k, 1].tolist(),
+        }
+        for k, axis in enumerate(motion.axes[number])
+    ]
+    joints = {name: {"limits": None if limits is None else list(limits)} for name, limits in instrument.joints.items()}
+    return {"instrument": instrument.name, "joints": joints, "axes": axes}
+
+
+def _link_pose(motion: ArticulatedMotion, number: int, link: int, state: InstrumentState) -> np.ndarray:
+    """Return instrument_from_link [4, 4] mm: all axes in their order, by this link's amounts."""
+    points = torch.cat([torch.zeros(1, 3), torch.eye(3)]).double()
+    for axis, amounts in zip(motion.axes[number], motion.links[number][1][link].double().cpu(), strict=True):
+        moved = amounts[0] + amounts[1] * float(state.joints[axis.reading])
+        direction, pivot = axis.axis.double().cpu(), axis.pivot.double().cpu()
+        points = points + moved * direction if axis.slides else rotate_about(points, direction, pivot, moved.expand(4))
+    pose = np.eye(4)
+    pose[:3, 3] = points[0].numpy()
+    pose[:3, :3] = (points[1:] - points[0]).T.numpy()
+    return pose

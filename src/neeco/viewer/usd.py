@@ -1,0 +1,128 @@
+"""`neeco export --format usdc`: a scene that moves, as OpenUSD: an Xform for every instrument, and below it, for every
+part of a link, a ParticleField3DGaussianSplat with time samples of its transform (`neeco.viewer.moving`).
+
+The stage has y up and the capture's mm; its default prim turns the world (right, down, front) by 180 degrees about x.
+Schema: OpenUSD 26.03 and newer, openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import write_atomically
+from neeco.capture.model import Camera, State
+from neeco.scene import GaussianScene
+from neeco.viewer.moving import local_splats, moving_instruments, times_of
+from neeco.viewer.splats import Splats, splats_of
+
+SCHEMA = "ParticleField3DGaussianSplat"
+PRIM = "/Scene"
+
+
+@dataclass(frozen=True, kw_only=True)
+class UsdSettings:
+    """Settings of the stage."""
+
+    meters_per_unit: float = 0.001
+    extent_sd: float = 3.0  # standard deviations to which a Gaussian counts for the extent
+    codes_per_second: float = 1000.0  # time codes: states keep their times to the ms
+
+
+USD = UsdSettings()
+
+
+def require_usd() -> None:
+    """Raise NeecoError where OpenUSD is missing, or older than the schema."""
+    try:
+        from pxr import Usd, UsdVol
+    except ImportError:
+        raise NeecoError(f"--format: usdc needs usd-core; {install_hint('usd')}") from None
+    if not hasattr(UsdVol, SCHEMA):
+        version = ".".join(map(str, Usd.GetVersion()[1:]))
+        raise NeecoError(f"--format: usdc needs OpenUSD 26.03 or newer, this is {version}; {install_hint('usd')}")
+
+
+def write_usd(scene: GaussianScene, states: Sequence[State], camera: Camera, path: Path) -> None:
+    """Write a binary file, .usdc, of the scene moving through `states`, lit as `camera` observes the first one.
+
+    Raises NeecoError where OpenUSD is missing or too old, the scene's method has no joints to move by, or the disk
+    refuses.
+    """
+    require_usd()
+    from pxr import Tf, Usd, UsdGeom
+
+    splats, codes = splats_of(scene, states[0], camera, moving=True), times_of(states) * USD.codes_per_second
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, USD.meters_per_unit)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    stage.SetTimeCodesPerSecond(USD.codes_per_second)
+    stage.SetStartTimeCode(float(codes[0]))
+    stage.SetEndTimeCode(float(codes[-1]))
+    root = UsdGeom.Xform.Define(stage, PRIM)
+    root.AddRotateXOp().Set(180.0)
+    stage.SetDefaultPrim(root.GetPrim())
+    tissue = np.arange(scene.canonical.counts[0])
+    _define_field(stage, f"{PRIM}/tissue", local_splats(splats, tissue, np.eye(4)), "tissue")
+    for instrument in moving_instruments(scene, states):
+        place = f"{PRIM}/{_identifier(instrument.name)}"
+        body = UsdGeom.Xform.Define(stage, place)
+        _set_poses(body, instrument.poses, codes)
+        body.GetPrim().SetCustomDataByKey("neeco:instrument", instrument.name)
+        for part in instrument.parts:
+            local = local_splats(splats, part.rows, instrument.poses[0] @ part.poses[0])
+            taken = f"{place}/{_identifier(part.name)}"
+            name = f"{taken}_{part.link}" if stage.GetPrimAtPath(taken) else taken
+            _set_poses(_define_field(stage, name, local, part.name), part.poses, codes)
+
+    def write(temporary: Path) -> None:
+        try:
+            stage.GetRootLayer().Export(str(temporary))
+        except Tf.ErrorException as error:
+            raise OSError(f"OpenUSD: {str(error).splitlines()[-1]}") from error
+
+    write_atomically(path, write)
+
+
+def _identifier(name: str) -> str:
+    """Return a name that prims may have."""
+    return re.sub(r"^(\d)|\W", r"_\1", name)
+
+
+def _set_poses(prim: Any, poses: np.ndarray, codes: np.ndarray) -> None:
+    """Set parent_from_prim [T, 4, 4] mm at time codes [T]; one value where it does not change."""
+    from pxr import Gf
+
+    operation = prim.AddTransformOp()
+    matrices = [Gf.Matrix4d(*pose.T.ravel().tolist()) for pose in poses]  # USD multiplies rows
+    if np.ptp(poses, axis=0).max() == 0:
+        operation.Set(matrices[0])
+        return
+    for code, matrix in zip(codes.tolist(), matrices, strict=True):
+        operation.Set(matrix, code)
+
+
+def _define_field(stage: Any, path: str, splats: Splats, label: str) -> Any:
+    """Return a new prim with these Gaussians in its own frame, of the semantic class `label`."""
+    from pxr import UsdSemantics, UsdVol, Vt
+
+    field = getattr(UsdVol, SCHEMA).Define(stage, path)
+    scales = np.exp(splats.log_scales)
+    reach = USD.extent_sd * scales.max(1, keepdims=True)
+    extent = np.stack([(splats.means - reach).min(0), (splats.means + reach).max(0)])
+    field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(splats.means))
+    field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])))  # w last
+    field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
+    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(1 / (1 + np.exp(-splats.logits))))
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(int(splats.sh.shape[1] ** 0.5) - 1)
+    coefficients = np.ascontiguousarray(splats.sh.reshape(-1, 3))
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(coefficients))
+    field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
+    UsdSemantics.LabelsAPI.Apply(field.GetPrim(), "class").CreateLabelsAttr([label])
+    return field
