@@ -15,7 +15,7 @@ from source_trees import module_paths, module_trees
 # lines of Python: the limit, and the aim
 ROOMS = {
     "cli": (2080, 1700),
-    "viewer": (3175, 2100),
+    "viewer": (3176, 2100),
     "report": (1600, 1500),
     "studies": (3002, 2600),
     "ingest": (17_979, 10_500),
@@ -33,7 +33,7 @@ ROOMS = {
     "geometry": (983, 1000),
     "base": (1600, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (308, 240), (3621, 3000), (292, 300)
+FILES, FUNCTIONS, NUMBERS = (308, 240), (3619, 3000), (292, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

@@ -1,7 +1,8 @@
 """Instruments of a scene that moves, for files that other viewers open: the parts of their links, and their poses.
 
 Each part's Gaussians are rigid: those that blend links follow the link of most weight from the first state on. Lamps
-and shadows are left out: light is baked into the colours as one camera observes the first state, in which the tissue stays.
+and shadows are left out: light is baked into the colours as one camera observes the first state, and the tissue stays
+in that.
 """
 
 from __future__ import annotations
