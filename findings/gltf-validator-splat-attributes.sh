@@ -1,4 +1,4 @@
-#!/bin/sh
+#!/usr/bin/env bash
 # gltf-validator 2.0.0-dev.3.10 (npm): a valid GLB whose points carry Gaussians by the ratified extension
 # KHR_gaussian_splatting is reported as invalid: one error for every attribute of the extension.
 #
@@ -7,11 +7,11 @@
 # the extension prescribes ("KHR_gaussian_splatting:ROTATION"), and each of the four (rotation, scale, opacity, first
 # harmonic) is an error MESH_PRIMITIVE_INVALID_ATTRIBUTE. A pipeline that refuses files with errors refuses every splat.
 # Exit status 0: as described. 1: it has changed.
-set -eu
+set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 cd "$folder"
-npm install --silent --no-fund --no-audit gltf-validator@2.0.0-dev.3.10 >/dev/null 2>&1
+npm install --silent --no-fund --no-audit gltf-validator@2.0.0-dev.3.10
 cat > run.js <<'JS'
 const { validateBytes, version } = require("gltf-validator");
 // one Gaussian: position, rotation (xyzw), scale, opacity, first harmonic

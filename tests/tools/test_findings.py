@@ -26,6 +26,6 @@ def test_a_finding_installs_pinned_packages_in_a_temporary_folder_and_states_its
     installed = [word for line in re.findall(r"(?:pip|npm) install(.*)", commands) for word in line.split()]
     packages = [word for word in installed if not word.startswith("-")]
     assert packages
-    assert all(re.fullmatch(r"@?[\w./-]+(==|@)[\w.]+", package) for package in packages), packages
+    assert all(re.fullmatch(r"@?[\w./-]+(==|@)[\w.-]+", package) for package in packages), packages
     assert "neeco" not in commands
     assert re.search(r"^# Output of \d{4}-\d\d-\d\d", text, re.MULTILINE)

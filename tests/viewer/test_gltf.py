@@ -197,3 +197,7 @@ def test_states_without_times_are_shown_fifteen_a_second_and_recorded_ones_in_or
     times = [state.time for state in exported_states(scene, STATES[0], None)]
     assert times == sorted(times)
     assert len(times) == 8
+    scene.recorded = replace(scene.recorded, states=scene.recorded.states * 2)  # two cameras
+    assert [state.time for state in exported_states(scene, STATES[0], None)] == times
+    scene.recorded = replace(scene.recorded, states=tuple(timeless))
+    assert len(exported_states(scene, STATES[0], None)) == 5

@@ -56,13 +56,15 @@ class MovingInstrument:
 
 
 def exported_states(scene: GaussianScene, first: State, states: Path | None) -> list[State]:
-    """Return the states of a file, or those recorded for training in the order of their times; `first` alone where no
-    instrument moves."""
+    """Return the states of a file, or those recorded for training in the order of their times, one of each instant
+    that several cameras observe; `first` alone where no instrument moves."""
     if not scene.instruments:
         return [first]
     if states is not None:
         return [line.state for line in read_states(states, scene.recorded.with_limits(scene.instruments))]
-    return sorted(scene.recorded.states, key=lambda state: state.time)
+    recorded = sorted(scene.recorded.states, key=lambda state: state.time)
+    instants = {state.time: state for state in recorded}
+    return list(instants.values()) if len(instants) > 1 else recorded  # all equal: no times were recorded
 
 
 def times_of(states: Sequence[State]) -> np.ndarray:
