@@ -26,6 +26,7 @@ from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.states.alignment import align_frame
 from neeco.synthesis.contact import GRASPING, NONE, contact_of
+from neeco.synthesis.settings import Settings
 from neeco.training.run import open_gaussian_run
 
 SPLITS = ("test", "unseen")
@@ -59,17 +60,15 @@ def frames_of(path: Path, align: bool) -> list[dict[str, Any]]:
         truth = read_json(capture.root / "truth" / "contact.json")
         for frame in (frame for split in SPLITS for frame in capture.split(split)):
             fit = align_frame(scene, frame, frame.load_image(), None) if align else frame
-            drawing = draw_layers(scene, labeller, fit.state, fit.camera.scaled(scene.recorded.scale), 0.01)
+            drawing = draw_layers(
+                scene, labeller, fit.state, fit.camera.scaled(scene.recorded.scale), Settings.min_component
+            )
             label = contact_of(scene, drawing, instrument.name)
             own = truth[frame.image_path.name]
             said = label or {"contact": NONE, "contact_confidence": 0.5, "penetration_mm": np.nan}
-            frames.append({"frame": frame.name, "split": frame.split, **said, "true": own["contact"], **own_of(own)})
+            true = {"true": own["contact"], "true_depth_mm": own["depth_mm"], "displacement_mm": own["displacement_mm"]}
+            frames.append({"frame": frame.name, "split": frame.split} | said | true)
     return frames
-
-
-def own_of(truth: dict[str, Any]) -> dict[str, float]:
-    """A frame's true depth and largest displacement, mm."""
-    return {"true_depth_mm": truth["depth_mm"], "displacement_mm": truth["displacement_mm"]}
 
 
 def row_of(name: str, frames: list[dict[str, Any]]) -> str:

@@ -30,7 +30,7 @@ from playwright.sync_api import sync_playwright
 from neeco.evaluation.image_metrics import psnr, to_uint8
 from neeco.training.run import open_gaussian_run
 from neeco.viewer.gltf import write_glb
-from neeco.viewer.moving import exported_states, times_of
+from neeco.viewer.moving import exported_states, moving_scene
 
 ENGINE = "playcanvas@2.23.3"
 SETTLE_MS = 6000  # until the engine has sorted the Gaussians of a new state
@@ -102,16 +102,18 @@ def main() -> None:
         states = exported_states(scene, scene.recorded.states[0], None)
         recorded = scene.recorded.cameras[0]
         camera = replace(recorded, cx=recorded.width / 2, cy=recorded.height / 2)  # glTF has no other
-        write_glb(scene, states, camera, folder / "scene.glb")
+        moving = moving_scene(scene, states, camera)
+        write_glb(moving, camera, folder / "scene.glb")
         subprocess.run(["npm", "install", "--silent", "--prefix", scratch, ENGINE], check=True)
         (folder / "page.html").write_text(PAGE)
         aspect = camera.width * camera.fy / (camera.height * camera.fx)
         fov = 2 * math.degrees(math.atan(camera.height / (2 * camera.fy)))
         query = urlencode({"width": camera.width, "height": camera.height, "fov": fov, "aspect": aspect})
         chosen = [0, len(states) // 2]
-        times = times_of(states)
         scene.shadow_strengths.zero_()
-        for number, picture in zip(chosen, pictures_of(folder, query, [float(times[k]) for k in chosen]), strict=True):
+        for number, picture in zip(
+            chosen, pictures_of(folder, query, [float(moving.times[k]) for k in chosen]), strict=True
+        ):
             own = scene.render(states[number], camera).color.clamp(0, 1)
             print(f"state {number}: {psnr(torch.from_numpy(picture / 255).float(), own):.1f} dB")
             if arguments.out:

@@ -15,7 +15,7 @@ from source_trees import module_paths, module_trees
 # lines of Python: the limit, and the aim
 ROOMS = {
     "cli": (2080, 1700),
-    "viewer": (3178, 2100),
+    "viewer": (3173, 2100),
     "report": (1600, 1500),
     "studies": (3002, 2600),
     "ingest": (17_979, 10_500),

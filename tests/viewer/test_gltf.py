@@ -14,13 +14,12 @@ import torch
 from scene_worlds import CAMERA, STATES, TISSUE, make_scene, rigid_scene
 from scipy.spatial.transform import Rotation
 
-from neeco.base.errors import NeecoError
 from neeco.evaluation.image_metrics import psnr
 from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
 from neeco.viewer.gltf import write_glb
-from neeco.viewer.moving import blended_share, exported_states
+from neeco.viewer.moving import exported_states, moving_scene
 
 PREFIX = "KHR_gaussian_splatting:"
 AXES = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))  # glTF's from the capture's
@@ -126,7 +125,7 @@ def test_posed_by_its_animation_it_is_the_scene_in_that_state(tmp_path: Path, nu
     weights = scene.deformation.link_weights(scene.canonical, 0)
     assert weights.max(1).values.min() > 0.999
     assert len(weights.argmax(1).unique()) == 3
-    write_glb(scene, STATES, CAMERA, tmp_path / "a.glb")
+    write_glb(moving_scene(scene, STATES, CAMERA), CAMERA, tmp_path / "a.glb")
     read = Glb.read(tmp_path / "a.glb").gaussians(0.5 * number**2)
     means, covariances = in_gltf(scene.at(STATES[number]))
     own, other = in_order(means), in_order(read.means)
@@ -140,8 +139,11 @@ def test_posed_by_its_animation_it_is_the_scene_in_that_state(tmp_path: Path, nu
 def test_drawn_from_the_file_by_the_recorded_camera_it_looks_as_the_scene_does(tmp_path: Path, number: int) -> None:
     scene = rigid_scene()
     scene.canonical.means[:TISSUE, 2] += 90
+    if number == 0:  # light is baked as the camera has it in the first state
+        scene.falloff.copy_(torch.tensor([0.8, 1.2]))
+        scene.vignette.copy_(torch.tensor([-0.5, 0.1]))
     truth = scene.render(STATES[number], CAMERA).color.clamp(0, 1)
-    write_glb(scene, STATES, CAMERA, tmp_path / "a.glb")
+    write_glb(moving_scene(scene, STATES, CAMERA), CAMERA, tmp_path / "a.glb")
     read = Glb.read(tmp_path / "a.glb")
     turned = replace(CAMERA, world_from_camera=AXES @ CAMERA.world_from_camera)
     drawn = rasterize(read.gaussians(0.5 * number**2), turned).color.clamp(0, 1)
@@ -151,7 +153,7 @@ def test_drawn_from_the_file_by_the_recorded_camera_it_looks_as_the_scene_does(t
 
 def test_nodes_name_parts_and_joints_and_the_camera_looks_where_it_did(tmp_path: Path) -> None:
     scene = rigid_scene()
-    write_glb(scene, STATES, CAMERA, tmp_path / "a.glb")
+    write_glb(moving_scene(scene, STATES, CAMERA), CAMERA, tmp_path / "a.glb")
     read = Glb.read(tmp_path / "a.glb")
     nodes = {node["name"]: node for node in read.content["nodes"]}
     assert {"tissue", "grasper", "wrist", "jaw_left", "jaw_right"} <= nodes.keys()
@@ -169,7 +171,7 @@ def test_nodes_name_parts_and_joints_and_the_camera_looks_where_it_did(tmp_path:
 
 def test_the_tissue_stays_and_instruments_move_between_states_as_well(tmp_path: Path) -> None:
     scene = rigid_scene()
-    write_glb(scene, STATES, CAMERA, tmp_path / "a.glb")
+    write_glb(moving_scene(scene, STATES, CAMERA), CAMERA, tmp_path / "a.glb")
     read = Glb.read(tmp_path / "a.glb")
     moved = [read.gaussians(time).means for time in (0.0, 0.25, 0.5)]
     assert (moved[0][:TISSUE] == moved[2][:TISSUE]).all()
@@ -177,20 +179,26 @@ def test_the_tissue_stays_and_instruments_move_between_states_as_well(tmp_path: 
     assert (half > 0.1 * (moved[2] - moved[0])[TISSUE:].norm(dim=1)).all()
 
 
-def test_what_blends_links_is_counted_and_methods_without_joints_are_refused(tmp_path: Path) -> None:
-    assert blended_share(make_scene("kinematic")) > 0.1
-    assert blended_share(rigid_scene()) == 0
-    write_glb(rigid_scene(), STATES[:1], CAMERA, tmp_path / "b.glb")
-    assert "animations" not in Glb.read(tmp_path / "b.glb").content
-    with pytest.raises(NeecoError, match="4dgs asks a network for every state"):
-        write_glb(make_scene("4dgs").requires_grad_(False), STATES, CAMERA, tmp_path / "c.glb")
-    assert not (tmp_path / "c.glb").exists()
+def test_what_blends_links_is_counted_and_methods_without_joints_stand_in_one_state(tmp_path: Path) -> None:
+    assert moving_scene(make_scene("kinematic").requires_grad_(False), STATES, CAMERA).blended > 0.1
+    assert moving_scene(rigid_scene(), STATES, CAMERA).blended == 0
+    scene = make_scene("4dgs").requires_grad_(False)
+    states = exported_states(scene, STATES[1], None)
+    assert states == [STATES[1]]
+    for name, moving in (
+        ("a", moving_scene(rigid_scene(), STATES[:1], CAMERA)),
+        ("b", moving_scene(scene, states, CAMERA)),
+    ):
+        write_glb(moving, CAMERA, tmp_path / name)
+        assert "animations" not in Glb.read(tmp_path / name).content
+    read, (means, _) = Glb.read(tmp_path / "b").gaussians(0.0), in_gltf(scene.at(STATES[1]))
+    assert (means - read.means).abs().max() < 1e-3
 
 
 def test_states_without_times_are_shown_fifteen_a_second_and_recorded_ones_in_order(tmp_path: Path) -> None:
     scene = rigid_scene()
     timeless = [replace(state, time=0.0) for state in STATES]
-    write_glb(scene, timeless, CAMERA, tmp_path / "a.glb")
+    write_glb(moving_scene(scene, timeless, CAMERA), CAMERA, tmp_path / "a.glb")
     read = Glb.read(tmp_path / "a.glb")
     clock = read.values(read.content["animations"][0]["samplers"][0]["input"])[:, 0]
     assert np.allclose(clock, np.arange(5) / 15)

@@ -18,6 +18,7 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
+from neeco.viewer.moving import moving_scene
 from neeco.viewer.usd import write_usd
 
 TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # about x, to y up
@@ -28,7 +29,7 @@ def opened(tmp_path: Path) -> Any:
     pxr = pytest.importorskip("pxr", reason="the extra usd")
     scene = rigid_scene()
     scene.canonical.means[:TISSUE, 2] += 90
-    write_usd(scene, STATES, CAMERA, tmp_path / "scene.usdc")
+    write_usd(moving_scene(scene, STATES, CAMERA), tmp_path / "scene.usdc")
     return pxr, pxr.Usd.Stage.Open(str(tmp_path / "scene.usdc")), scene
 
 
@@ -100,9 +101,10 @@ def test_prims_have_names_labels_extents_and_the_stage_its_axes(opened: Any) -> 
 
 
 def test_a_missing_or_old_openusd_is_refused_with_what_to_install(tmp_path, monkeypatch):
+    moving = moving_scene(rigid_scene(), STATES, CAMERA)
     old = SimpleNamespace(Usd=SimpleNamespace(GetVersion=lambda: (0, 25, 5)), UsdVol=SimpleNamespace())
     for module, why in ((None, "usdc needs usd-core"), (old, "26.03 or newer, this is 25.5")):
         monkeypatch.setitem(sys.modules, "pxr", module)
         with pytest.raises(NeecoError, match=rf"{why}; pip install '.\[usd\]'"):
-            write_usd(rigid_scene(), STATES, CAMERA, tmp_path / "a.usdc")
+            write_usd(moving, tmp_path / "a.usdc")
     assert not list(tmp_path.iterdir())

@@ -21,8 +21,7 @@ class Arguments:
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote."""
     format: Format | None = None
-    """ply: as 3D Gaussian splatting's code writes it. spz: a tenth of the size, coarser. glb (glTF), usdc (OpenUSD,
-    extra usd): a node for every part, recorded states as animation. Default: as --output ends, or ply."""
+    """ply; spz: a tenth of the size; glb (glTF); usdc (OpenUSD, extra usd). Default: as --output ends or ply."""
     output: Path | None = None
     """File to write, .ply, .spz, .usdc or .glb. Default: scene.ply (or as --format) in the run folder."""
     frame: int = 0
@@ -38,9 +37,9 @@ def run(arguments: Arguments) -> int:
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run
     from neeco.viewer.gltf import write_glb
-    from neeco.viewer.moving import blended_share, exported_states
+    from neeco.viewer.moving import exported_states, moving_scene
     from neeco.viewer.splats import exported_state, splats_of, write_splats
-    from neeco.viewer.usd import write_usd
+    from neeco.viewer.usd import require_usd, write_usd
 
     format = arguments.format or "ply"
     if arguments.output is not None:
@@ -48,6 +47,8 @@ def run(arguments: Arguments) -> int:
         require_ending("--output", arguments.output, *(f".{ending}" for ending in endings))
         if arguments.format is None and arguments.output.suffix:
             format = cast(Format, arguments.output.suffix[1:].lower())
+    if format == "usdc":
+        require_usd()
     with open_gaussian_run(arguments.run, "export", device_of(arguments.device)) as trained:
         scene = trained.scene
         frames = len(scene.recorded.states)
@@ -56,9 +57,9 @@ def run(arguments: Arguments) -> int:
         state, camera = exported_state(scene, arguments.frame, arguments.states)
         output = arguments.output or arguments.run / f"scene.{format}"
         if format == "glb" or format == "usdc":
-            states = exported_states(scene, state, arguments.states)
-            (write_glb if format == "glb" else write_usd)(scene, states, camera, output)
-            note = f"{len(states)} states; {blended_share(scene):.0%} of the instruments' Gaussians blend links"
+            moving = moving_scene(scene, exported_states(scene, state, arguments.states), camera)
+            write_glb(moving, camera, output) if format == "glb" else write_usd(moving, output)
+            note = f"{len(moving.times)} states; {moving.blended:.0%} of the instruments' Gaussians blend links"
         else:
             note = "without joints and labels"
             write_splats(splats_of(scene, state, camera), output, format)

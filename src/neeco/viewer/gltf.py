@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,12 @@ import numpy as np
 import torch
 
 from neeco.base.files import write_atomically
-from neeco.capture.model import Camera, State
+from neeco.capture.model import Camera
 from neeco.evaluation.image_metrics import to_uint8
 from neeco.geometry.rotations import matrix_to_quat
 from neeco.raster.reference import SH_C0
-from neeco.scene import GaussianScene
-from neeco.viewer.moving import local_splats, moving_instruments, times_of
-from neeco.viewer.splats import Splats, splats_of
+from neeco.viewer.moving import MovingScene, local_splats
+from neeco.viewer.splats import Splats
 
 EXTENSION = "KHR_gaussian_splatting"
 
@@ -91,22 +89,12 @@ class _Document:
         return struct.pack("<4sII", MAGIC, 2, size) + b"".join(chunks) + bytes(self.binary)
 
 
-def write_glb(scene: GaussianScene, states: Sequence[State], camera: Camera, path: Path) -> None:
-    """Write the scene, moving through `states`, lit as `camera` observes the first one.
-
-    Raises NeecoError where the scene's method has no joints to move by, its numbers are not finite, or the disk
-    refuses.
-    """
-    document = _described(scene, states, camera)
-    write_atomically(path, lambda temporary: temporary.write_bytes(document.packed()))
-
-
-def _described(scene: GaussianScene, states: Sequence[State], camera: Camera) -> _Document:
-    document, splats = _Document(), splats_of(scene, states[0], camera, moving=True)
+def write_glb(scene: MovingScene, camera: Camera, path: Path) -> None:
+    """Write the scene and its camera. Raises NeecoError where the disk refuses."""
+    document, splats = _Document(), scene.splats
     root = document.node("neeco", rotation=TURN.tolist())
-    tissue = np.arange(scene.canonical.counts[0])
-    _add_mesh(document, document.node("tissue", root), local_splats(splats, tissue, np.eye(4)))
-    clock = document.add(times_of(states), bounds=True) if len(states) > 1 else None
+    _add_mesh(document, document.node("tissue", root), local_splats(splats, scene.still, np.eye(4)))
+    clock = document.add(scene.times, bounds=True) if len(scene.times) > 1 else None
     channels: list[dict[str, Any]] = []
     samplers: list[dict[str, Any]] = []
 
@@ -119,7 +107,7 @@ def _described(scene: GaussianScene, states: Sequence[State], camera: Camera) ->
                 samplers.append({"input": clock, "output": document.add(values), "interpolation": "LINEAR"})
                 channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": target}})
 
-    for instrument in moving_instruments(scene, states):
+    for instrument in scene.instruments:
         body = document.node(instrument.name, root, extras=instrument.facts)
         animate(body, instrument.poses)
         for part in instrument.parts:
@@ -127,21 +115,32 @@ def _described(scene: GaussianScene, states: Sequence[State], camera: Camera) ->
             node = document.node(part.name, body, extras=extras)
             animate(node, part.poses)
             _add_mesh(document, node, local_splats(splats, part.rows, instrument.poses[0] @ part.poses[0]))
-    _add_camera(document, camera, root)
+    pose = camera.world_from_camera.double().cpu()
+    lens = {
+        "yfov": 2 * math.atan(camera.height / (2 * camera.fy)),
+        "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
+        "znear": GLTF.near_m,
+    }
+    document.content["cameras"] = [{"name": "laparoscope", "type": "perspective", "perspective": lens}]
+    rotation = _rotations(
+        np.stack([np.block([[(pose[:3, :3] @ CAMERA_TURN).numpy(), np.zeros((3, 1))], [np.eye(4)[3:]]])])
+    )
+    place = (pose[:3, 3] * GLTF.metres).tolist()
+    # glTF cannot state a principal point off the image's centre
+    document.node("laparoscope", root, camera=0, rotation=rotation[0].tolist(), translation=place)
     document.content |= {"asset": {"version": "2.0", "generator": "neeco"}, "extensionsUsed": [EXTENSION]}
     document.content |= {"scene": 0, "scenes": [{"nodes": [root]}]}
     if channels:
         document.content["animations"] = [{"name": "states", "channels": channels, "samplers": samplers}]
-    return document
+    write_atomically(path, lambda temporary: temporary.write_bytes(document.packed()))
 
 
 def _add_mesh(document: _Document, node: int, splats: Splats) -> None:
     """Give a node its Gaussians, in its own frame, mm."""
-    opacities = 1 / (1 + np.exp(-splats.logits))
-    shown = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, opacities[:, None]], 1)
+    shown = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, splats.opacities[:, None]], 1)
     columns = {"ROTATION": splats.quats[:, [1, 2, 3, 0]], "SCALE": np.exp(splats.log_scales) * GLTF.metres}
-    columns["OPACITY"] = opacities
-    for degree in range(int(splats.sh.shape[1] ** 0.5)):
+    columns["OPACITY"] = splats.opacities
+    for degree in range(splats.degree + 1):
         for order in range(2 * degree + 1):
             columns[f"SH_DEGREE_{degree}_COEF_{order}"] = splats.sh[:, degree**2 + order]
     attributes = {"POSITION": document.add((splats.means * GLTF.metres).astype(np.float32), bounds=True)}
@@ -161,19 +160,3 @@ def _rotations(poses: np.ndarray) -> np.ndarray:
         if quats[k] @ quats[k - 1] < 0:
             quats[k] = -quats[k]
     return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
-
-
-def _add_camera(document: _Document, camera: Camera, root: int) -> None:
-    """Add the camera at its pose; glTF cannot state a principal point off the image's centre."""
-    pose = camera.world_from_camera.double().cpu()
-    lens = {
-        "yfov": 2 * math.atan(camera.height / (2 * camera.fy)),
-        "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
-        "znear": GLTF.near_m,
-    }
-    document.content["cameras"] = [{"name": "laparoscope", "type": "perspective", "perspective": lens}]
-    rotation = _rotations(
-        np.stack([np.block([[(pose[:3, :3] @ CAMERA_TURN).numpy(), np.zeros((3, 1))], [np.eye(4)[3:]]])])
-    )
-    place = (pose[:3, 3] * GLTF.metres).tolist()
-    document.node("laparoscope", root, camera=0, rotation=rotation[0].tolist(), translation=place)

@@ -7,7 +7,7 @@ in that.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.base.errors import NeecoError
-from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.capture.readers import read_states
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply, rotate_about
 from neeco.scene import GaussianScene
 from neeco.scene.drawable import ArticulatedMotion
-from neeco.viewer.splats import Splats
+from neeco.viewer.splats import Splats, splats_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,10 +54,21 @@ class MovingInstrument:
     facts: dict[str, Any]  # joints, their limits, and the axes by which they move links
 
 
+@dataclass(frozen=True)
+class MovingScene:
+    """A scene in a sequence of states."""
+
+    splats: Splats  # in the first state
+    still: np.ndarray  # [M] rows of these that no instrument's part has
+    instruments: tuple[MovingInstrument, ...]
+    times: np.ndarray  # [T] s, from 0 on
+    blended: float  # share of the instruments' Gaussians that blend links: right in the first state only
+
+
 def exported_states(scene: GaussianScene, first: State, states: Path | None) -> list[State]:
     """Return the states of a file, or those recorded for training in the order of their times, one of each instant
-    that several cameras observe; `first` alone where no instrument moves."""
-    if not scene.instruments:
+    that several cameras observe; `first` alone where no instrument moves, or a network moves all Gaussians."""
+    if not scene.instruments or scene.motion() is None:
         return [first]
     if states is not None:
         return [line.state for line in read_states(states, scene.recorded.with_limits(scene.instruments))]
@@ -76,15 +86,24 @@ def times_of(states: Sequence[State]) -> np.ndarray:
 
 
 @torch.no_grad()
-def moving_instruments(scene: GaussianScene, states: Sequence[State]) -> list[MovingInstrument]:
-    """Return every instrument in these states. Raises NeecoError where the scene's method has no joints to move by."""
-    motion = scene.motion()
+def moving_scene(scene: GaussianScene, states: Sequence[State], camera: Camera) -> MovingScene:
+    """Return the scene moving through `states`, lit as `camera` observes the first one; still where its method has no
+    joints to move by. Raises NeecoError where its numbers are not finite."""
+    motion, rows = scene.motion(), np.arange(len(scene.canonical))
+    splats, times = splats_of(scene, states[0], camera, moving=motion is not None), times_of(states)
     if motion is None:
-        raise NeecoError(
-            f"--format: method {scene.method} asks a network for every state, which no file holds; use ply"
-        )
+        return MovingScene(splats, rows, (), times, 0.0)
+    blended = [weights.max(1).values < MOVING.least_weight for weights, _ in motion.links]
+    share = float(torch.cat(blended).float().mean()) if blended else 0.0
+    instruments = tuple(_moving_instruments(scene, motion, states))
+    return MovingScene(splats, rows[: scene.canonical.counts[0]], instruments, times, share)
+
+
+def _moving_instruments(
+    scene: GaussianScene, motion: ArticulatedMotion, states: Sequence[State]
+) -> Iterator[MovingInstrument]:
     corrected = [scene.registered(state) for state in states]
-    labels, found = scene.label_channels().cpu().numpy(), []
+    labels = scene.label_channels().cpu().numpy()
     for number, instrument in enumerate(scene.instruments):
         rows = np.arange(len(scene.canonical))[scene.canonical.body(number + 1)]
         given = [state.instruments[instrument.name] for state in corrected]
@@ -98,15 +117,7 @@ def moving_instruments(scene: GaussianScene, states: Sequence[State]) -> list[Mo
                 name = scene.label_names[columns[part]][1] if columns else f"link {link}"
                 parts.append(MovingPart(name, link, own[shown == part], poses))
         bodies = np.stack([item.pose.double().cpu().numpy() for item in given])
-        found.append(MovingInstrument(instrument.name, bodies, tuple(parts), _facts(instrument, motion, number)))
-    return found
-
-
-def blended_share(scene: GaussianScene) -> float:
-    """Return the share of the instruments' Gaussians that blend links: right in the first state only."""
-    motion = scene.motion()
-    blended = [weights.max(1).values < MOVING.least_weight for weights, _ in motion.links] if motion else []
-    return float(torch.cat(blended).float().mean()) if blended else 0.0
+        yield MovingInstrument(instrument.name, bodies, tuple(parts), _facts(instrument, motion, number))
 
 
 def local_splats(splats: Splats, rows: np.ndarray, world_from_part: np.ndarray) -> Splats:

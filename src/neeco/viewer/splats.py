@@ -2,7 +2,7 @@
 
 They know neither joints nor lamps nor labels: instruments stand still, and the light is baked into the colours as one
 camera has it. Coordinates are those of the capture's world (mm), right, down and front by the custom of PLY; in SPZ,
-whose axes are right, up and back, and in OpenUSD with y up they are turned about x by 180 degrees, so that all overlay.
+whose axes are right, up and back, they are turned about x by 180 degrees, so that both overlay.
 """
 
 from __future__ import annotations
@@ -50,6 +50,16 @@ class Splats:
     log_scales: np.ndarray  # [N, 3]
     logits: np.ndarray  # [N] of the opacities
     sh: np.ndarray  # [N, K, 3], world frame
+
+    @property
+    def opacities(self) -> np.ndarray:
+        """Return the opacities [N] in (0, 1)."""
+        return 1 / (1 + np.exp(-self.logits))
+
+    @property
+    def degree(self) -> int:
+        """Return the degree of the harmonics."""
+        return int(self.sh.shape[1] ** 0.5) - 1
 
 
 def exported_state(scene: GaussianScene, frame: int, states: Path | None) -> tuple[State, Camera]:
@@ -110,8 +120,7 @@ def spz_bytes(splats: Splats) -> bytes:
     fixed = np.rint(splats.means.astype(np.float64) * 2**SPZ_FRACTION).astype(np.int64)
     if fixed.size and np.abs(fixed).max() >= 2**23:
         raise NeecoError("--format: spz holds positions within 2 m of the world's origin only; use ply")
-    degree = int(splats.sh.shape[1] ** 0.5) - 1
-    header = struct.pack("<IIIBBBB", SPZ_MAGIC, SPZ_VERSION, len(splats.means), degree, SPZ_FRACTION, 0, 0)
+    header = struct.pack("<IIIBBBB", SPZ_MAGIC, SPZ_VERSION, len(splats.means), splats.degree, SPZ_FRACTION, 0, 0)
     positions = (fixed & 0xFFFFFF).astype("<u4")[..., None].view(np.uint8)[..., :3]
     quats = np.where(splats.quats[:, :1] < 0, -splats.quats, splats.quats)[:, 1:]  # w, positive, follows from them
     columns = (

@@ -8,7 +8,6 @@ Schema: OpenUSD 26.03 and newer, openusd.org/release/api/class_usd_vol_particle_
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,8 @@ import numpy as np
 
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import write_atomically
-from neeco.capture.model import Camera, State
-from neeco.scene import GaussianScene
-from neeco.viewer.moving import local_splats, moving_instruments, times_of
-from neeco.viewer.splats import Splats, splats_of
+from neeco.viewer.moving import MovingScene, local_splats
+from neeco.viewer.splats import Splats
 
 SCHEMA = "ParticleField3DGaussianSplat"
 PRIM = "/Scene"
@@ -49,16 +46,12 @@ def require_usd() -> None:
         raise NeecoError(f"--format: usdc needs OpenUSD 26.03 or newer, this is {version}; {install_hint('usd')}")
 
 
-def write_usd(scene: GaussianScene, states: Sequence[State], camera: Camera, path: Path) -> None:
-    """Write a binary file, .usdc, of the scene moving through `states`, lit as `camera` observes the first one.
-
-    Raises NeecoError where OpenUSD is missing or too old, the scene's method has no joints to move by, or the disk
-    refuses.
-    """
+def write_usd(scene: MovingScene, path: Path) -> None:
+    """Write a binary file, .usdc. Raises NeecoError where OpenUSD is missing or too old, or the disk refuses."""
     require_usd()
     from pxr import Tf, Usd, UsdGeom
 
-    splats, codes = splats_of(scene, states[0], camera, moving=True), times_of(states) * USD.codes_per_second
+    splats, codes = scene.splats, scene.times * USD.codes_per_second
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageMetersPerUnit(stage, USD.meters_per_unit)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -68,9 +61,8 @@ def write_usd(scene: GaussianScene, states: Sequence[State], camera: Camera, pat
     root = UsdGeom.Xform.Define(stage, PRIM)
     root.AddRotateXOp().Set(180.0)
     stage.SetDefaultPrim(root.GetPrim())
-    tissue = np.arange(scene.canonical.counts[0])
-    _define_field(stage, f"{PRIM}/tissue", local_splats(splats, tissue, np.eye(4)), "tissue")
-    for instrument in moving_instruments(scene, states):
+    _define_field(stage, f"{PRIM}/tissue", local_splats(splats, scene.still, np.eye(4)), "tissue")
+    for instrument in scene.instruments:
         place = f"{PRIM}/{_identifier(instrument.name)}"
         body = UsdGeom.Xform.Define(stage, place)
         _set_poses(body, instrument.poses, codes)
@@ -119,8 +111,8 @@ def _define_field(stage: Any, path: str, splats: Splats, label: str) -> Any:
     field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(splats.means))
     field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])))  # w last
     field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
-    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(1 / (1 + np.exp(-splats.logits))))
-    field.CreateRadianceSphericalHarmonicsDegreeAttr(int(splats.sh.shape[1] ** 0.5) - 1)
+    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(splats.opacities))
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(splats.degree)
     coefficients = np.ascontiguousarray(splats.sh.reshape(-1, 3))
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(coefficients))
     field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
