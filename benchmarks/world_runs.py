@@ -54,6 +54,11 @@ def linked(world: World) -> bool:
     return world.links != "none" and world.joints
 
 
+def unstated_wrist(world: World) -> bool:
+    """A wrist whose joints are logged and whose links nothing states."""
+    return world.links == "none" and world.joints and world.kind == "wrist"
+
+
 def erring(world: World) -> bool:
     """States have errors."""
     return world.states != "exact"
@@ -102,6 +107,10 @@ WITHOUT: dict[str, Mechanism] = {
     "judging-again": Mechanism(f"{METHOD}m.judge_again = {NOTHING}", mistaken),
     "carving-again": Mechanism(f"{METHOD}m.carve_again = {NOTHING}", mistaken),
     "refuted-dropped": Mechanism(f"{FINISH}m.drop_refuted = lambda session: session.scene.canonical"),
+    "detached-dropped": Mechanism(f"{FINISH}m.drop_detached = lambda canonical: canonical"),
+    "wrists-found": Mechanism(
+        f"import neeco.methods.kinematic.discovery as m; m.search_wrist = {NOTHING}", unstated_wrist
+    ),
     "wrists-placed": Mechanism(f"{METHOD}m.place_wrists = {NOTHING}", jointed),
     "wrists-again": _option("deformation.refine_wrists=false", jointed),
     "shadow": _option("deformation.shadow=false"),

@@ -20,6 +20,7 @@ from neeco.geometry.rotations import rigid_from_vector, rotate_about
 from neeco.methods.kinematic.link_registration import base_root, correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
+from neeco.methods.kinematic.wrist_search import search_wrist
 from neeco.scene.drawable import Recorded
 from neeco.states.refinement import RefineConfig, Refinement
 
@@ -295,3 +296,34 @@ def test_a_base_that_is_off_is_corrected(carved: tuple[Evidence, CarvedShape]) -
     before = pivots_off_mm(asked, links, off[0], true[0])
     assert correct_poses(asked, links, *carved_for(asked, off), readings_of(asked, off[0], "tool"))
     assert pivots_off_mm(asked, links, off[0], true[0]) < 0.4 * before
+
+
+def exchanged(readings: list[dict[str, float]]) -> list[dict[str, float]]:
+    return [{"pitch": given["jaw"], "jaw": given["pitch"]} for given in readings]
+
+
+@pytest.mark.parametrize("named", [list, exchanged])
+def test_links_that_nobody_stated_are_found_whatever_their_readings_are_called(carved, named) -> None:
+    evidence, shape = carved
+    readings = named([dict(frame.state.instruments["tool"].joints) for frame in evidence.frames])
+    tree = search_wrist(evidence, "tool", shape, readings, ("pitch", "jaw"))
+    assert tree is not None
+    _, wrist, left, right = tree.links
+    first, second = ("pitch", "jaw") if named is list else ("jaw", "pitch")
+    assert set(wrist.value) == {first}
+    assert set(left.value) == set(right.value) == {second}
+    assert right.value[second] - left.value[second] == pytest.approx(1.0)
+    points, directions = tree.axes_at_rest
+    np.testing.assert_allclose(np.abs(directions), [[1, 0, 0], [1, 0, 0], [0, 1, 0]], atol=0.2)
+    np.testing.assert_allclose(points[:, 2], [YAW_AT, YAW_AT, PITCH_AT], atol=4.0)
+    # turned as the true one is, but for its errors
+    true, found = (part.poses({"pitch": 0.5, "jaw": 0.0})["wrist"] for part in (driver_tree(), tree))
+    if named is list:
+        np.testing.assert_allclose(found[:3, :3], true[:3, :3], atol=0.2)
+
+
+def test_readings_of_other_moments_show_no_wrist(carved) -> None:
+    evidence, shape = carved
+    readings = [dict(frame.state.instruments["tool"].joints) for frame in evidence.frames]
+    exchanged_in_time = [*readings[17:], *readings[:17]]
+    assert search_wrist(evidence, "tool", shape, exchanged_in_time, ("pitch", "jaw")) is None

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.base.errors import NeecoError
+from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.geometry.camera import Camera
 from neeco.raster.types import Rendering
@@ -154,8 +155,10 @@ class Deformation(nn.Module, Method):
         control carries them along."""
         return {}
 
-    def begin(self, session: Any) -> None:
-        """Called once before the first step of a new scene (not on resume); may replace the canonical Gaussians."""
+    def begin(self, session: Any) -> Mapping[str, KinematicTree]:
+        """Called once before the first step of a new scene (not on resume); may replace the canonical Gaussians. Where
+        it returns links of instruments, a scene in which these are stated takes the place of this one."""
+        return {}
 
     def perturb(
         self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator

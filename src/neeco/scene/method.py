@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from torch import Tensor
 
-from neeco.capture.model import Capture, Frame, Instrument
+from neeco.capture.model import Capture, Instrument
 from neeco.raster.native import torch_threads
 from neeco.scene.drawable import DrawableScene, Recorded
 from neeco.scene.training_session import Report, RunLength, Session
@@ -71,7 +71,7 @@ class Method:
 
     @classmethod
     def learned_joints(
-        cls, instrument: Instrument, joints: tuple[str, ...], frames: Sequence[Frame], settings: Any, report: Report
+        cls, instrument: Instrument, joints: tuple[str, ...], settings: Any, report: Report
     ) -> tuple[str, ...]:
         """Return the `joints` that are learned of an instrument without stated links; `report` those that are left out
         or uncertain."""

@@ -48,8 +48,9 @@ def begin_session(
     assert isinstance(scene, GaussianScene)
     session = new_session(scene.to(views.device), views, config, report)
     session.timed = capture.timed
-    if is_new:
-        scene.deformation.begin(session)
+    if is_new and (trees := scene.deformation.begin(session)):
+        found = [replace(item, kinematics=trees.get(item.name, item.kinematics)) for item in capture.instruments]
+        return begin_session(replace(capture, instruments=tuple(found)), views, config, report)
     session.start()
     return session
 
@@ -116,7 +117,7 @@ def _learned_instrument(
         return replace(instrument, joints=stated, unrecorded=unrecorded, left_out=left_out)
     joints = moving_joints(instrument, frames, config, report)
     if config.joints is None:
-        joints = method.learned_joints(instrument, joints, frames, config.deformation, report)
+        joints = method.learned_joints(instrument, joints, config.deformation, report)
     learned = {joint: instrument.joints[joint] for joint in joints}
     return Instrument(instrument.name, learned, left_out=tuple(sorted(set(instrument.joints) - set(learned))))
 

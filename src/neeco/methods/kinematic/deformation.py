@@ -26,7 +26,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neeco.capture.model import Frame, Instrument, State, evenly_spaced
+from neeco.capture.kinematics import KinematicTree
+from neeco.capture.model import Instrument, State, evenly_spaced
 from neeco.evidence.carving import CarvingSettings
 from neeco.evidence.foreground import SETTINGS, Foreground
 from neeco.geometry.camera import Camera
@@ -179,11 +180,10 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         cls,
         instrument: Instrument,
         joints: tuple[str, ...],
-        frames: Sequence[Frame],
         settings: KinematicSettings,
         report: Report,
     ) -> tuple[str, ...]:
-        return hinge_joints(instrument, joints, frames, report) if settings.kinematics else joints
+        return hinge_joints(instrument, joints, report) if settings.kinematics else joints
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         """Pose every instrument as an articulated body: its readings become joint values, these move its links."""
@@ -273,9 +273,9 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
         return {LINK_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}
 
-    def begin(self, session: GaussianSession) -> None:
+    def begin(self, session: GaussianSession) -> dict[str, KinematicTree]:
         with session.searching():
-            find_instruments(session, self)
+            return find_instruments(session, self, wrists=self.settings.kinematics and session.config.joints is None)
 
     def perturb(
         self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator

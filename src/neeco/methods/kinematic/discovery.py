@@ -5,19 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neeco.base.errors import NeecoError
+from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
 from neeco.evidence.carving import CARVING, Evidence, carve_along, frame_along, pad_and_stack
 from neeco.geometry.projection import project_world
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
-from neeco.methods.kinematic.hinges import Hinges, start_hinges
+from neeco.methods.kinematic.hinges import STATE_LINKS, STICKS, Hinges, start_hinges
 from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
 from neeco.methods.kinematic.stated_links import StatedLinks
+from neeco.methods.kinematic.wrist_search import WRISTS, search_wrist
 from neeco.methods.tissue_fit import carved_shape, fit_tissue, tissue_evidence
 from neeco.raster.reference import SH_C0
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
@@ -27,26 +30,67 @@ from neeco.states.outline_states import register_states
 from neeco.training.session import GaussianSession
 
 
-def find_instruments(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+def find_instruments(
+    session: GaussianSession, articulated: ArticulatedInstruments, *, wrists: bool
+) -> dict[str, KinematicTree]:
     """Add every instrument's body to the session's scene, whose canonical set holds the tissue alone, and start its
-    joints.
+    joints. Or, with `wrists`, return the links of instruments whose several joints no kinematics explain, where images
+    show them; then nothing was added.
 
     `articulated` is the scene's deformation. Raises NeecoError when an instrument leaves no evidence in its own frame:
     its poses do not match the images.
     """
     scene, report = session.scene, session.report
     if not scene.instruments:
-        return
+        return {}
     report("searching for the instruments: fitting the tissue alone")
     tissue = fit_tissue(scene, session.views, session.config)
     if isinstance(articulated, BreathingTissue) and articulated.may_breathe and session.timed:
         tissue = _learn_breathing(session, articulated, tissue)
     evidence = tissue_evidence(scene, session.views, session.config, tissue)
+    if wrists and (found := _unstated_wrists(session, articulated, evidence)):
+        return found
     alone = len(scene.instruments) == 1 and isinstance(articulated.articulations[0], StatedLinks)
     corrects = alone and session.config.refine.frame_poses
     if corrects and register_states(session.views, session.refinement, scene.instruments[0]):
         evidence = _corrected_evidence(session, evidence)
     scene.canonical = _with_instruments(session, articulated, evidence)
+    return {}
+
+
+def _unstated_wrists(
+    session: GaussianSession, articulated: ArticulatedInstruments, evidence: Evidence
+) -> dict[str, KinematicTree]:
+    """Return the links of instruments with several moving joints and no kinematics, where images show them; report
+    either."""
+    generator, found = torch.Generator().manual_seed(session.config.seed), {}
+    for instrument, articulation in zip(session.scene.instruments, articulated.articulations, strict=True):
+        readings = [frame.state.instruments[instrument.name].joints for frame in evidence.frames]
+        logged = set.intersection(*map(set, readings))
+        varying = {j for j in logged if np.ptp([given[j] for given in readings]) > STICKS.min_reading_range}
+        moving = [joint for joint in articulation.reading_names if joint in varying]
+        if len(moving) < 2 or isinstance(articulation, StatedLinks):
+            continue
+        tree = None
+        if len(moving) <= WRISTS.max_joints:
+            session.report(f"{instrument.name}: searching for its links, as nothing states them: {', '.join(moving)}")
+            shape = carved_shape(session, evidence, instrument.name, generator)
+            # a joint of the wrist may follow from the poses by chance
+            others = [joint for joint in instrument.left_out if joint in varying and not instrument.slides(joint)]
+            tree = search_wrist(evidence, instrument.name, shape, readings, moving, others[: WRISTS.max_others])
+        if tree is None:
+            session.report(
+                f"warning: {instrument.name}: {', '.join(moving)}: several joints, no kinematics, and images show no "
+                f"wrist that they turn; each is learned as a hinge across the shaft, which fits jaws; {STATE_LINKS}"
+            )
+        else:
+            found[instrument.name] = tree
+            session.report(f"{instrument.name}: images show its links: {_words(tree)}; if that is wrong, {STATE_LINKS}")
+    return found
+
+
+def _words(tree: KinematicTree) -> str:
+    return ", ".join(f"{link.name} turned by {' and '.join(link.value)}" for link in tree.links if link.value)
 
 
 def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:

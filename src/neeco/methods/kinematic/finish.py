@@ -9,6 +9,9 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
@@ -37,6 +40,7 @@ class FinishSettings:
     # show either for certain
     refuting_frames: int = 2
     refuting_share: float = 0.25
+    max_gap_mm: float = 3.0  # between solid Gaussians of one instrument; beyond, they are detached from it
     # training frames that must observe a position of the shaft for it to be copied: share, and number (half at most)
     min_coverage: float = 0.08
     min_frames: int = 6
@@ -50,12 +54,12 @@ FINISH = FinishSettings()
 
 @torch.no_grad()
 def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Drop occluded Gaussians of instruments, set the extent of each, prolong its shaft and write the joints' verdicts
-    into `scene.diagnostics`. Warn of an instrument of which hardly anything was learned.
+    """Drop refuted, occluded and detached Gaussians of instruments, set the extent of each, prolong its shaft and write
+    the joints' verdicts into `scene.diagnostics`. Warn of an instrument of which hardly anything was learned.
     """
     session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
     session.scene.canonical = drop_refuted(session)
-    session.scene.canonical = finalise_links(drop_occluded(session.scene), articulated)
+    session.scene.canonical = finalise_links(drop_detached(drop_occluded(session.scene)), articulated)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         articulation = articulated.articulations[index]
@@ -219,6 +223,32 @@ def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
         for own in instruments:
             alone[own] += visible_pixels(posed.select(own), camera)
     stays = (canonical.bodies == 0) | (alone < FINISH.min_pixels_alone) | (visible >= FINISH.min_visible_share * alone)
+    return _selected(canonical, stays)
+
+
+def drop_detached(canonical: CanonicalGaussians) -> CanonicalGaussians:
+    """Return the canonical Gaussians without those of instruments that are detached from the rest of their instrument.
+
+    An instrument is connected. A cloud beside it is tissue that moved as the instrument did in a few frames, or that no
+    frame looked at, and it would be labelled in new states.
+    """
+    stays = canonical.bodies == 0
+    for body in range(1, len(canonical.counts)):
+        rows = canonical.body(body)
+        points = canonical.means[rows].detach().cpu().double().numpy()
+        areas = canonical.log_scales[rows].detach().topk(2).values.sum(1).exp()
+        solid = solid_gaussians(canonical, body - 1).cpu().numpy()
+        if not solid.any():
+            stays[rows] = True
+            continue
+        # cells bound the number of pairs, however dense the Gaussians
+        cells, cell = np.unique(np.floor(points[solid] / (FINISH.max_gap_mm / 4)), axis=0, return_inverse=True)
+        pairs = KDTree(cells).query_pairs(4, output_type="ndarray")
+        links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), 2 * (len(cells),))
+        group = connected_components(links, directed=False)[1][cell.ravel()]
+        largest = np.bincount(group, areas.cpu().numpy()[solid]).argmax()
+        away, _ = KDTree(points[solid][group == largest]).query(points, distance_upper_bound=FINISH.max_gap_mm)
+        stays[rows] = torch.from_numpy(np.isfinite(away)).to(stays.device)
     return _selected(canonical, stays)
 
 

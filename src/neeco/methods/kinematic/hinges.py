@@ -6,7 +6,7 @@ The search tries stick figures, and seeds the parts that turn about the joints f
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neeco.capture.model import Frame, Instrument
+from neeco.capture.model import Instrument
 from neeco.evidence.carving import CarvedShape, CarvingSettings, Evidence, camera_from_instrument, center_line
 from neeco.geometry.rotations import rotate_about
 from neeco.methods.kinematic.articulation import Articulation
@@ -270,23 +270,13 @@ STATE_LINKS = (
 )
 
 
-def hinge_joints(
-    instrument: Instrument, joints: tuple[str, ...], frames: Sequence[Frame], report: Report
-) -> tuple[str, ...]:
-    """Return those of `joints` that are learned as hinges across the shaft: all revolute ones. Warn of prismatic
-    joints, and of several moving ones, for which this is the wrong model."""
+def hinge_joints(instrument: Instrument, joints: tuple[str, ...], report: Report) -> tuple[str, ...]:
+    """Return those of `joints` that are learned as hinges across the shaft, or as a wrist: all revolute ones. Warn of
+    prismatic joints."""
     for joint in joints:
         if instrument.slides(joint):
             report(f"warning: {instrument.name}: joint {joint} is prismatic and moves no part; {STATE_LINKS}")
-    turning = tuple(joint for joint in joints if not instrument.slides(joint))
-    states = [frame.state.instruments[instrument.name] for frame in frames]
-    used = [joint for joint in turning if np.ptp([state.joints[joint] for state in states]) > STICKS.min_reading_range]
-    if len(used) > 1:
-        report(
-            f"warning: {instrument.name}: {', '.join(used)}: several joints and no kinematics; each is learned as a "
-            f"hinge across the shaft, which fits jaws but no wrist; {STATE_LINKS}"
-        )
-    return turning
+    return tuple(joint for joint in joints if not instrument.slides(joint))
 
 
 def start_hinges(

@@ -8,7 +8,7 @@ readings, bends where the joints are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,7 +106,7 @@ def register_links(
     line = links.rest_line()
     if line is None:
         return None
-    problem = _SilhouetteProblem(links, evidence, name, shape, line, readings)
+    problem = SilhouetteProblem(links, evidence, name, shape, line, readings)
     if stated is not None:
         problem.state_base(stated)
     fits: list[tuple[tuple[str, ...], np.ndarray, Linearisation[np.ndarray]]] = []
@@ -114,10 +114,7 @@ def register_links(
     for more in MODELS:
         names += more
         problem.fit_only(names)
-        found = np.zeros(problem.size)
-        for width, steps in zip(CAPSULES.widths, CAPSULES.max_steps, strict=True):
-            problem.compare_at(width)
-            found = levenberg_marquardt(found, problem.linearise, np.add, max_steps=steps, damping=1e-3, tolerance=1e-3)
+        found = minimised(problem)
         fits.append((tuple(names), found, problem.linearise(found)))
     costs = [fitted.value for _, _, fitted in fits]
     chosen = next(k for k in range(len(fits)) if costs[k] - min(costs[k:]) < CAPSULES.min_gain)
@@ -198,7 +195,17 @@ def base_root(stated: BaseUncertainty, center: Tensor) -> Tensor:
     return torch.linalg.cholesky(covariance).to(center)
 
 
-class _SilhouetteProblem:
+def minimised(problem: SilhouetteProblem, *, coarse: bool = False) -> np.ndarray:
+    """Return the parameters of least cost, in standard deviations of those that are fitted. The problem then compares
+    the images of the last width; coarse: of the first alone."""
+    found = np.zeros(problem.size)
+    for width, steps in list(zip(CAPSULES.widths, CAPSULES.max_steps, strict=True))[: 1 if coarse else None]:
+        problem.compare_at(width)
+        found = levenberg_marquardt(found, problem.linearise, np.add, max_steps=steps, damping=1e-3, tolerance=1e-3)
+    return found
+
+
+class SilhouetteProblem:
     """Silhouettes of capsules along an instrument's links, against the evidence of F frames.
 
     `layout` has the standard deviations of all parameters, in which vectors of those that are fitted are counted."""
@@ -213,7 +220,7 @@ class _SilhouetteProblem:
         name: str,
         shape: CarvedShape,
         line: tuple[Tensor, Tensor],
-        readings: list[dict[str, float]],
+        readings: Sequence[Mapping[str, float]],
     ) -> None:
         chosen = evenly_spaced(len(evidence.frames), CAPSULES.max_frames)
         self.links, self.shape = links, shape
@@ -282,12 +289,13 @@ class _SilhouetteProblem:
         return Linearisation(
             (weighed.T @ slopes).double().cpu().numpy() + np.eye(self.size),
             (weighed.T @ residual).double().cpu().numpy() + at,
-            self._cost(at, residual),
-            lambda other: self._cost(other, self._residual(other)),
+            self.cost(at, residual),
+            self.cost,
         )
 
-    def _cost(self, at: np.ndarray, residual: Tensor) -> float:
-        size = residual.abs()
+    def cost(self, at: np.ndarray, residual: Tensor | None = None) -> float:
+        """Return -log likelihood and prior; `residual`: that of `at`, if known."""
+        size = (self._residual(at) if residual is None else residual).abs()
         huber = torch.where(size < self._limit, 0.5 * size.square(), self._limit * (size - 0.5 * self._limit))
         return float(huber.sum(dtype=torch.float64)) + 0.5 * float(at @ at)
 
