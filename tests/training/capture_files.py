@@ -71,8 +71,11 @@ def train_interrupted(capture: Path, folder: Path, config: TrainConfig, stop: in
     return whole, resumed
 
 
-def write_grasper(root: Path, *, frames: int = 24, sizes: tuple[tuple[int, int], ...] = ((80, 64),)) -> Path:
-    """A two-jawed grasper that moves and opens before a red wall, recorded in images of `sizes` in turn."""
+def write_grasper(
+    root: Path, *, frames: int = 24, sizes: tuple[tuple[int, int], ...] = ((80, 64),), wristed: bool = False
+) -> Path:
+    """A two-jawed grasper that moves and opens, and bends its wrist where it has one, before a red wall, recorded in
+    images of `sizes` in turn."""
     rng = np.random.default_rng(5)
     wall = torch.from_numpy(rng.uniform([-75, -60, 98], [75, 60, 102], (900, 3))).float()
     wall_colors = torch.from_numpy(rng.uniform(0.3, 0.7, (900, 3)) * (1.2, 0.6, 0.6)).float()
@@ -86,7 +89,8 @@ def write_grasper(root: Path, *, frames: int = 24, sizes: tuple[tuple[int, int],
         turn = rigid_from_vector(torch.tensor([0.9 + tilt, pan, roll, 0, 0, 0], dtype=torch.float64))
         pose = turn.clone()
         pose[:3, 3] = torch.tensor([rng.uniform(-14, 14), rng.uniform(-10, 10), rng.uniform(64, 78)])
-        body, colors = grasper_body(opening)
+        readings = {"jaw_angle": opening} | ({"wrist_pitch": rng.uniform(-0.9, 0.9)} if wristed else {})
+        body, colors = grasper_body(**readings)
         means = torch.cat([wall, body @ pose[:3, :3].float().T + pose[:3, 3].float()])
         count = len(means)
         gaussians = Gaussians(
@@ -98,22 +102,24 @@ def write_grasper(root: Path, *, frames: int = 24, sizes: tuple[tuple[int, int],
         )
         path = root / "images" / f"{k:06d}.png"
         write_image(path, rasterize(gaussians, camera).color)
-        state = State({"grasper": InstrumentState(pose, {"jaw_angle": opening})}, 0.04 * k)
+        state = State({"grasper": InstrumentState(pose, readings)}, 0.04 * k)
         taken.append(Frame(path, camera, state, "train" if k % 6 else "test"))
     points = PointCloud(wall.numpy(), wall_colors.numpy().clip(0, 1))
-    instruments = (Instrument("grasper", {"jaw_angle": (0.0, 1.5)}),)
+    instruments = (Instrument("grasper", {"jaw_angle": (0.0, 1.5)} | ({"wrist_pitch": None} if wristed else {})),)
     write_folder(Capture(root, tuple(taken), instruments, points), root)
     return root
 
 
-def grasper_body(opening: float) -> tuple[Tensor, Tensor]:
-    """Points [M, 3] mm and colours [M, 3]: a shaft along z, its wrist brighter, and two jaws."""
+def grasper_body(jaw_angle: float, wrist_pitch: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Points [M, 3] mm and colours [M, 3]: a shaft along z, its wrist brighter, which pitches about y, and two jaws."""
     around = torch.arange(8) * (math.pi / 4)
     along = torch.arange(-30.0, PIVOT_MM, 1.5)
     shaft = torch.stack([around.cos().repeat(24) * 2, around.sin().repeat(24) * 2, along.repeat_interleave(8)], -1)
     blade = torch.stack([torch.zeros(15), torch.zeros(15), torch.linspace(PIVOT_MM, 20, 15)], -1)
     pivot, axis = torch.tensor([0.0, 0.0, PIVOT_MM]), torch.tensor([1.0, 0.0, 0.0])
-    jaws = [rotate_about(blade, axis, pivot, torch.full((15,), side * opening / 2)) for side in (1, -1)]
+    jaws = [rotate_about(blade, axis, pivot, torch.full((15,), side * jaw_angle / 2)) for side in (1, -1)]
     bright = (shaft[:, 2:] > WRIST_MM).float().expand(-1, 3)
     colors = torch.cat([0.15 + 0.7 * bright, torch.full((30, 3), 0.85)])
-    return torch.cat([shaft, *jaws]), colors
+    points = torch.cat([shaft, *jaws])
+    turn = torch.where(points[:, 2] > WRIST_MM, wrist_pitch, 0.0)
+    return rotate_about(points, torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, WRIST_MM]), turn), colors

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from capture_files import PIVOT_MM, write_grasper
+from capture_files import PIVOT_MM, WRIST_MM, write_grasper
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
@@ -95,6 +95,35 @@ def test_with_two_instruments_each_has_its_own_parts_and_both_cast_a_shadow(capt
     casters = gaussians.headlight.shadow.casters
     assert torch.equal(casters, scene.canonical.bodies > 0)
     assert torch.allclose(labels.sum(1), casters.float())
+
+
+def test_the_links_of_a_wrist_are_found_and_serve_as_if_they_were_stated(tmp_path: Path) -> None:
+    capture = write_grasper(tmp_path / "capture", frames=32, sizes=((112, 88),), wristed=True)
+    told: list[str] = []
+    run = load_run(train(capture, tmp_path / "run", CONFIG, progress=lambda row: told.append(row.note)))
+    (instrument,) = run.scene.instruments
+    assert instrument.kinematics is not None
+    _, wrist, *jaws = instrument.kinematics.links
+    assert set(wrist.value) == {"wrist_pitch"}
+    assert [set(jaw.value) for jaw in jaws] == [{"jaw_angle"}, {"jaw_angle"}]
+    assert any("images show its links: wrist turned by wrist_pitch" in note for note in told)
+    assert abs(wrist.origin[2, 3] - WRIST_MM) < 4
+    assert abs(wrist.axis[1]) > 0.9
+    assert evaluate_run(run, run.capture(), ("test",), align=True)["given"]["test"]["frames"] == 6
+    synthesize(run, tmp_path / "dataset", Settings(count=2, tissue_check=False, min_share=1e-4))
+
+
+def test_joints_that_turn_no_wrist_are_hinges_with_a_warning(tmp_path: Path) -> None:
+    capture = write_grasper(tmp_path / "capture")
+    transforms = json.loads((capture / "transforms.json").read_text())
+    transforms["instruments"][0]["joints"]["grip"] = {}
+    for number, frame in enumerate(transforms["frames"]):  # as a motor's current
+        frame["instruments"][0]["joints"]["grip"] = (0.7 * number * number) % 1.0
+    (capture / "transforms.json").write_text(json.dumps(transforms))
+    told: list[str] = []
+    run = load_run(train(capture, tmp_path / "run", CONFIG, progress=lambda row: told.append(row.note)))
+    assert run.scene.instruments[0].kinematics is None
+    assert any("several joints, no kinematics, and images show no wrist" in note for note in told)
 
 
 def test_evidence_of_images_of_two_sizes_lies_in_each_ones_own(capture: Path) -> None:
