@@ -14,8 +14,8 @@ from source_trees import module_paths, module_trees
 
 # lines of Python: the limit, and the aim
 ROOMS = {
-    "cli": (2080, 1700),
-    "viewer": (3173, 2100),
+    "cli": (2082, 1700),
+    "viewer": (3193, 2100),
     "report": (1600, 1500),
     "studies": (3002, 2600),
     "ingest": (17_979, 10_500),
@@ -33,7 +33,7 @@ ROOMS = {
     "geometry": (983, 1000),
     "base": (1600, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (309, 240), (3630, 3000), (290, 300)
+FILES, FUNCTIONS, NUMBERS = (309, 240), (3631, 3000), (290, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import zstandard
 from ball_world import ball_scene
 from scene_worlds import CAMERA, grasper_state, make_scene, pose_of
 from torch import Tensor
@@ -63,10 +64,21 @@ def gaussians_of_ply(data: bytes) -> Gaussians:
 
 
 def gaussians_of_spz(data: bytes) -> Gaussians:
-    raw = gzip.decompress(data)
-    magic, version, count, degree, bits, flags, reserved = struct.unpack("<IIIBBBB", raw[:16])
-    assert (magic.to_bytes(4, "little"), version, flags, reserved) == (b"NGSP", 2, 0, 0)
-    at = 16
+    if data[:4] == b"NGSP":
+        magic, version, count, degree, bits, flags, streams, begin = struct.unpack("<IIIBBBBI12x", data[:32])
+        sizes = [struct.unpack_from("<QQ", data, begin + 16 * k) for k in range(streams)]
+        raw, start = b"", begin + 16 * streams
+        for size, full in sizes:
+            raw += zstandard.decompress(data[start : start + size], max_output_size=full)
+            start += size
+        assert (version, start) == (4, len(data))
+    else:
+        raw = gzip.decompress(data)
+        magic, version, count, degree, bits, flags, reserved = struct.unpack("<IIIBBBB", raw[:16])
+        assert (version, reserved) == (3, 0)
+        raw = raw[16:]
+    assert (magic.to_bytes(4, "little"), flags) == (b"NGSP", 0)
+    at = 0
 
     def columns(width: int) -> np.ndarray:
         nonlocal at
@@ -78,12 +90,19 @@ def gaussians_of_spz(data: bytes) -> Gaussians:
     whole = thirds[..., 0] | thirds[..., 1] << 8 | thirds[..., 2] << 16
     means = np.where(whole >= 2**23, whole - 2**24, whole) / 2**bits
     opacities, dc = columns(1)[:, 0] / 255, (columns(3) / 255 - 0.5) / 0.15
-    scales, xyz = np.exp(columns(3) / 16 - 10), columns(3) / 127.5 - 1
-    w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
+    scales = np.exp(columns(3) / 16 - 10)
+    packed = columns(4) @ (1 << np.array([0, 8, 16, 24]))
+    largest, others, xyzw = packed >> 30, packed & (1 << 30) - 1, np.zeros((count, 4))
+    for place in (3, 2, 1, 0):
+        given = place != largest
+        size = (others & 511) / 511 / np.sqrt(2)
+        xyzw[given, place] = np.where(others >> 9 & 1, -size, size)[given]
+        others = np.where(given, others >> 10, others)
+    xyzw[np.arange(count), largest] = np.sqrt(np.clip(1 - (xyzw**2).sum(1), 0, None))
     rest = (columns(3 * ((degree + 1) ** 2 - 1)) - 128) / 128
     assert at == len(raw)
     sh = np.concatenate([dc[:, None], rest.reshape(count, -1, 3)], 1)
-    arrays = (means, np.concatenate([w, xyz], 1), scales, opacities, sh)
+    arrays = (means, np.roll(xyzw, 1, axis=1), scales, opacities, sh)
     return Gaussians(*(torch.from_numpy(array).float() for array in arrays))
 
 
@@ -98,7 +117,13 @@ def test_drawn_again_from_the_file_it_looks_as_the_scene_does_from_that_camera()
     splats = splats_of(scene, STATE, CAMERA)
     assert float(truth.std()) > 0.05
     assert decibels(rasterize(gaussians_of_ply(ply_bytes(splats)), CAMERA).color, truth) > 60
-    assert decibels(rasterize(gaussians_of_spz(spz_bytes(splats)), TURNED).color, truth) > 25
+    versions = [gaussians_of_spz(spz_bytes(splats, version)) for version in (3, 4)]
+    assert all(
+        torch.equal(*both)
+        for both in zip(*(vars(gaussians).values() for gaussians in versions), strict=True)
+        if isinstance(both[0], Tensor)
+    )
+    assert decibels(rasterize(versions[1], TURNED).color, truth) > 25
 
 
 @torch.no_grad()
@@ -124,6 +149,16 @@ def test_a_ball_survives_in_both_formats_and_the_same_bytes_come_twice() -> None
     assert len(small) < len(large) / 5
     turned = replace(camera, world_from_camera=TURN.to(camera.world_from_camera) @ camera.world_from_camera)
     assert decibels(rasterize(gaussians_of_spz(small), turned).color, truth) > 38
+
+
+def test_spz_turns_rotations_by_less_than_a_fifth_of_a_degree() -> None:
+    scene = lit_scene()
+    splats = splats_of(scene, STATE, CAMERA)
+    turn = torch.tensor([1.0, 1, -1, -1])  # of the axes, about x
+    for version in (3, 4):
+        found = gaussians_of_spz(spz_bytes(splats, version)).quats
+        cosines = (found * turn * torch.from_numpy(splats.quats)).sum(1).abs().clamp_max(1)
+        assert float(torch.rad2deg(2 * cosines.acos()).max()) < 0.2
 
 
 def test_positions_that_spz_cannot_hold_are_refused() -> None:
@@ -170,7 +205,7 @@ def test_the_verb_writes_and_refuses(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_the_format_is_that_of_the_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = run_folder(tmp_path / "run", ball_scene("ball", [(0.0, 0.0, 60.0)]))
-    for name, begin in (("a.spz", b"\x1f\x8b"), ("a.usdc", b"PXR-USDC"), ("a.PLY", b"ply"), ("a", b"ply")):
+    for name, begin in (("a.spz", b"NGSP"), ("a.usdc", b"PXR-USDC"), ("a.PLY", b"ply"), ("a", b"ply")):
         assert main(["export", str(run), "--output", str(tmp_path / name)]) == 0
         assert (tmp_path / name).read_bytes().startswith(begin)
     for words, ends in ((["b.splat"], ".ply or .spz or .usdc or .glb"), (["b.ply", "--format", "spz"], ".spz")):

@@ -14,7 +14,7 @@ from neeco.base.settings import Device
 Format = Literal["ply", "spz", "usdc", "glb"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Write a run's scene for other viewers, in the light of one camera: in one state, or (glb, usdc) moving."""
 
@@ -28,6 +28,8 @@ class Arguments:
     """Number of the frame, of those trained on, whose state and light are taken."""
     states: Path | None = None
     """The first state of this states.jsonl instead (glb, usdc: all), in its own camera's light where it names one."""
+    spz_version: Literal[3, 4] = 4
+    """Version of SPZ: 4, or 3 for viewers that do not read it yet."""
     device: Device = "auto"
 
 
@@ -62,6 +64,6 @@ def run(arguments: Arguments) -> int:
             note = f"{len(moving.times)} states; {moving.blended:.0%} of the instruments' Gaussians blend links"
         else:
             note = "without joints and labels"
-            write_splats(splats_of(scene, state, camera), output, format)
+            write_splats(splats_of(scene, state, camera), output, format, arguments.spz_version)
     print(f"{output}: {scene.num_gaussians:,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, {note}")
     return 0

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
+from zstandard import ZstdCompressor
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_atomically
@@ -31,14 +32,16 @@ from neeco.raster.types import Gaussians
 from neeco.scene import GaussianScene
 
 Format = Literal["ply", "spz"]
+SpzVersion = Literal[3, 4]
 DIRECTIONS = 64  # by which harmonics are rotated: four times as many as there are harmonics
 MIN_SCALE = 1e-30  # mm: the logarithm of 0 is no number of a file
-SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 2
+SPZ_MAGIC = 0x5053474E
 SPZ_FRACTION = 12  # bits of a mm: positions reach 2 m
 SPZ_COLOR = 0.15  # of the first harmonic, per unit of what is stored
 # signs of harmonics whose y and z are negated, by degree and order
 SPZ_TURNED = [(-1) ** (degree + order + (order < 0)) for degree in range(4) for order in range(-degree, degree + 1)]
 SPZ_STEPS = (8, 16, 16)  # of 256, by which harmonics of degree 1, 2 and 3 are rounded
+SPZ_ROTATION = 511  # steps of a component of a rotation, up to 2 ** -0.5
 
 
 @dataclass(frozen=True)
@@ -92,9 +95,9 @@ def splats_of(scene: GaussianScene, state: State, camera: Camera, *, moving: boo
     return Splats(*(tensor.float().cpu().numpy() for tensor in tensors))
 
 
-def write_splats(splats: Splats, path: Path, format: Format) -> None:
+def write_splats(splats: Splats, path: Path, format: Format, spz_version: SpzVersion = 4) -> None:
     """Write a file of that format. Raises NeecoError where the format cannot hold them, or the disk refuses."""
-    data = {"ply": ply_bytes, "spz": spz_bytes}[format](splats)
+    data = ply_bytes(splats) if format == "ply" else spz_bytes(splats, spz_version)
     write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
@@ -112,27 +115,44 @@ def ply_bytes(splats: Splats) -> bytes:
     return "\n".join(lines).encode() + table.tobytes()
 
 
-def spz_bytes(splats: Splats) -> bytes:
-    """Niantic's SPZ, version 2: about a tenth of the size of PLY. Raises NeecoError where positions leave its range."""
+def spz_bytes(splats: Splats, version: SpzVersion = 4) -> bytes:
+    """Niantic's SPZ: about a tenth of the size of PLY; version 4 is compressed by Zstandard, 3 by gzip. Raises
+    NeecoError where positions leave its range."""
     turn = np.array([1, -1, -1], np.float32)
     sh = splats.sh * np.array(SPZ_TURNED[: splats.sh.shape[1]], np.float32)[:, None]
     splats = replace(splats, means=splats.means * turn, quats=splats.quats * np.append(1, turn), sh=sh)
     fixed = np.rint(splats.means.astype(np.float64) * 2**SPZ_FRACTION).astype(np.int64)
     if fixed.size and np.abs(fixed).max() >= 2**23:
         raise NeecoError("--format: spz holds positions within 2 m of the world's origin only; use ply")
-    header = struct.pack("<IIIBBBB", SPZ_MAGIC, SPZ_VERSION, len(splats.means), splats.degree, SPZ_FRACTION, 0, 0)
-    positions = (fixed & 0xFFFFFF).astype("<u4")[..., None].view(np.uint8)[..., :3]
-    quats = np.where(splats.quats[:, :1] < 0, -splats.quats, splats.quats)[:, 1:]  # w, positive, follows from them
     columns = (
-        positions,
+        (fixed & 0xFFFFFF).astype("<u4")[..., None].view(np.uint8)[..., :3],
         to_uint8(255 / (1 + np.exp(-splats.logits.astype(np.float64)))),
         to_uint8(splats.sh[:, 0] * (SPZ_COLOR * 255) + 127.5),
         to_uint8((splats.log_scales + 10) * 16),
-        to_uint8(quats * 127.5 + 127.5),
+        _smallest_three(splats.quats),
         _harmonics(splats.sh[:, 1:]),
     )
-    body = header + b"".join(np.ascontiguousarray(column).tobytes() for column in columns)
-    return gzip.compress(body, mtime=0)
+    streams = [np.ascontiguousarray(column).tobytes() for column in columns if column.size]
+    header = struct.pack("<IIIBB", SPZ_MAGIC, version, len(splats.means), splats.degree, SPZ_FRACTION)
+    if version == 3:
+        return gzip.compress(b"".join([header, bytes(2), *streams]), mtime=0)
+    packed = [ZstdCompressor(level=19).compress(stream) for stream in streams]
+    sizes = [struct.pack("<QQ", len(part), len(stream)) for part, stream in zip(packed, streams, strict=True)]
+    return b"".join([header, struct.pack("<BBI12x", 0, len(streams), 32), *sizes, *packed])
+
+
+def _smallest_three(quats: np.ndarray) -> np.ndarray:
+    """Rotations uint32 [N] of quaternions [N, 4] wxyz: the place of the component of largest size (2 bits; x, y, z, w),
+    which is taken as positive and left out, and of the others sign and size (10 bits each)."""
+    xyzw = np.roll(quats.astype(np.float64), -1, axis=1)
+    largest = np.abs(xyzw).argmax(1)
+    xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -1, 1)
+    sizes = np.rint(np.abs(xyzw) * (SPZ_ROTATION * np.sqrt(2))).clip(0, SPZ_ROTATION).astype(np.uint32)
+    packed = largest.astype(np.uint32)
+    for place in range(4):
+        component = (xyzw[:, place] < 0).astype(np.uint32) << 9 | sizes[:, place]
+        packed = np.where(place == largest, packed, packed << 10 | component)
+    return packed.astype("<u4")
 
 
 def _harmonics(rest: np.ndarray) -> np.ndarray:
