@@ -35,7 +35,7 @@ class WristSearchSettings:
     n_fitted: int = 8  # number of trees that are fitted
     turn_sd: float = 0.25  # rad, of an axis of the grid
     shift_sd_mm: float = 4.0  # of a pivot of the grid
-    min_gain: float = 5.0  # of -log likelihood by either axis of the wrist, over the same links where it rests
+    min_gain: float = 3.0  # of -log likelihood by either axis of the wrist, over the same links where it rests
 
 
 WRISTS = WristSearchSettings()
