@@ -107,8 +107,8 @@ def search_wrist(
         problem.compare_at(CAPSULES.widths[0])
         return problem.cost(np.zeros(problem.size))
 
-    def fitted_cost(wrist: _Wrist, readings: Sequence[Mapping[str, float]] = readings) -> float:
-        problem = problem_of(wrist, readings)
+    def fitted_cost(wrist: _Wrist) -> float:
+        problem = problem_of(wrist)
         return problem.cost(minimised(problem, coarse=True))
 
     likely = sorted(_hypotheses(shape, joints, others), key=first_cost)[: WRISTS.n_fitted]
@@ -118,14 +118,16 @@ def search_wrist(
         unequal = [replace(best, share=share) for share in WRISTS.shares]
         costs |= {wrist: fitted_cost(wrist) for wrist in unequal}
         best = min(costs, key=costs.__getitem__)
+    problem = problem_of(best)
+    found = minimised(problem)
     for joint in (best.first, best.second):
         if joint is None:
             continue
         rest = {joint: float(np.mean([given[joint] for given in readings]))}
-        if fitted_cost(best, [{**given, **rest} for given in readings]) - costs[best] < WRISTS.min_gain:
+        resting = problem_of(best, [{**given, **rest} for given in readings])
+        if resting.cost(minimised(resting)) - problem.cost(found) < WRISTS.min_gain:
             return None
-    problem = problem_of(best)
-    pivots, axes = (part.double().cpu().numpy() for part in problem.corrected_axes(problem.parts(minimised(problem))))
+    pivots, axes = (part.double().cpu().numpy() for part in problem.corrected_axes(problem.parts(found)))
     return _placed(best.tree(shape, closed), best.jaw, pivots, axes)
 
 
