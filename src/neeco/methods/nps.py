@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from neeco.base.errors import NeecoError
-from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import Instrument, State
 from neeco.evidence.carving import CarvingSettings
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
@@ -187,12 +186,11 @@ class NPS(LabelledByMotion):
             return {}
         return {MEMBER_LOGITS: canonical.means.new_full((len(canonical), len(self.instruments)), -INITIAL_LOGIT)}
 
-    def begin(self, session: GaussianSession) -> dict[str, KinematicTree]:
+    def begin(self, session: GaussianSession) -> None:
         if self.settings.seeds:
             with session.searching():
                 found = carve_seeds(session)
             session.scene.canonical = self._with_seeds(session.scene.canonical, found)
-        return {}
 
     def _with_seeds(self, canonical: CanonicalGaussians, found: Sequence[tuple[Tensor, float]]) -> CanonicalGaussians:
         """Return `canonical` with Gaussians on the carved instruments, given as points [P, 3] mm in each one's frame

@@ -155,10 +155,10 @@ class Deformation(nn.Module, Method):
         control carries them along."""
         return {}
 
-    def begin(self, session: Any) -> Mapping[str, KinematicTree]:
+    def begin(self, session: Any) -> Mapping[str, KinematicTree] | None:
         """Called once before the first step of a new scene (not on resume); may replace the canonical Gaussians. Where
         it returns links of instruments, a scene in which these are stated takes the place of this one."""
-        return {}
+        return None
 
     def perturb(
         self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator
