@@ -23,7 +23,7 @@ ROOMS = {
     "synthesis": (4377, 3200),
     "evaluation": (1410, 1200),
     "labels": (926, 800),
-    "methods": (5296, 3500),
+    "methods": (5295, 3500),
     "training": (2041, 1700),
     "states": (3361, 2600),
     "evidence": (962, 1200),

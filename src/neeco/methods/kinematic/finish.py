@@ -41,6 +41,7 @@ class FinishSettings:
     refuting_frames: int = 2
     refuting_share: float = 0.25
     max_gap_mm: float = 3.0  # between solid Gaussians of one instrument; beyond, they are detached from it
+    cells_per_gap: int = 4  # of the grid on which they are connected, which bounds the pairs however dense they are
     # training frames that must observe a position of the shaft for it to be copied: share, and number (half at most)
     min_coverage: float = 0.08
     min_frames: int = 6
@@ -241,9 +242,9 @@ def drop_detached(canonical: CanonicalGaussians) -> CanonicalGaussians:
         if not solid.any():
             stays[rows] = True
             continue
-        # cells bound the number of pairs, however dense the Gaussians
-        cells, cell = np.unique(np.floor(points[solid] / (FINISH.max_gap_mm / 4)), axis=0, return_inverse=True)
-        pairs = KDTree(cells).query_pairs(4, output_type="ndarray")
+        size = FINISH.max_gap_mm / FINISH.cells_per_gap
+        cells, cell = np.unique(np.floor(points[solid] / size), axis=0, return_inverse=True)
+        pairs = KDTree(cells).query_pairs(FINISH.cells_per_gap, output_type="ndarray")
         links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), 2 * (len(cells),))
         group = connected_components(links, directed=False)[1][cell.ravel()]
         largest = np.bincount(group, areas.cpu().numpy()[solid]).argmax()

@@ -120,9 +120,7 @@ def search_wrist(
         best = min(costs, key=costs.__getitem__)
     problem = problem_of(best)
     found = minimised(problem)
-    for joint in (best.first, best.second):
-        if joint is None:
-            continue
+    for joint in filter(None, (best.first, best.second)):
         rest = {joint: float(np.mean([given[joint] for given in readings]))}
         resting = problem_of(best, [{**given, **rest} for given in readings])
         if resting.cost(minimised(resting)) - problem.cost(found) < WRISTS.min_gain:
