@@ -134,3 +134,16 @@ def test_nothing_is_said_where_the_points_have_no_colors_of_their_own(capture, t
     assert capture.points is not None
     grey = replace(capture, points=PointCloud(capture.points.positions))
     assert found(with_pixels(grey, tmp_path, lambda image: image[:, ::-1])) == []
+
+
+def test_nothing_is_said_of_plain_cloth_whose_noise_alone_varies(capture, tmp_path):
+    """As of draped cloth in one colour: right cameras, but the points have the noise of the images they are from."""
+    assert capture.points is not None
+    generator = np.random.default_rng(5)
+    noisy = PointCloud(capture.points.positions, 0.4 + generator.normal(0, 0.05, capture.points.colors.shape))
+    plain = replace(capture, points=noisy)
+
+    def cloth(image: np.ndarray) -> np.ndarray:
+        return np.clip(100 + generator.normal(0, 4, image.shape), 0, 255).astype(np.uint8)
+
+    assert found(with_pixels(plain, tmp_path, cloth)) == []

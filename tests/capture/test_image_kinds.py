@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from image_files import read_image
 from PIL import Image, ImageFile
 
 from neeco.base.errors import NeecoError
-from neeco.capture.images import has_alpha, image_size, open_image, read_image, read_mask
+from neeco.capture.images import has_alpha, image_size, open_image, read_mask
 from neeco.ingest.readers.video import open_images
 from neeco.synthesis.card import draw_tile
 

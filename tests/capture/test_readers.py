@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from image_files import read_image
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, errors_only, read_capture, write_capture
-from neeco.capture.images import read_image, read_labels, read_mask, write_image, write_labels
+from neeco.capture.images import read_labels, read_mask, write_image, write_labels
 from neeco.capture.model import (
     BaseUncertainty,
     Capture,

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from image_files import read_image
 from safetensors.torch import save_file
 
 from neeco.base.errors import NeecoError
-from neeco.capture.images import read_image
 from neeco.evaluation.image_metrics import NETWORKS, Lpips, find_lpips, load_lpips
 
 WEIGHTS = os.environ.get("NEECO_LPIPS_WEIGHTS", "")

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 import torch
 from folder_contents import contents
+from image_files import read_image
 from PIL import Image
 from rod_world import CAMERA, FakeRun, make_scene, rod_state
 
 from neeco.base.errors import NeecoError
-from neeco.capture.images import read_image, read_labels, write_image
+from neeco.capture.images import read_labels, write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.cli import main
 from neeco.evaluation.trust import TypicalErrors, estimate_trust, typical_errors_of

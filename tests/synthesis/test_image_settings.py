@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from image_files import read_image
 from PIL import Image
 
 import neeco
 from neeco.base.errors import NeecoError
-from neeco.capture.images import read_image, read_labels
+from neeco.capture.images import read_labels
 from neeco.geometry.lens import Lens
 from neeco.labels.annotation import annotate, draw_labelled
 from neeco.labels.drawing import draw, draw_layers

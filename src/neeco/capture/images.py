@@ -50,23 +50,17 @@ def image_files(folder: Path) -> tuple[Path, ...]:
     return tuple(file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and file.name[0] != ".")
 
 
-def read_image(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> Tensor:
-    """An image as float32 [H, W, 3] in [0, 1], sRGB as stored (EXIF orientation is not applied).
-
-    Grey, 16-bit and palette images become RGB; transparent pixels show `background` (0 black, 1 white).
-    `size`: (width, height) the image must have. Raises NeecoError when unreadable, damaged or of another size.
-    """
-    return torch.from_numpy(_to_rgb(open_image(path, size), background))
-
-
 def read_image_bytes(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> Tensor:
-    """`read_image` as uint8 [H, W, 3]. Files of 8 bits are read without a float image, which would fragment the memory
-    of a process that reads many."""
+    """`read_pixels` as uint8 [H, W, 3], rounded where needed."""
     return torch.from_numpy(byte_pixels(read_pixels(path, size, background)))
 
 
 def read_pixels(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> np.ndarray:
-    """`read_image` as an array: uint8 [H, W, 3] where that is exact, else float32 in [0, 1]."""
+    """An image as uint8 [H, W, 3] where that is exact, else float32 in [0, 1]; sRGB as stored (EXIF orientation is
+    not applied). Grey, 16-bit and palette images become RGB; transparent pixels show `background` (0 black, 1 white).
+
+    `size`: (width, height) the image must have. Raises NeecoError when unreadable, damaged or of another size.
+    """
     image = open_image(path, size)
     if image.mode in ("RGB", "L", "P") and not _is_transparent(image):
         return np.array(image.convert("RGB"))

@@ -120,6 +120,9 @@ class ColorEvidence:
         self.rows = compared_rows(parsed)
         self.images = [image for row in self.rows if (image := pictures[row].image) is not None]
         self.grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in self.images]
+        smooth = [cv2.GaussianBlur(gray, (0, 0), 1.0) for gray in self.grays]  # less noise
+        details = [np.abs(gray - cv2.blur(gray, (gray.shape[1] // 9,) * 2)).ravel() for gray in smooth]
+        self.contrast = float(np.median(np.concatenate(details)))  # of 255, of pixels with their surroundings
         sizes = [reduced_size(frame) for frame in parsed.frames]
         self.all_cameras = CameraArrays.of([frame.camera for frame in parsed.frames], sizes)
         self.cameras = self.all_cameras[self.rows]

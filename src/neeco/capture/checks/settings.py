@@ -46,6 +46,7 @@ class CheckSettings:
     max_points: int = 800  # compared
     min_points: int = 30  # visible in an image, for a correlation
     min_brightness_sd: float = 2.0  # of 255; points of one colour cannot be compared
+    min_contrast: float = 3.4  # of 255, of images: on plain cloth, the correlation is noise's or the instrument's
     neighbours: int = 8  # of a point, with which its brightness is compared
     far_neighbours: int = 48  # the same for the coarse correlation, which inaccurate cameras keep
     contradicted_colors: float = 0.1  # correlation below which images and cameras may contradict each other

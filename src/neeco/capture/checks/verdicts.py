@@ -75,7 +75,8 @@ class ImageVerdicts:
         if (mistake := likeliest(candidates, colors)) is not None:
             return Verdict.of(mistake, "frames[*].transform_matrix", "frames")
         coarse = float(colors.agreement(coarse=True).mean())
-        if fine < SETTINGS.contradicted_colors and coarse < SETTINGS.contradicted_coarsely:
+        unlike = fine < SETTINGS.contradicted_colors and coarse < SETTINGS.contradicted_coarsely
+        if unlike and colors.contrast > SETTINGS.min_contrast:
             message = (
                 "the images contradict the cameras: sparse points do not have the colours of the pixels they project "
                 f"to (correlation {fine:.2f})"
