@@ -45,9 +45,10 @@ class Glb:
         accessor = self.content["accessors"][number]
         view = self.content["bufferViews"][accessor["bufferView"]]
         width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
-        kind, whole = {5126: ("<f4", 1), 5121: ("u1", 255)}[accessor["componentType"]]
+        kind, whole = {5126: ("<f4", 1), 5121: ("u1", 255), 5122: ("<i2", 32767)}[accessor["componentType"]]
         assert view["byteOffset"] % 4 == 0
         read = np.frombuffer(self.binary, kind, accessor["count"] * width, view["byteOffset"])
+        assert accessor.get("normalized", False) == (whole > 1)
         return read.reshape(-1, width).astype(np.float64) / whole
 
     def locals(self, time: float) -> list[np.ndarray]:
@@ -117,6 +118,22 @@ def in_gltf(posed: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
 
 def in_order(means: torch.Tensor) -> torch.Tensor:
     return means[:, 0].argsort()
+
+
+def test_in_another_unit_all_lengths_are_so_many_times_larger(tmp_path: Path) -> None:
+    moving = moving_scene(rigid_scene(), STATES, CAMERA)
+    write_glb(moving, CAMERA, tmp_path / "m.glb")
+    write_glb(moving, CAMERA, tmp_path / "mm.glb", "mm")
+    metres, larger = (Glb.read(tmp_path / name) for name in ("m.glb", "mm.glb"))
+    for time in (0.0, 2.0):
+        one, other = metres.gaussians(time), larger.gaussians(time)
+        assert torch.allclose(1000 * one.means, other.means, atol=1e-2)
+        assert torch.allclose(1000 * one.scales, other.scales, rtol=1e-4)
+        for ours, theirs in zip(metres.worlds(time), larger.worlds(time), strict=True):
+            assert np.allclose(ours[:3, :3], theirs[:3, :3])
+            assert np.allclose(1000 * ours[:3, 3], theirs[:3, 3], atol=1e-4)
+    (lens,), (larger_lens,) = (each.content["cameras"] for each in (metres, larger))
+    assert larger_lens["perspective"]["znear"] == pytest.approx(1000 * lens["perspective"]["znear"])
 
 
 @pytest.mark.parametrize("number", [0, 2, 4])

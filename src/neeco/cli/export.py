@@ -30,6 +30,8 @@ class Arguments:
     """The first state of this states.jsonl instead (glb, usdc: all), in its own camera's light where it names one."""
     spz_version: Literal[3, 4] = 4
     """Version of SPZ: 4, or 3 for viewers that do not read it yet."""
+    unit: Literal["m", "cm", "mm"] = "m"
+    """Unit of lengths in glb: m, as glTF has it, or a smaller one for viewers that hide what is near."""
     device: Device = "auto"
 
 
@@ -45,22 +47,21 @@ def run(arguments: Arguments) -> int:
 
     format = arguments.format or "ply"
     if arguments.output is not None:
-        endings = get_args(Format) if arguments.format is None else (format,)
-        require_ending("--output", arguments.output, *(f".{ending}" for ending in endings))
+        endings = [f".{ending}" for ending in (get_args(Format) if arguments.format is None else (format,))]
+        require_ending("--output", arguments.output, *endings)
         if arguments.format is None and arguments.output.suffix:
             format = cast(Format, arguments.output.suffix[1:].lower())
     if format == "usdc":
         require_usd()
     with open_gaussian_run(arguments.run, "export", device_of(arguments.device)) as trained:
-        scene = trained.scene
-        frames = len(scene.recorded.states)
+        scene, frames = trained.scene, len(trained.scene.recorded.states)
         if not 0 <= arguments.frame < frames:
             raise NeecoError(f"--frame: {arguments.frame}: the scene was trained on frames 0 to {frames - 1}")
         state, camera = exported_state(scene, arguments.frame, arguments.states)
         output = arguments.output or arguments.run / f"scene.{format}"
         if format == "glb" or format == "usdc":
             moving = moving_scene(scene, exported_states(scene, state, arguments.states), camera)
-            write_glb(moving, camera, output) if format == "glb" else write_usd(moving, output)
+            write_glb(moving, camera, output, arguments.unit) if format == "glb" else write_usd(moving, output)
             note = f"{len(moving.times)} states; {moving.blended:.0%} of the instruments' Gaussians blend links"
         else:
             note = "without joints and labels"

@@ -220,6 +220,9 @@ class DataSetFolder:
         Then the index files are written. Interrupted (Ctrl-C) or failing, what is done stays and is indexed, to be
         continued; where nothing was begun and no image made, nothing stays.
         """
+        for name in self.formats:
+            if refusal := writer(name)().refusal([part for _, part in self.labeller.names]):
+                raise NeecoError(f"--formats: {refusal}")
         with own_folder(self.output):
             try:
                 write_json(self.output / INFO, self.info | {"complete": False})

@@ -17,7 +17,8 @@ from neeco.labels.settings import LABELS
 LabelWay = Literal["composited", "threshold"]
 Views = Literal["recorded", "perturbed", "orbit"]
 ImageFormat = Literal["png", "jpg"]
-FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")  # of our own writers
+PUBLIC_SETS = ("endovis2017-parts", "endovis2018", "sar-rarp50")  # class ids of these
+FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder", *PUBLIC_SETS)  # of our own writers
 DEFAULT_FORMATS = ("coco", "yolo", "imagefolder")  # the last for `datasets.load_dataset` of the folder
 WRITERS = "neeco.writers"  # the group of entry points of others'
 PATH_PREFIX = "path:"

@@ -1,8 +1,8 @@
 """`neeco export --format glb`: a scene that moves, as binary glTF 2.0 with the extension KHR_gaussian_splatting.
 
 One node per part of each link, with which its Gaussians and their harmonics turn; the poses and joints of a sequence of
-states are animation channels (`neeco.viewer.moving`). Positions are in metres; the root turns the capture's world
-(right, down, front) by 180 degrees about z to glTF's axes.
+states are animation channels (`neeco.viewer.moving`). Lengths are in metres, as glTF has them, or in another unit; the
+root turns the capture's world (right, down, front) by 180 degrees about z to glTF's axes.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from __future__ import annotations
 import json
 import math
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -26,19 +27,10 @@ from neeco.viewer.moving import MovingScene, local_splats
 from neeco.viewer.splats import Splats
 
 EXTENSION = "KHR_gaussian_splatting"
-
-
-@dataclass(frozen=True, kw_only=True)
-class GltfSettings:
-    """Settings of the file."""
-
-    metres: float = 0.001  # per mm
-    near_m: float = 0.001  # the camera's near plane
-
-
-GLTF = GltfSettings()
+Unit = Literal["m", "cm", "mm"]
+UNITS: Mapping[Unit, float] = {"m": 1e-3, "cm": 0.1, "mm": 1.0}  # of the file, per mm
 MAGIC = b"glTF"
-COMPONENTS = {"float32": 5126, "uint8": 5121}
+COMPONENTS = {"float32": 5126, "uint8": 5121, "int16": 5122}
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 TURN = np.array([0.0, 0.0, 1.0, 0.0])  # xyzw: 180 degrees about z, from the capture's axes to glTF's
 CAMERA_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # glTF's cameras look along -z
@@ -48,12 +40,13 @@ CAMERA_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  
 class _Document:
     """JSON and binary chunk while they are put together."""
 
+    per_mm: float  # units of the file
     content: dict[str, Any] = field(default_factory=lambda: {"accessors": [], "bufferViews": [], "meshes": []})
     nodes: list[dict[str, Any]] = field(default_factory=list)
     binary: bytearray = field(default_factory=bytearray)
 
     def add(self, values: np.ndarray, *, bounds: bool = False) -> int:
-        """Return the number of an accessor of values [M, K] or [M], float32 or normalised uint8."""
+        """Return the number of an accessor of values [M, K] or [M], float32 or normalised integers."""
         values = np.ascontiguousarray(values)
         views, accessors = self.content["bufferViews"], self.content["accessors"]
         views.append({"buffer": 0, "byteOffset": len(self.binary), "byteLength": values.nbytes})
@@ -64,7 +57,7 @@ class _Document:
             "count": len(values),
             "type": TYPES[1 if values.ndim == 1 else values.shape[1]],
         }
-        if values.dtype == np.uint8:
+        if values.dtype != np.float32:
             accessor["normalized"] = True
         if bounds:
             rows = values.reshape(len(values), -1)
@@ -89,9 +82,9 @@ class _Document:
         return struct.pack("<4sII", MAGIC, 2, size) + b"".join(chunks) + bytes(self.binary)
 
 
-def write_glb(scene: MovingScene, camera: Camera, path: Path) -> None:
-    """Write the scene and its camera. Raises NeecoError where the disk refuses."""
-    document, splats = _Document(), scene.splats
+def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") -> None:
+    """Write the scene and its camera, lengths in `unit`. Raises NeecoError where the disk refuses."""
+    document, splats = _Document(UNITS[unit]), scene.splats
     root = document.node("neeco", rotation=TURN.tolist())
     _add_mesh(document, document.node("tissue", root), local_splats(splats, scene.still, np.eye(4)))
     clock = document.add(scene.times, bounds=True) if len(scene.times) > 1 else None
@@ -100,7 +93,7 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path) -> None:
 
     def animate(node: int, poses: np.ndarray) -> None:
         """Give a node its poses [T, 4, 4] mm: the first at rest, all of them as an animation."""
-        rotations, places = _rotations(poses), (poses[:, :3, 3] * GLTF.metres).astype(np.float32)
+        rotations, places = _rotations(poses), (poses[:, :3, 3] * document.per_mm).astype(np.float32)
         document.nodes[node] |= {"rotation": rotations[0].tolist(), "translation": places[0].tolist()}
         for target, values in (("rotation", rotations), ("translation", places)):
             if clock is not None and np.ptp(values, axis=0).max() > 0:
@@ -119,13 +112,13 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path) -> None:
     lens = {
         "yfov": 2 * math.atan(camera.height / (2 * camera.fy)),
         "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
-        "znear": GLTF.near_m,
+        "znear": document.per_mm,  # 1 mm
     }
     document.content["cameras"] = [{"name": "laparoscope", "type": "perspective", "perspective": lens}]
     rotation = _rotations(
         np.stack([np.block([[(pose[:3, :3] @ CAMERA_TURN).numpy(), np.zeros((3, 1))], [np.eye(4)[3:]]])])
     )
-    place = (pose[:3, 3] * GLTF.metres).tolist()
+    place = (pose[:3, 3] * document.per_mm).tolist()
     # glTF cannot state a principal point off the image's centre
     document.node("laparoscope", root, camera=0, rotation=rotation[0].tolist(), translation=place)
     document.content |= {"asset": {"version": "2.0", "generator": "neeco"}, "extensionsUsed": [EXTENSION]}
@@ -138,13 +131,14 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path) -> None:
 def _add_mesh(document: _Document, node: int, splats: Splats) -> None:
     """Give a node its Gaussians, in its own frame, mm."""
     shown = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, splats.opacities[:, None]], 1)
-    columns = {"ROTATION": splats.quats[:, [1, 2, 3, 0]], "SCALE": np.exp(splats.log_scales) * GLTF.metres}
-    columns["OPACITY"] = splats.opacities
+    columns = {"SCALE": np.exp(splats.log_scales) * document.per_mm, "OPACITY": splats.opacities}
     for degree in range(splats.degree + 1):
         for order in range(2 * degree + 1):
             columns[f"SH_DEGREE_{degree}_COEF_{order}"] = splats.sh[:, degree**2 + order]
-    attributes = {"POSITION": document.add((splats.means * GLTF.metres).astype(np.float32), bounds=True)}
+    attributes = {"POSITION": document.add((splats.means * document.per_mm).astype(np.float32), bounds=True)}
     attributes["COLOR_0"] = document.add(to_uint8(255 * shown))
+    rotations = np.rint(splats.quats[:, [1, 2, 3, 0]] * np.iinfo(np.int16).max).astype(np.int16)  # to .002 degrees
+    attributes[f"{EXTENSION}:ROTATION"] = document.add(rotations)
     attributes |= {f"{EXTENSION}:{name}": document.add(v.astype(np.float32)) for name, v in columns.items()}
     settings = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: settings}}

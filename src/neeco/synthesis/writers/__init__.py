@@ -46,6 +46,10 @@ class Writer(ABC):
     description: ClassVar[str]  # a line of README.md: which files, for what
     accepts_distortion: ClassVar[bool] = True  # whether it can describe images rendered with the recording's lens
 
+    def refusal(self, parts: Sequence[str]) -> str:
+        """Return why the format cannot describe these parts; "" when it can."""
+        return ""
+
     @abstractmethod
     def write(self, images: WrittenImages) -> None:
         """(Re)write all files of the format; the same images give the same bytes. Raises NeecoError."""
