@@ -45,14 +45,14 @@ def require(true: object, what: str) -> None:
 
 
 def read_pycocotools(root: Path) -> str:
-    """Filled again, polygons are the masks and parts; ids of parts are those of dataset.json."""
+    """Filled again, polygons and run lengths are the masks and parts; ids of parts are those of dataset.json."""
     from pycocotools.coco import COCO
 
     info = document(root / "dataset.json")
     ids = {item["id"]: f"{info['classes'][item['instrument']]}/{item['part']}" for item in info["ids"][1:]}
     shares, count = [], 0
     for kind in ("instances", "parts"):
-        for file in (root / f"coco/{kind}.json", *sorted((root / "coco/annotations").glob(f"{kind}_*.json"))):
+        for file in sorted((root / "coco").glob(f"**/{kind}*.json")):
             coco = COCO(str(file))
             if kind == "parts":
                 require({k: item["name"] for k, item in coco.cats.items()} == ids, f"{file}: ids are not the parts'")

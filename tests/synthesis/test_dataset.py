@@ -1,11 +1,14 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 from folder_contents import contents
+from hypothesis import given
+from hypothesis.extra.numpy import array_shapes, arrays
 from PIL import Image
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
@@ -19,7 +22,7 @@ from neeco.synthesis.generator import Acceptance, SampleGenerator, draw_to_folde
 from neeco.synthesis.rendered_views import render, split_views, state_views
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers import WrittenImages
-from neeco.synthesis.writers.coco import Coco
+from neeco.synthesis.writers.coco import Coco, run_lengths
 from neeco.synthesis.writers.folder import load_record
 
 COUNT = 6
@@ -128,9 +131,11 @@ def test_ids_of_parts_do_not_depend_on_which_are_seen(made, tmp_path):
     ids = {item["id"]: f"{item['instrument']}/{item['part']}" for item in info["ids"][1:]}
     records = [load_record(made, 0)]
     records[0]["labels"][0]["parts"].pop("shaft")
-    shutil.copytree(made / "images", tmp_path / "images")
+    records[0]["labels"][0]["instrument"] = "rod"
+    for folder in ("images", "parts"):
+        shutil.copytree(made / folder, tmp_path / folder)
     names = (("rod", "shaft"), ("rod", "jaw"))
-    nothing = {"keypoint_names": (), "bones": (), "scene": None, "labeller": None}
+    nothing = {"keypoint_names": (), "bones": (), "scene": None, "labeller": SimpleNamespace(names=names)}
     Coco().write(WrittenImages(root=tmp_path, records=records, part_names=names, **nothing))
     for file in (made / "coco/parts.json", made / "coco/annotations/parts_val.json", tmp_path / "coco/parts.json"):
         assert {number: category["name"] for number, category in COCO(str(file)).cats.items()} == ids
@@ -138,14 +143,16 @@ def test_ids_of_parts_do_not_depend_on_which_are_seen(made, tmp_path):
     assert ids[annotation["category_id"]] == "rod/jaw"
 
 
-def test_coco_parts_cover_the_part_ids(made):
-    coco = COCO(str(made / "coco" / "parts.json"))
+@pytest.mark.parametrize("file", ["parts.json", "rle/parts.json"])
+def test_coco_parts_cover_the_part_ids(made, file):
+    coco = COCO(str(made / "coco" / file))
     names = {number: category["name"] for number, category in coco.cats.items()}
     assert set(names.values()) == {"rod/shaft", "rod/jaw"}
     for annotation in coco.loadAnns(coco.getAnnIds()):
         parts = pixels(made / "parts" / coco.imgs[annotation["image_id"]]["file_name"])
         number = {"rod/shaft": 1, "rod/jaw": 2}[names[annotation["category_id"]]]
         assert annotation["area"] == (parts == number).sum()
+        assert np.array_equal(coco.annToMask(annotation) > 0, parts == number)
         assert int(coco_mask.area(coco.annToRLE(annotation))) == annotation["area"]
 
 
@@ -402,3 +409,10 @@ def test_a_data_set_is_not_continued_with_other_settings_or_another_band(made, r
     with pytest.raises(NeecoError, match="--resume"):
         synthesize(run, output, SETTINGS)
     assert contents(output) == before
+
+
+@given(arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=9)))
+def test_run_lengths_are_the_mask(mask: np.ndarray) -> None:
+    runs = run_lengths(mask)
+    packed = coco_mask.frPyObjects(runs, *runs["size"])
+    assert np.array_equal(coco_mask.decode(packed) > 0, mask)

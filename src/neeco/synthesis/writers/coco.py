@@ -3,21 +3,23 @@
     coco/images/                                images (hard links); every `file_name` is relative to it
     coco/{instances,parts}.json                 all images
     coco/annotations/{instances,parts}_{train,val}.json    one split each, where readers of COCO look for them
+    coco/rle/{instances,parts}.json             all images, with run lengths for polygons
 
 Category ids of parts are the part ids of dataset.json and of parts/, whether an image shows the part or not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neeco.base.files import write_json
+from neeco.capture.images import read_labels
 from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import CONTACT, Record, link
+from neeco.synthesis.writers.folder import CONTACT, Record, link, stem
 
 Entry = dict[str, Any]
 
@@ -32,7 +34,8 @@ class Coco(Writer):
     format = "coco"
     description = (
         "`coco/instances.json` (boxes, polygons, keypoints, 6-DoF poses) and `coco/parts.json`; each split in "
-        "`coco/annotations/`, images in `coco/images/`"
+        "`coco/annotations/`, images in `coco/images/`; `coco/rle/` has run lengths instead of polygons, for readers "
+        "that fill polygons with OpenCV, which adds up to a pixel"
     )
 
     def write(self, images: WrittenImages) -> None:
@@ -64,7 +67,34 @@ class Coco(Writer):
             )
             for kind, categories, made in (("instances", instruments, by_instrument), ("parts", parts, by_part)):
                 path = folder / (f"{kind}.json" if split is None else f"annotations/{kind}_{split}.json")
-                write_json(path, _document(chosen, categories, made), indent=None)
+                document = _document(chosen, categories, made)
+                write_json(path, document, indent=None)
+                if split is None:
+                    masks = _masks(images, visible, by_part=kind == "parts")
+                    for annotation, mask in zip(document["annotations"], masks, strict=True):
+                        annotation["segmentation"] = run_lengths(mask)
+                    write_json(folder / "rle" / f"{kind}.json", document, indent=None)
+
+
+def _masks(images: WrittenImages, visible: Sequence[tuple[Record, Entry]], *, by_part: bool) -> Iterator[np.ndarray]:
+    """Yield the mask [H, W] of every instrument that is visible, or of every part of them."""
+    for record, label in visible:
+        ids = read_labels(images.root / "parts" / f"{stem(record['index'])}.png").numpy()
+        for part in label["parts"] if by_part else (None,):
+            owned = [
+                number
+                for number, (instrument, name) in enumerate(images.labeller.names, 1)
+                if instrument == label["instrument"] and part in (None, name)
+            ]
+            yield np.isin(ids, owned)
+
+
+def run_lengths(mask: np.ndarray) -> Entry:
+    """Return COCO's uncompressed run lengths of a mask bool [H, W]: down the columns, from what is outside on."""
+    flat = mask.T.ravel()
+    changes = np.flatnonzero(np.diff(flat)) + 1
+    counts = np.diff([0, *changes, flat.size]).tolist()
+    return {"size": list(mask.shape), "counts": [0, *counts] if flat[0] else counts}
 
 
 def _document(records: Sequence[Record], categories: list[Entry], annotations: Iterable[Entry]) -> Entry:
