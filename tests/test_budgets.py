@@ -15,25 +15,25 @@ from source_trees import module_paths, module_trees
 # lines of Python: the limit, and the aim
 ROOMS = {
     "cli": (2083, 1700),
-    "viewer": (3193, 2100),
-    "report": (1600, 1500),
+    "viewer": (3187, 2100),
+    "report": (1593, 1500),
     "studies": (3002, 2600),
-    "ingest": (17_979, 10_500),
+    "ingest": (18_045, 10_500),
     "tracking": (1410, 1200),
-    "synthesis": (4506, 3200),
-    "evaluation": (1410, 1200),
+    "synthesis": (4504, 3200),
+    "evaluation": (1407, 1200),
     "labels": (926, 800),
     "methods": (5295, 3500),
     "training": (2041, 1700),
     "states": (3361, 2600),
-    "evidence": (962, 1200),
+    "evidence": (961, 1200),
     "scene": (1999, 1800),
-    "capture": (4972, 3900),
+    "capture": (4971, 3900),
     "raster": (4055, 3800),
     "geometry": (983, 1000),
-    "base": (1600, 1500),
+    "base": (1595, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (310, 240), (3636, 3000), (290, 300)
+FILES, FUNCTIONS, NUMBERS = (311, 240), (3637, 3000), (290, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -17,6 +17,7 @@ from neeco.base.errors import NeecoError
 from neeco.capture import check_capture, read_capture
 from neeco.capture.documents import errors_only
 from neeco.geometry.lens import Lens
+from neeco.ingest.frames.images import choose_images
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.timing.reading import read_episodes
@@ -81,6 +82,24 @@ def recording(tmp_path: Path) -> Path:
     path = tmp_path / "recording.yaml"
     path.write_text(yaml.safe_dump(document))
     return path
+
+
+def test_what_a_console_draws_over_the_images_is_masked_and_said(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "images").unlink()
+    (tmp_path / "images").mkdir()
+    for path in sorted((SAMPLE / "images").iterdir()):
+        image = Image.open(path).convert("RGB")
+        ImageDraw.Draw(image).text((8, 6), "PSM1", (250, 250, 250), ImageFont.load_default(24))
+        image.save(tmp_path / "images" / path.name, quality=95)
+    data = read_episodes([read_recording(recording)])
+    images = choose_images(data, tmp_path, silent)
+    assert any("drawn over the video" in sentence for sentence in data.notes.sentences)
+    mask_path = images.mask_of(int(images.selected[0]))
+    assert mask_path is not None
+    hidden = np.array(Image.open(mask_path)) == 0
+    assert hidden[6:32, 8:75].mean() > 0.5
+    hidden[:45, :90] = False
+    assert hidden.mean() < 1e-3
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from neeco.capture.images import PIXELS, encoded_rgb, is_repeated, open_image, w
 from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
+from neeco.ingest.frames.overlay import find_overlay
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.timing.episodes import Episodes
@@ -220,7 +221,8 @@ class ChosenImages:
     lens: Lens | None  # None: not known yet
     selected: np.ndarray  # [K] video frames
     dropped: Mapping[int, DropReason]  # of other video frames, why
-    border: Border | None  # the endoscope's, in the frames as recorded
+    border: Border | None = None  # the endoscope's, in the frames as recorded
+    overlay: np.ndarray | None = None  # bool [H, W], what a console draws over the frames as recorded
 
     @property
     def names(self) -> list[str]:
@@ -247,19 +249,19 @@ class ChosenImages:
 
     @property
     def field_of_view(self) -> np.ndarray | None:
-        """Pixels within the border, bool [H, W], undistorted as the images are; None without a border."""
-        if self.border is None:
-            return None
-        visible = visible_mask(self.border, self.size)
-        return visible if self.lens is None else self.lens.undistort_mask(visible)
+        """Pixels within the border and beside what is drawn, bool [H, W], undistorted as the images are; None: all."""
+        visible = None if self.border is None else visible_mask(self.border, self.size)
+        if self.overlay is not None:
+            visible = ~self.overlay if visible is None else visible & ~self.overlay
+        return visible if self.lens is None or visible is None else self.lens.undistort_mask(visible)
 
     @property
     def masks(self) -> Path | None:
-        """Folder of the border's masks, one file per frame as pycolmap expects them; None without a border."""
-        return None if self.border is None else self.folder / "visible"
+        """Folder of the field of view's masks, one file per frame as pycolmap expects them; None: there are none."""
+        return None if self.border is None and self.overlay is None else self.folder / "visible"
 
     def mask_of(self, frame: int) -> Path | None:
-        """Return the border's mask of a video frame; None without a border."""
+        """Return the field of view's mask of a video frame; None: there is none."""
         return None if self.masks is None else self.masks / f"{frame:06d}.png.png"
 
     def rename(self, frame: int, name: str) -> Path:
@@ -277,14 +279,18 @@ def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> Chos
     lens = read_lens(data)
     selected, dropped = _choose(data, progress)
     size = data.video.size
-    images = ChosenImages(folder=folder, size=size, lens=lens, selected=selected, dropped=dropped, border=None)
+    images = ChosenImages(folder=folder, size=size, lens=lens, selected=selected, dropped=dropped)
     _write(images, data.video, progress)
     sample = selected[evenly_spaced(len(selected), BORDERS.max_frames, floor=True)]
-    border = find_border(image for _, image in data.video.read(sample.tolist()))
-    if border is not None:
-        dark = 1 - visible_mask(border, size).mean()
-        data.notes.add(f"the endoscope's dark border ({dark:.0%} of the image) is masked")
-    images = replace(images, border=border)
+    sampled = [image for _, image in data.video.read(sample.tolist())]
+    visible = None
+    if (border := find_border(sampled)) is not None:
+        visible = visible_mask(border, size)
+        data.notes.add(f"the endoscope's dark border ({1 - visible.mean():.0%} of the image) is masked")
+    if (overlay := find_overlay(sampled[::2], visible)) is not None:
+        what = "text, icons or bars drawn over the video"
+        data.notes.add(f"what never moves while the scene does ({what}; {overlay.mean():.1%} of the image) is masked")
+    images = replace(images, border=border, overlay=overlay)
     _write_masks(images)
     return images
 
