@@ -15,7 +15,7 @@ class OverlaySettings:
     """Thresholds of what is drawn over a scene. Brightness is of 255."""
 
     min_images: int = 8
-    percentiles: tuple[float, float] = (5.0, 95.0)  # of a pixel's brightness in the images, whose distance is its spread
+    percentiles: tuple[float, float] = (5.0, 95.0)  # of a pixel's brightness; their distance is its spread
     min_motion: float = 12.0  # median spread from which the scene moves; else nothing tells the two apart
     max_spread: float = 8.0  # of what is drawn: compression alone changes it
     min_edge: float = 30.0  # step of the median image among neighbours; what moves has no sharp edges there
