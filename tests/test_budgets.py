@@ -26,14 +26,14 @@ ROOMS = {
     "methods": (5295, 3500),
     "training": (2041, 1700),
     "states": (3361, 2600),
-    "evidence": (961, 1200),
+    "evidence": (984, 1200),
     "scene": (1999, 1800),
     "capture": (4971, 3900),
     "raster": (4055, 3800),
     "geometry": (983, 1000),
     "base": (1595, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (311, 240), (3637, 3000), (290, 300)
+FILES, FUNCTIONS, NUMBERS = (311, 240), (3638, 3000), (290, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

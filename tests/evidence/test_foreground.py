@@ -21,7 +21,9 @@ def view(seed: int, shade_of_shaft: tuple[float, float], residual_of_shaft: floa
     residual[:, LABEL] = residual_of_shaft * np.exp(rng.normal(0, 0.15, shade[:, LABEL].shape))
     label, everywhere = np.zeros(shade.shape), np.ones(shade.shape)
     label[:, LABEL] = 1
-    return Comparison(shade, residual, residual, everywhere, 50 * everywhere, label, usable=everywhere > 0)
+    return Comparison(
+        shade, residual, residual, everywhere, 50 * everywhere, label, left=0.02 * everywhere, usable=everywhere > 0
+    )
 
 
 def test_a_black_shaft_beside_a_penumbra_is_no_shadow() -> None:

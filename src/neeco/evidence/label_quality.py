@@ -79,7 +79,8 @@ def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     """Count pixels of a view [4]: certain instrument that is labelled, that is not, and of the other labelled pixels
     tissue, and instrument. Of those that are neither for certain, each counts as both: at outlines, as an instrument by
     how near it is to being covered by half, elsewhere by the share of instrument among certain pixels nearby. Certain
-    instrument is no isolated patch: see `least_body`."""
+    instrument is no isolated patch: see `least_body`. Unlabelled pixels beside an instrument that are not certainly
+    tissue, and that nothing in the scene explains, are instrument as well: a wrist that was never learned, say."""
     certainty, label = foreground.certainty(view, QUALITY.reach), view.usable & (view.label > QUALITY.labelled)
     instrument, tissue = certainty > QUALITY.certain, certainty < -QUALITY.certain
     across = np.ones((2 * foreground.settings.outline_px + 1,) * 2, np.uint8)  # outlines do not divide a body
@@ -87,13 +88,22 @@ def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     areas = np.bincount(bodies[instrument], minlength=1)
     shown = areas >= QUALITY.least_body * areas.max()
     shown[bodies[instrument & label]] = True
-    missed = instrument & ~label & shown[bodies]
+    missed = ~label & np.where(instrument, shown[bodies], ~tissue & _unexplained(view, foreground))
     share = view.covered / foreground.settings.covered
     window = (2 * math.ceil(QUALITY.nearby * label.shape[1]) + 1,) * 2
     near_instrument, near_tissue = (1e-6 + cv2.blur(kind.astype(float), window) for kind in (instrument, tissue))
     share = np.where(tissue, 0, np.where(share > 1, near_instrument / (near_instrument + near_tissue), share))
     other = share[label & ~instrument]
     return np.array([(instrument & label).sum(), missed.sum(), (1 - other).sum(), other.sum()])
+
+
+def _unexplained(view: Comparison, foreground: Foreground) -> np.ndarray:
+    """Return which pixels [H, W] beside a rendered instrument nothing that the scene renders explains."""
+    settings, rendered = foreground.settings, (view.label > 0.1).astype(np.uint8)
+    outline = (2 * (settings.outline_px + settings.window_px // 2) + 1,) * 2
+    beside = view.usable & view.near(QUALITY.reach) & (cv2.dilate(rendered, np.ones(outline, np.uint8)) == 0)
+    left = (beside & (view.left > foreground.left)).astype(np.uint8)
+    return cv2.morphologyEx(left, cv2.MORPH_OPEN, np.ones((settings.window_px,) * 2, np.uint8)) > 0
 
 
 def quality_of(images: Sequence[np.ndarray], least: int = SETTINGS.least_pixels) -> LabelQuality | None:
