@@ -58,7 +58,7 @@ class ForegroundSettings:
     # the tissue's alone, that quantile of it, and what counts as noise in any case
     apart: float = 0.2
     left_quantile: float = 0.99
-    least_left: float = 0.06
+    least_left: float = 0.1
     covered: float = 0.5  # share of a pixel that an instrument covers, from which on it may be one, or else tissue
     lit: float = 0.6  # shade of a pixel that is tissue by itself: a darker one may be mixed with a black instrument
     outline_px: int = 2  # about a pixel, within which the largest difference from the tissue is one wholly covered
