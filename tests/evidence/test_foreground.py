@@ -22,7 +22,7 @@ def view(seed: int, shade_of_shaft: tuple[float, float], residual_of_shaft: floa
     label, everywhere = np.zeros(shade.shape), np.ones(shade.shape)
     label[:, LABEL] = 1
     return Comparison(
-        shade, residual, residual, everywhere, 50 * everywhere, label, left=0.02 * everywhere, usable=everywhere > 0
+        shade, residual, residual, everywhere, 50 * everywhere, label, error=0.02 * everywhere, usable=everywhere > 0
     )
 
 

@@ -29,7 +29,7 @@ def view(label: slice, seed: int, *, dark: bool = False) -> Comparison:
     everywhere = np.ones((HEIGHT, WIDTH))
     depth = np.full((HEIGHT, WIDTH), 50.0)
     return Comparison(
-        shade, residual, residual, everywhere, depth, rendered, left=0.02 * everywhere, usable=everywhere > 0
+        shade, residual, residual, everywhere, depth, rendered, error=0.02 * everywhere, usable=everywhere > 0
     )
 
 
@@ -133,11 +133,11 @@ def test_a_part_that_neither_the_label_nor_the_rendering_has_makes_labels_doubtf
     views = [view(SHAFT, seed) for seed in range(3)]
     foreground = Foreground.learned(views)
     assert foreground is not None
-    for left, doubtful in ((0.02, False), (0.2, True)):
+    for error, doubtful in ((0.02, False), (0.2, True)):
         counts = []
         for shown in views:
-            image = replace(shown, left=shown.left.copy(), residual=shown.residual.copy(), own=shown.own.copy())
-            image.left[jaws] = left
+            image = replace(shown, error=shown.error.copy(), residual=shown.residual.copy(), own=shown.own.copy())
+            image.error[jaws] = error
             image.residual[jaws] = image.own[jaws] = foreground.noise * 2  # neither certainly tissue nor instrument
             counts.append(label_counts(image, foreground))
         quality = quality_of(counts)

@@ -50,9 +50,9 @@ def image_files(folder: Path) -> tuple[Path, ...]:
     return tuple(file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and file.name[0] != ".")
 
 
-def read_image_bytes(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> Tensor:
+def read_image_bytes(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> np.ndarray:
     """`read_pixels` as uint8 [H, W, 3], rounded where needed."""
-    return torch.from_numpy(byte_pixels(read_pixels(path, size, background)))
+    return byte_pixels(read_pixels(path, size, background))
 
 
 def read_pixels(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> np.ndarray:

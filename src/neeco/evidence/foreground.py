@@ -54,11 +54,10 @@ class ForegroundSettings:
     inside_px: int = 2  # from the outline of a rendered instrument: certainly one
     least_pixels: int = 200  # of each kind, below which nothing is said
     noise_quantile: float = 0.98  # of the tissue's residuals: its noise
-    # what the whole scene leaves of the image [0, 1]: share of the width from a rendered instrument beyond which it is
-    # the tissue's alone, that quantile of it, and what counts as noise in any case
-    apart: float = 0.2
-    left_quantile: float = 0.99
-    least_left: float = 0.1
+    apart: float = 0.2  # of the images' width from a rendered instrument: beyond, nothing of one shows in any case
+    # rendering errors of tissue that far away, whose quantile is their noise, and the least noise, of [0, 1]
+    error_quantile: float = 0.99
+    least_error: float = 0.1
     covered: float = 0.5  # share of a pixel that an instrument covers, from which on it may be one, or else tissue
     lit: float = 0.6  # shade of a pixel that is tissue by itself: a darker one may be mixed with a black instrument
     outline_px: int = 2  # about a pixel, within which the largest difference from the tissue is one wholly covered
@@ -72,8 +71,8 @@ SETTINGS = ForegroundSettings()
 class Comparison:
     """An image beside a scene's tissue: shade and residual [H, W], the residual of each pixel alone `own` [H, W], the
     share `covered` of each pixel by what differs from the tissue [H, W], the tissue's depth [H, W] mm, infinite where
-    there is none, the label [H, W] in [0, 1] as rendered; what the whole scene leaves of the image [H, W] in [0, 1],
-    and which pixels count, bool [H, W]."""
+    there is none, the label [H, W] in [0, 1] as rendered, the rendering error of the whole scene [H, W] (mean absolute
+    difference from the image), and which pixels count, bool [H, W]."""
 
     shade: np.ndarray
     residual: np.ndarray
@@ -81,7 +80,7 @@ class Comparison:
     covered: np.ndarray
     depth: np.ndarray
     label: np.ndarray
-    left: np.ndarray = field(kw_only=True)
+    error: np.ndarray = field(kw_only=True)
     usable: np.ndarray = field(kw_only=True)
 
     @staticmethod
@@ -109,14 +108,14 @@ class Comparison:
         covered = (differences / np.maximum(most, 1e-6)).min(-1)
         brightness = settings.dark + uniform_filter(likely * tissue.mean(-1), window)
         label = whole.channels[..., 0].cpu().numpy()
-        left = uniform_filter(np.abs(shown - whole.color.clamp(0, 1).cpu().numpy()).mean(-1), window)
+        error = uniform_filter(np.abs(shown - whole.color.clamp(0, 1).cpu().numpy()).mean(-1), window)
         usable = np.ones(label.shape, bool) if mask is None else mask.cpu().numpy()
         residual = uniform_filter(off, window) / brightness
-        return Comparison(shade, residual, off / brightness, covered, depth, label, left=left, usable=usable)
+        return Comparison(shade, residual, off / brightness, covered, depth, label, error=error, usable=usable)
 
-    def near(self, share: float) -> np.ndarray:
-        """bool [H, W]: pixels within `share` of the width of where an instrument may be rendered."""
-        reach = 2 * math.ceil(share * self.label.shape[1]) + 1
+    def near(self, share: float = 0.0, px: int = 0) -> np.ndarray:
+        """bool [H, W]: pixels within `share` of the width and `px` of where an instrument may be rendered."""
+        reach = 2 * (math.ceil(share * self.label.shape[1]) + px) + 1
         return cv2.dilate((self.label > 0.1).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
 
     def inside(self, margin_px: int) -> np.ndarray:
@@ -128,12 +127,11 @@ class Comparison:
 @dataclass(frozen=True, eq=False)
 class Foreground:
     """Tells instruments from tissue: the logarithm of the ratio of both densities [R, S] by bins of log residual and
-    shade; `noise`: the residual that nearly all of the tissue is below; `left`: likewise what the whole scene leaves of
-    an image."""
+    shade; `noise`: the residual that nearly all of the tissue is below; `error`: likewise the rendering error."""
 
     ratio: np.ndarray
     noise: float
-    left: float
+    error: float
     settings: ForegroundSettings = SETTINGS
 
     @staticmethod
@@ -156,12 +154,12 @@ class Foreground:
         tissue = lit / lit.sum() + shaded / max(shaded.sum(), 1e-9)  # as often in a shadow as not
         of_tissue = np.concatenate([view.residual[mask] for view, mask in zip(views, far, strict=True)])
         noise = float(np.quantile(of_tissue, settings.noise_quantile))
-        left = np.concatenate([view.left[view.usable & ~view.near(settings.apart)] for view in views])
-        known = len(left) >= settings.least_pixels
-        limit = max(settings.least_left, float(np.quantile(left, settings.left_quantile))) if known else math.inf
+        errors = np.concatenate([view.error[view.usable & ~view.near(settings.apart)] for view in views])
+        known = len(errors) >= settings.least_pixels
+        error = max(settings.least_error, float(np.quantile(errors, settings.error_quantile))) if known else math.inf
         instrument = _density(instrument, settings.unsampled_instrument, settings.smoothing)
         tissue = _density(tissue, settings.unsampled_tissue, settings.smoothing)
-        return Foreground(np.log(instrument / tissue), noise, limit, settings)
+        return Foreground(np.log(instrument / tissue), noise, error, settings)
 
     def certainty(self, view: Comparison, near: float) -> np.ndarray:
         """Return of every pixel of a view [H, W]: 1 certainly an instrument, -1 certainly tissue, 0 not known. No

@@ -21,7 +21,6 @@ class QualitySettings:
     """Settings of the estimate."""
 
     n_views: int = 12  # training frames from which instruments and tissue are told apart
-    reach: float = 0.2  # of the images' width: how far from a rendered instrument one may show that is not labelled
     labelled: float = 0.5  # rendered share of a pixel from which it is labelled
     certain: float = 0.25  # certainty from which a pixel counts
     nearby: float = 0.02  # of the images' width: how far certain pixels tell what uncertain ones show
@@ -81,7 +80,10 @@ def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     how near it is to being covered by half, elsewhere by the share of instrument among certain pixels nearby. Certain
     instrument is no isolated patch: see `least_body`. Unlabelled pixels beside an instrument that are not certainly
     tissue, and that nothing in the scene explains, are instrument as well: a wrist that was never learned, say."""
-    certainty, label = foreground.certainty(view, QUALITY.reach), view.usable & (view.label > QUALITY.labelled)
+    certainty, label = (
+        foreground.certainty(view, foreground.settings.apart),
+        view.usable & (view.label > QUALITY.labelled),
+    )
     instrument, tissue = certainty > QUALITY.certain, certainty < -QUALITY.certain
     across = np.ones((2 * foreground.settings.outline_px + 1,) * 2, np.uint8)  # outlines do not divide a body
     bodies = cv2.connectedComponents(cv2.dilate(instrument.astype(np.uint8), across))[1]
@@ -99,11 +101,11 @@ def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
 
 def _unexplained(view: Comparison, foreground: Foreground) -> np.ndarray:
     """Return which pixels [H, W] beside a rendered instrument nothing that the scene renders explains."""
-    settings, rendered = foreground.settings, (view.label > 0.1).astype(np.uint8)
-    outline = (2 * (settings.outline_px + settings.window_px // 2) + 1,) * 2
-    beside = view.usable & view.near(QUALITY.reach) & (cv2.dilate(rendered, np.ones(outline, np.uint8)) == 0)
-    left = (beside & (view.left > foreground.left)).astype(np.uint8)
-    return cv2.morphologyEx(left, cv2.MORPH_OPEN, np.ones((settings.window_px,) * 2, np.uint8)) > 0
+    settings = foreground.settings
+    outline = view.near(px=settings.outline_px + settings.window_px // 2)
+    beside = view.usable & view.near(settings.apart) & ~outline
+    wrong = (beside & (view.error > foreground.error)).astype(np.uint8)
+    return cv2.morphologyEx(wrong, cv2.MORPH_OPEN, np.ones((settings.window_px,) * 2, np.uint8)) > 0
 
 
 def quality_of(images: Sequence[np.ndarray], least: int = SETTINGS.least_pixels) -> LabelQuality | None:

@@ -90,7 +90,7 @@ class ImageFolder:
 
 @lru_cache(maxsize=IMAGES.cached_images)
 def _decoded(file: Path) -> np.ndarray:
-    return read_image_bytes(file).numpy()
+    return read_image_bytes(file)
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Colors:
 
 @lru_cache(maxsize=4096)
 def _colors_of_file(file: Path) -> Colors:
-    return Colors.of(read_image_bytes(file).numpy().astype(np.float32) / 255)
+    return Colors.of(read_image_bytes(file).astype(np.float32) / 255)
 
 
 @dataclass(frozen=True)

@@ -74,9 +74,8 @@ class ImageVerdicts:
         candidates += camera_candidates(colors.cameras.poses) if fine < SETTINGS.good_colors else []
         if (mistake := likeliest(candidates, colors)) is not None:
             return Verdict.of(mistake, "frames[*].transform_matrix", "frames")
-        coarse = float(colors.agreement(coarse=True).mean())
-        unlike = fine < SETTINGS.contradicted_colors and coarse < SETTINGS.contradicted_coarsely
-        if unlike and colors.contrast > SETTINGS.min_contrast:
+        unlike = fine < SETTINGS.contradicted_colors and colors.contrast > SETTINGS.min_contrast
+        if unlike and colors.agreement(coarse=True).mean() < SETTINGS.contradicted_coarsely:
             message = (
                 "the images contradict the cameras: sparse points do not have the colours of the pixels they project "
                 f"to (correlation {fine:.2f})"

@@ -178,7 +178,7 @@ class SyntheticSample:
     def load(self) -> Example:
         """Raises NeecoError where a file is of another size, or has an id without a class."""
         ids = read_labels(self.labels, image_size(self.image)).numpy()
-        return Example(read_image_bytes(self.image).numpy(), _classes_of(ids, self.table, self.labels, ANEW))
+        return Example(read_image_bytes(self.image), _classes_of(ids, self.table, self.labels, ANEW))
 
 
 def permuted(samples: Sequence[SyntheticSample]) -> tuple[SyntheticSample, ...]:

@@ -123,7 +123,7 @@ class Backgrounds:
         """The image uint8 [H, W, 3] of this number, at this size (width, height)."""
         if not self.files:
             return self._filled(CACHE.load(self.samples[index]))
-        return cv2.resize(read_image_bytes(self.files[index]).numpy(), size, interpolation=cv2.INTER_AREA)
+        return cv2.resize(read_image_bytes(self.files[index]), size, interpolation=cv2.INTER_AREA)
 
     def _filled(self, example: Example) -> np.ndarray:
         """The image with its instruments filled in."""

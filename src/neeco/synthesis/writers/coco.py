@@ -10,7 +10,7 @@ Category ids of parts are the part ids of dataset.json and of parts/, whether an
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,7 @@ class Coco(Writer):
         for split in (None, *sorted({record["split"] for record in records})):
             chosen = [record for record in records if split in (None, record["split"])]
             visible = [(record, label) for record in chosen for label in record["labels"] if label["area"] > 0]
+            exact = _exact_masks(images, visible) if split is None else {}
             by_instrument = (_instrument(record, label, numbers, keypoints) for record, label in visible)
             by_part = (
                 _annotation(record, shape, part_numbers[label["name"], part])
@@ -70,23 +71,22 @@ class Coco(Writer):
                 document = _document(chosen, categories, made)
                 write_json(path, document, indent=None)
                 if split is None:
-                    masks = _masks(images, visible, by_part=kind == "parts")
-                    for annotation, mask in zip(document["annotations"], masks, strict=True):
-                        annotation["segmentation"] = run_lengths(mask)
+                    for annotation, runs in zip(document["annotations"], exact[kind], strict=True):
+                        annotation["segmentation"] = runs
                     write_json(folder / "rle" / f"{kind}.json", document, indent=None)
 
 
-def _masks(images: WrittenImages, visible: Sequence[tuple[Record, Entry]], *, by_part: bool) -> Iterator[np.ndarray]:
-    """Yield the mask [H, W] of every instrument that is visible, or of every part of them."""
-    for record, label in visible:
-        ids = read_labels(images.root / "parts" / f"{stem(record['index'])}.png").numpy()
-        for part in label["parts"] if by_part else (None,):
-            owned = [
-                number
-                for number, (instrument, name) in enumerate(images.labeller.names, 1)
-                if instrument == label["instrument"] and part in (None, name)
-            ]
-            yield np.isin(ids, owned)
+def _exact_masks(images: WrittenImages, visible: Sequence[tuple[Record, Entry]]) -> dict[str, list[Entry]]:
+    """Return the run lengths of all instances that are visible, and of their parts, by kind."""
+    runs: dict[str, list[Entry]] = {"instances": [], "parts": []}
+    record, ids = None, np.zeros((0, 0), np.uint8)
+    for owner, label in visible:
+        if owner is not record:
+            record, ids = owner, read_labels(images.root / "parts" / f"{stem(owner['index'])}.png").numpy()
+        numbers = {part: k for k, (name, part) in enumerate(images.labeller.names, 1) if name == label["instrument"]}
+        runs["instances"].append(run_lengths(np.isin(ids, [*numbers.values()])))
+        runs["parts"] += [run_lengths(ids == numbers[part]) for part in label["parts"]]
+    return runs
 
 
 def run_lengths(mask: np.ndarray) -> Entry:
