@@ -48,7 +48,7 @@ def test_blank_lines_and_a_damaged_first_row_move_no_header(world):
     rows[0], rows[5] = "0,oops,1,2,1,0,0,0", "\n,,,\n" + rows[5]
     log = read_pose_log(PoseColumns(world.text("\n".join(["t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz", "", *rows]))))
     np.testing.assert_allclose(log.positions, world.positions(world.times)[1:], atol=1e-6)
-    assert "1 row dropped: not readable" in log.notes[0]
+    assert "1 row dropped: values are missing, first: x_mm is 'oops'" in log.notes[0]
 
 
 def test_names_over_two_lines_tell_columns_of_one_name_apart(world):

@@ -64,8 +64,8 @@ def test_readings_far_outside_the_table_are_refused_a_single_spike_is_dropped(wo
         ),
         ([[1.0, 0.0], [2.0, 0.4], [2.0, 0.5]], r"table\.csv: lines 3 and 4: expected"),
         ([[1.0, 0.0]], "one point"),
-        ([[1.0, 0.0], ["", 0.4]], r"line 3: has an empty cell"),
-        ([[1.0, 0.0], [2.0, "x"]], r"line 3: angle_rad is 'x'"),
+        ([[1.0, 0.0], ["", 0.4]], "line 3: counts: a number is missing"),
+        ([[1.0, 0.0], [2.0, "x"]], "line 3: angle_rad: a number is missing"),
         ([[1.0, 0.0], [2.0, 90.0]], "beyond two turns"),
     ],
 )

@@ -142,8 +142,7 @@ def test_rows_out_of_order_twice_or_damaged_are_noted(world):
     np.testing.assert_allclose(log.times, world.times[selected])
     assert_same(log, world, world.times[selected])
     notes = "\n".join(log.notes)
-    assert "2 rows dropped: values are missing (lines 72, 92)" in notes
-    assert "1 row dropped: not readable, first: qx is 'x7', not a number (line 82)" in notes
+    assert "3 rows dropped: values are missing, first: y_mm is 'nan', not a number (lines 72, 82, 92)" in notes
     assert "1 row dropped: a second row at one time (line 52)" in notes
     assert "1 row out of order in time; sorted (line 23)" in notes
 

@@ -26,7 +26,6 @@ from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
 from neeco.ingest.readers.frame_names import NamedFrame
 
-MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
 HUGE = 1e20
 MAX_LISTED = 3  # lines named in a message
@@ -106,7 +105,7 @@ class Stream:
     For a template: offered: is it what is recorded most likely, or only there, too? body: what it is of, where the
     format tells; joints: (name, column) of the readings worth having, None: all angles; hints: remarks on the body;
     columns: of the table, those that are the body's (None: all); asks: keys of the log that nothing in the file says,
-    as lines for the user to choose from, those of its columns indented; clock: that of a file without images; problem:
+    as lines for the user to choose from; clock: that of a file without images; problem:
     why it cannot be read, though the rest of the file can.
     """
 
@@ -299,23 +298,24 @@ def compare_lengths(file: Path, video: VideoSource, rows: int, image_hz: float) 
     return compare_counts(file, images, rows, f"states at {image_hz:g} a second", MAX_UNLIKE, remedy)
 
 
-def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[tuple[int, str]]]:
-    """Columns as numbers [R, C]; bool [R] rows where a value is missing; (row, what) for cells that are no numbers.
+def numbers(table: Table, columns: Sequence[str]) -> np.ndarray:
+    """Return columns as numbers [R, C], NaN where a value is missing or none. Raises NeecoError when a column does not
+    exist."""
+    return to_numbers(table.rows[:, [column_index(table, name) for name in columns]])
 
-    Missing or unreadable cells are NaN. Raises NeecoError when a column does not exist.
-    """
-    chosen, bad = table.rows[:, [column_index(table, name) for name in columns]], dict[int, str]()
-    if chosen.dtype == object:
-        cells = chosen.ravel().tolist()
-        values = [parse_number(cell) for cell in cells]
-        for place in (place for place, value in enumerate(values) if value is None):
-            row, slot = divmod(place, len(columns))
-            bad.setdefault(row, f"{columns[slot]} is {printable(cells[place], 24)}, not a number")
-        chosen = np.array(values, np.float64).reshape(chosen.shape)  # None becomes NaN
-    missing = ~(np.abs(chosen) < HUGE)  # NaN compares false
-    incomplete = missing.any(axis=1)
-    incomplete[list(bad)] = False
-    return np.where(missing, np.nan, chosen), incomplete, list(bad.items())
+
+def to_numbers(cells: np.ndarray) -> np.ndarray:
+    """Return texts or numbers [...] as numbers; NaN for what is no number, or so huge that it stands for none."""
+    if cells.dtype == object:
+        cells = np.array([_number(cell) for cell in cells.ravel().tolist()], np.float64).reshape(cells.shape)
+    return np.where(np.abs(cells) < HUGE, cells, np.nan)  # NaN compares false
+
+
+def _number(text: str) -> float:
+    try:
+        return np.nan if "_" in text else float(text)  # Python would read 1_000
+    except ValueError:
+        return np.nan
 
 
 def column_index(table: Table, name: str) -> int:
@@ -327,19 +327,6 @@ def column_index(table: Table, name: str) -> int:
         names = ", ".join(table.header[:16]) + (", ..." if len(table.header) > 16 else "")
         raise NeecoError(f"{table.where}: has no column {printable(name)}; its columns are {printable(names, 200)}")
     return matches[0]
-
-
-def parse_number(text: str) -> float | None:
-    """The number in a cell, NaN where the sample is missing, None where it is no number."""
-    if text.lower() in MISSING:
-        return np.nan
-    if "_" in text:  # Python would read 1_000
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if abs(value) < HUGE else np.nan
 
 
 def rate_of(times: np.ndarray) -> float | None:

@@ -226,7 +226,8 @@ def recognise_pose(header: Sequence[str], named: _Given = _NOTHING) -> Recognise
     lower = [_plain(name) for name in header]
     ndi = {"state", "q0", "tx", "ty", "tz"} <= set(lower)
     ros = bool(position and _ROS.search(position[0].lower()))
-    state = next((name for name in left if ndi and _plain(name) == "state"), None)
+    states = [name for name in left if (ndi and _plain(name) == "state") or name.endswith("TransformStatus")]  # of PLUS
+    state = next(iter(states), None)
     unit = "mm" if ndi else "m" if ros else None
     return replace(
         when, position=position, rotation=rotation, form=form, state=state, length_unit=unit, unclear=unclear

@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from io import StringIO
 from itertools import accumulate, pairwise
 from pathlib import Path
 
@@ -19,7 +18,7 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes
 from neeco.capture.documents import printable
-from neeco.ingest.readers import DELIMITED, MISSING, Body, RecordingFormat, Table, parse_number
+from neeco.ingest.readers import DELIMITED, Body, RecordingFormat, Table, to_numbers
 from neeco.ingest.readers.columns import UNITS, PoseColumns, canonical_unit
 
 EXPECTED = "CSV with a header line"
@@ -37,6 +36,7 @@ class TextLimits:
     columns: int = 4096
     padding: int = 16  # limit on the ratio of a table's cells to the cells with text
     sample_lines: int = 400  # lines examined for the columns of numbers
+    header_lines: int = 1000  # lines among which the header is
 
 
 LIMITS = TextLimits()
@@ -75,12 +75,6 @@ class Cells:
     counts: np.ndarray
     comment: np.ndarray
 
-    def numeric(self, rows: np.ndarray | slice) -> np.ndarray:
-        """Return which cells [R, W] of some lines hold numbers."""
-        cells = self.cells[rows]
-        flags = [parse_number(cell) is not None and cell.lower() not in MISSING for cell in cells.ravel()]
-        return np.array(flags, dtype=bool).reshape(cells.shape)
-
     def names(self, row: int) -> list[str]:
         """Return the cells of a line."""
         names: list[str] = self.cells[row, : self.counts[row]].tolist()
@@ -89,38 +83,31 @@ class Cells:
 
 def read_cells(path: Path) -> Cells:
     """The lines of a text file that hold anything, of which one at least is no comment. Raises NeecoError."""
-    import pandas
-
     texts = [(number, text) for number, text in enumerate(_read_text(path).splitlines(), 1) if text.strip(",;\t ")]
     comment = np.array([_COMMENT.match(text) is not None for _, text in texts], dtype=bool)
     if comment.all():
         raise NeecoError(f"{path}: holds only comments; expected {EXPECTED}")
-    plain = [text for (_, text), is_comment in zip(texts, comment, strict=True) if not is_comment]
-    sign = _delimiter(plain)
+    sign = _delimiter([text for (_, text), is_comment in zip(texts, comment, strict=True) if not is_comment])
     lines = [_COMMENT.sub("", text) for _, text in texts]
-    counts = np.array([len(line.split()) if sign == " " else line.count(sign) + 1 for line in lines])
-    columns = range(int(counts.max()))
-    if len(columns) > LIMITS.columns:
+    try:  # line by line: a quote left open must not swallow the rest of the file
+        rows = [line.split() if sign == " " else next(csv.reader([line], delimiter=sign)) for line in lines]
+    except csv.Error as error:
+        raise NeecoError(f"{path}: not readable as CSV ({error}); repair it") from None
+    counts = np.array([len(row) for row in rows])
+    width = int(counts.max())
+    if width > LIMITS.columns:
         line = texts[int(counts.argmax())][0]
-        raise NeecoError(f"{path}: line {line}: has {len(columns)} cells; expected at most {LIMITS.columns}")
-    if len(columns) * len(lines) > LIMITS.padding * int(counts.sum()) + 10**6:
+        raise NeecoError(f"{path}: line {line}: has {width} cells; expected at most {LIMITS.columns}")
+    if width * len(lines) > LIMITS.padding * int(counts.sum()) + 10**6:
         raise NeecoError(f"{path}: most lines are much shorter than the longest one; expected the rows of one table")
-    is_open = any(line.count('"') % 2 for line in lines)  # a quote left open must not swallow the rest of the file
-    try:
-        frame = pandas.read_csv(
-            StringIO("\n".join(lines)), sep=r"\s+" if sign == " " else sign, header=None, names=columns,
-            index_col=False, dtype=str, na_filter=False, skip_blank_lines=False, low_memory=False,
-            quoting=csv.QUOTE_NONE if is_open else csv.QUOTE_MINIMAL,
-        )  # fmt: skip
-    except (ValueError, OverflowError) as error:
-        raise NeecoError(f"{path}: not readable as CSV ({' '.join(str(error).split())[:100]}); repair it") from None
-    frame = frame.fillna("")  # where a line has fewer cells
-    stripped = [cell.strip(' \t"') for cell in frame.to_numpy(object).ravel().tolist()]
-    if sign in ";\t" and any("," in text for text in plain[:49]):
-        stripped = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in stripped]
-    cells = np.empty(frame.size, object)
-    cells[:] = stripped
-    return Cells(cells.reshape(frame.shape), np.array([number for number, _ in texts]), counts, comment)
+    commas = sign in ";\t"  # of decimals
+    cells = np.full((len(rows), width), "", object)
+    for line, row in zip(cells, rows, strict=True):
+        stripped = (cell.strip(' \t"') for cell in row)
+        line[: len(row)] = [
+            cell.replace(",", ".") if commas and _DECIMAL_COMMA.fullmatch(cell) else cell for cell in stripped
+        ]
+    return Cells(cells, np.array([number for number, _ in texts]), counts, comment)
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -135,31 +122,24 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
 
 def _header(path: Path, text: Cells) -> tuple[list[str], int]:
     """The names of the columns, and the line from which the rows are. Raises NeecoError where nothing names them."""
-    plain = np.flatnonzero(~text.comment).tolist()
+    plain = np.flatnonzero(~text.comment)
     sample = plain[len(plain) // 2 :][: LIMITS.sample_lines]
-    numeric = np.flatnonzero(text.numeric(np.array(sample)).mean(axis=0) > 0.5)
-
-    def is_row(row: int) -> bool:
-        """Whether a line holds numbers, or a word for a missing one, wherever most do."""
-        filled = text.numeric(slice(row, row + 1))[0, numeric]
-        missing = [index < text.counts[row] and text.cells[row, index].lower() in MISSING for index in numeric]
-        return bool(filled.any() and (filled | missing).all())
-
-    def names_columns(row: int, columns: np.ndarray) -> bool:
-        """Whether a line has no numbers where the rows have them, and names for at least half of those columns."""
-        filled = text.numeric(slice(row, row + 1))[0, columns]
-        return sum(map(bool, text.cells[row, columns])) >= 0.5 * len(columns) and not filled.any()
-
-    start = next((row for row in plain if is_row(row)), None)
-    if not len(numeric) or start is None:
+    numeric = np.flatnonzero(np.isfinite(to_numbers(text.cells[sample])).mean(axis=0) > 0.5)
+    head = text.cells[: LIMITS.header_lines, numeric]
+    filled = np.isfinite(to_numbers(head))
+    # lines that have no numbers where the rows have them, and names for at least half of those columns
+    named = ((head != "").sum(axis=1) >= 0.5 * len(numeric)) & ~filled.any(axis=1)
+    starts = [row for row in plain.tolist() if row < len(head) and filled[row].sum() > 0.5 * len(numeric)]
+    if not starts:
         return text.names(plain[0]), plain[0] + 1
-    above = [row for row in plain if row < start]
-    if places := [row for row in above if names_columns(row, numeric)]:
-        place, others = places[-1], [row for row in above if row < places[-1]]
+    above = plain[plain < starts[0]]
+    places = above[named[above]].tolist()
+    if places:
+        place, others = places[-1], above[above < places[-1]].tolist()
         units = [canonical_unit(cell.strip("[]() ")) for cell in text.cells[place]]
         units = [unit if any(unit in scales for scales in UNITS.values()) else "" for unit in units]
-        filled = [unit for unit, cell in zip(units, text.cells[place], strict=True) if cell.strip("[]()- ")]
-        if others and others[-1] in places and sum(map(bool, filled)) > 0.5 * len(filled) > 0:  # a line of units
+        stated = [unit for unit, cell in zip(units, text.cells[place], strict=True) if cell.strip("[]()- ")]
+        if others and others[-1] in places and sum(map(bool, stated)) > 0.5 * len(stated) > 0:  # a line of units
             place = others.pop()
         else:
             units = [""] * len(units)
@@ -168,15 +148,13 @@ def _header(path: Path, text: Cells) -> tuple[list[str], int]:
             groups = accumulate(text.cells[others[-1]].tolist(), lambda last, group: str(group or last))
             joined = ["_".join(filter(None, pair)) for pair in zip(groups, names, strict=False)]
             names = joined if len(set(names)) < len(set(joined)) else names
-        named = (f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, units, strict=False))
-        return list(named), places[-1] + 1
-    if above and text.counts[above[-1]] == text.counts[start] and names_columns(above[-1], np.array([0])):
-        return text.names(above[-1]), above[-1] + 1
-    for row in reversed(np.flatnonzero(text.comment[:start]).tolist()):
-        if text.counts[row] == text.counts[start] and names_columns(row, numeric):
-            return text.names(row), start
+        named_units = zip(names, units, strict=False)
+        return [f"{name} [{unit}]" if unit and name else name for name, unit in named_units], places[-1] + 1
+    for row in reversed(np.flatnonzero(text.comment[: starts[0]]).tolist()):
+        if text.counts[row] == text.counts[starts[0]] and named[row]:
+            return text.names(row), starts[0]
     first_cells, where = printable(",".join(text.names(plain[0]))[:40]), f"{path}: line {text.lines[plain[0]]}"
-    rows = f", and the rows of numbers begin at line {text.lines[start]}" if above else ""
+    rows = f", and the rows of numbers begin at line {text.lines[starts[0]]}" if len(above) else ""
     raise NeecoError(f"{where} is no header of columns (found {first_cells}){rows}; add a line that names the columns")
 
 

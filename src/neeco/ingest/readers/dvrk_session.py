@@ -99,20 +99,18 @@ class DvrkSession(RecordingFormat):
         name = self.choose(path, stream, Kind.POSES, Kind.READINGS).name
         kind, columns, table = _topic(_topics(path)[name])
         stamps = ["header.stamp.sec", "header.stamp.nanosec"]
-        times = numbers(table, ["timestamp"])[0][:, 0] * 1e-9  # of receipt
+        times = numbers(table, ["timestamp"])[:, 0] * 1e-9  # of receipt
         if set(stamps) <= set(table.header):
-            stated = numbers(table, stamps)[0] @ [1.0, 1e-9]
+            stated = numbers(table, stamps) @ [1.0, 1e-9]
             times = np.where(stated == 0, times, stated)
         frames = _frames(table) if kind == Kind.POSES else []
         if len(frames) > 1:
             listed = ", ".join(frames[:4])
             raise NeecoError(f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame")
         joints = (joint_column(name) for name in _joint_names(table, columns))
-        values, _, bad = numbers(table, columns)
         return Table(
             path, POSE_HEADER if kind == Kind.POSES else unique_names(["t_s", *joints]),
-            np.column_stack([times - start, values]), table.lines, stream=name,
-            notes=(f"{path.name}: {name}: {len(bad)} rows cannot be read; left out",) if bad else (),
+            np.column_stack([times - start, numbers(table, columns)]), table.lines, stream=name,
             stated_in=frames[0] if frames else None, meaning=meaning_of(frames[0], dvrk=True) if frames else None,
         )  # fmt: skip
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
-from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, parse_number, read_once
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, read_once, to_numbers
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.delimited import read_cells
 from neeco.ingest.readers.frame_names import NamedFrame
@@ -36,9 +36,8 @@ class JigsawsKinematics(RecordingFormat):
 
     def claims(self, path: Path) -> bool:
         first = read_head(path, 4096).partition(b"\n")[0].decode("utf-8", "replace").split()
-        return (
-            path.suffix.lower() == ".txt" and len(first) == COLUMNS * len(ARMS) and None not in map(parse_number, first)
-        )
+        is_long = path.suffix.lower() == ".txt" and len(first) == COLUMNS * len(ARMS)
+        return is_long and bool(np.isfinite(to_numbers(np.array(first, object))).all())
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         count = len(_lines(path)[0])
@@ -67,8 +66,7 @@ class JigsawsKinematics(RecordingFormat):
 def _lines(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return numbers [R, 76], NaN in lines that have not as many, and the lines [R] that they stand in."""
     text, count = read_cells(path), COLUMNS * len(ARMS)
-    cells = text.cells[:, :count].tolist()
-    values = np.array([[parse_number(cell) for cell in row] for row in cells], np.float64)
-    padded = np.full((len(cells), count), np.nan)
-    padded[text.counts == count, : values.shape[1]] = values[text.counts == count]
-    return padded, text.lines
+    values = np.full((len(text.lines), count), np.nan)
+    whole = text.counts == count
+    values[whole] = to_numbers(text.cells[whole, :count]) if whole.any() else np.nan
+    return values, text.lines

@@ -7,34 +7,27 @@ a quaternion or the frame that poses are stated in; where the columns' names do 
 
 from __future__ import annotations
 
-import json
-import os
 import re
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from io import BytesIO
-from itertools import count
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
-from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
-from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, one_line
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.frame_names import NamedFrame, camera_order, meaning_in, of_dvrk, unsaid, without_frame
-from neeco.ingest.readers.lerobot_files import FIXED, DataSet, Episode, Feature, LeRobotLimits, batches, read_data_set
+from neeco.ingest.readers.lerobot_files import FIXED, LIMITS, DataSet, Episode, Feature, batches, read_data_set
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
 TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
-DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*/\s*(\S+)\s*", re.IGNORECASE)
 
 
@@ -45,7 +38,6 @@ class LeRobot(RecordingFormat):
     holds = "poses, readings and images of an episode: folders of versions 2.0, 2.1 and 3.0 (meta/info.json)"
     package = "pyarrow"
     extra = "lerobot"
-    limits = LeRobotLimits()
 
     def claims(self, path: Path) -> bool:
         return b'"codebase_version"' in read_head(path / "meta" / "info.json", 2**20)
@@ -63,10 +55,7 @@ class LeRobot(RecordingFormat):
             elif kind == Kind.IMAGES:
                 images.append(stream)
             elif kind == Kind.READINGS:
-                try:
-                    tables += self._bodies(data, episode, feature, stream)
-                except NeecoError as error:
-                    tables.append(replace(stream, problem=str(error)))
+                tables += _bodies(feature, stream)
             elif key not in FIXED:
                 tables.append(stream)
         images.sort(key=lambda stream: camera_order(stream.name))
@@ -90,30 +79,26 @@ class LeRobot(RecordingFormat):
         episode, key = self._chosen(data, stream, Kind.IMAGES)
         times, order, places, notes = _times(data, episode)
         if data.features[key].dtype == "image":
-            stored = _Stored(
-                episode.data, (0, 0), notes, times, key=key, episode=episode.number, limits=self.limits,
-                rows=tuple(order.tolist()),
-            )  # fmt: skip
+            rows = tuple(order.tolist())
+            stored = _Stored(episode.data, (0, 0), notes, times, key=key, episode=episode.number, rows=rows)
             height, width = next(stored.read([0]))[1].shape[:2]
             return replace(stored, size=(width, height))
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
         film, part = episode.films[key]
-        if part is not None and places[-1] >= len(places):  # the part was counted without the rows that were removed
-            part = part[0], max(part[1], part[0] + (int(places[-1]) + 1) / data.fps)
+        count = int(places[-1]) + 1  # images that the states belong to, and those between
+        if part is not None and count > len(places):  # the part was counted without the rows that were removed
+            part = part[0], max(part[1], part[0] + count / data.fps)
         video = open_video(film, part=part)
         # the episode's frame of each of the video's, in which those that cannot be decoded are missing
         numbers = np.rint(video.times / float(np.median(np.diff(video.times)))).astype(np.int64)
-        damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
-        count = int(places[-1]) + 1  # images that the states belong to, and those between
-        last = int(numbers[-1]) + 1
-        n_images = max(last, count) if damaged else max(last, len(numbers)) if last > count else len(numbers)
+        n_images = int(numbers[-1]) + 1
         noun, remedy = f"states of episode {episode.number}", "download the data set again, or name another episode"
         if count > len(times):
             notes = (*notes, f"{film.name}: by timestamps, not all images have {noun}; the others are left out")
             noun, n_images = f"that the timestamps of episode {episode.number} reach", min(n_images, count)
         notes = (*notes, *compare_counts(film, n_images, count, noun, remedy=remedy))
-        row = np.full(max(last, count), -1)
+        row = np.full(max(int(numbers[-1]) + 1, count), -1)
         row[places] = np.arange(len(times))
         usable = row[numbers] >= 0
         frames = tuple(np.flatnonzero(usable).tolist())
@@ -132,7 +117,7 @@ class LeRobot(RecordingFormat):
 
     def _data_set(self, path: Path) -> DataSet:
         self.require_package(path)
-        return read_data_set(path, self.limits)
+        return read_data_set(path)
 
     def _chosen(self, data: DataSet, stream: str | None, *kinds: Kind) -> tuple[Episode, str]:
         """Return the episode and the feature that a stream names; the only ones there are where none is named."""
@@ -147,30 +132,27 @@ class LeRobot(RecordingFormat):
         key = self.choose(data.path, wanted, *kinds, streams=streams).name.partition("/")[2]
         return data.episode(number), key
 
-    def _bodies(self, data: DataSet, episode: Episode, feature: Feature, stream: Stream) -> list[Stream]:
-        """Return a stream for every body that the names of a feature's columns distinguish."""
-        plain = replace(stream, offered=False)
-        if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
-            return [plain]
-        bodies = named.pose_bodies(feature.names)
-        readings, found = named.joint_columns(feature.names, bodies), []
-        for prefix, columns in bodies.items():
-            body, poses = without_frame(prefix), named.recognise_pose(columns)
-            if poses.position is None:
-                continue
-            of_body = [name for name in readings if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
-            joints = tuple((_joint_name(name, body), name) for name in of_body)
-            columns = tuple(name for name in columns if name not in readings)
-            asks = () if poses.rotation else _rotation_asks(data, episode, feature, columns)
-            found.append((body or UNNAMED, columns, joints, asks))
-        if not found and (asks := _rotation_asks(data, episode, feature, feature.names)):
-            found.append((UNNAMED, (), (), asks))
-        streams = []
-        for body, columns, joints, asks in found:
-            meaning = _meaning(feature.key, columns or feature.names)
-            posed = replace(plain, kind=Kind.POSES, offered=True, body=body, columns=columns, joints=joints)
-            streams.append(replace(posed, hints=meaning.hints, asks=(*meaning.asks, *asks)))
-        return streams or [plain]
+
+def _bodies(feature: Feature, stream: Stream) -> list[Stream]:
+    """Return a stream for every body that the names of a feature's columns distinguish."""
+    plain = replace(stream, offered=False)
+    if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
+        return [plain]
+    bodies = named.pose_bodies(feature.names)
+    readings, streams = named.joint_columns(feature.names, bodies), []
+    for prefix, columns in bodies.items():
+        body, meaning = without_frame(prefix), _meaning(feature.key, columns)
+        if named.recognise_pose(columns).position is None:
+            continue
+        of_body = [name for name in readings if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
+        posed = replace(plain, kind=Kind.POSES, offered=True, body=body or UNNAMED, hints=meaning.hints)
+        streams.append(
+            replace(
+                posed, columns=tuple(name for name in columns if name not in readings), asks=meaning.asks,
+                joints=tuple((_joint_name(name, body), name) for name in of_body),
+            )
+        )  # fmt: skip
+    return streams or [plain]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,41 +162,27 @@ class _Stored(VideoSource):
 
     key: str
     episode: int
-    limits: LeRobotLimits
     rows: tuple[int, ...]
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        wanted, rows = {self.rows[int(index)]: int(index) for index in indices}, count()
-        with ThreadPoolExecutor(DECODERS) as pool:  # zlib lets other threads run
-            for cells in self._cells():
-                chosen = {row: cell for cell, row in zip(cells, rows, strict=False) if row in wanted}
-                for number, pixels in zip(chosen, pool.map(self._decoded, chosen, chosen.values()), strict=True):
-                    yield wanted.pop(number), pixels
-                if not wanted:
-                    return
+        wanted = {self.rows[int(index)]: int(index) for index in indices}
+        parts = batches(self.path, ["episode_index", self.key], self.episode, LIMITS.images_at_once)
+        for row, cell in enumerate(chain.from_iterable(part.column(self.key).to_pylist() for part in parts)):
+            if row in wanted:
+                yield wanted.pop(row), self._decoded(row, cell.get("bytes") if isinstance(cell, dict) else cell)
+            if not wanted:
+                return
         raise NeecoError(f"{self.path}: {self.key}: holds fewer images than states; download the data set again")
 
-    def _cells(self) -> Iterator[list[Any]]:
-        """Yield the bytes of some images of the episode at a time."""
-        import pyarrow
-
-        columns = ["episode_index", self.key]
-        for part in batches(self.path, columns, self.limits, self.episode, self.limits.images_at_once):
-            column = part.column(self.key)
-            if pyarrow.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0:
-                column = column.field("bytes")
-            if not (pyarrow.types.is_binary(column.type) or pyarrow.types.is_large_binary(column.type)):
-                kind = printable(str(column.type))
-                raise NeecoError(f"{self.path}: {self.key}: holds {kind}, no images; name another feature")
-            yield column.to_pylist()
-
-    def _decoded(self, row: int, cell: bytes | None) -> np.ndarray:
+    def _decoded(self, row: int, cell: object) -> np.ndarray:
         where = f"{self.path}: {self.key}: row {row} of episode {self.episode}"
-        if cell is None:
-            raise NeecoError(f"{where}: has no image in it; write the data set with its images")
+        if not isinstance(cell, bytes):
+            raise NeecoError(
+                f"{where}: has no image in it; write the data set with its images, or name another feature"
+            )
         with one_line(where, "cannot be decoded", "download the episode again"):
             image = Image.open(BytesIO(cell), formats=FORMATS)
-            if image.size[0] * image.size[1] > self.limits.pixels:
+            if image.size[0] * image.size[1] > LIMITS.pixels:
                 raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
             pixels = np.array(image.convert("RGB"))
         if self.size not in ((0, 0), pixels.shape[1::-1]):
@@ -239,7 +207,7 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.
     if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
         return frames / data.fps, order, rows, (f"{title} do not increase; taken as {data.fps:g} a second",)
     places = np.rint(stamps * data.fps)
-    if (np.diff(places) > 0).all() and places[0] >= 0 and places[-1] < data.limits.film_images:
+    if (np.diff(places) > 0).all() and places[0] >= 0 and places[-1] < LIMITS.film_images:
         return stamps - stamps[0], order, places.astype(np.int64), ()
     return stamps - stamps[0], order, rows, (f"{title} name no images; state i is taken to be of image i",)
 
@@ -254,40 +222,6 @@ def _meaning(key: str, columns: Sequence[str]) -> NamedFrame:
     """Return the meaning of the frame in a feature's name, or in those of all its columns."""
     dvrk = of_dvrk(key, *columns)
     return meaning_in([key], dvrk=dvrk) or meaning_in(columns, dvrk=dvrk) or unsaid(dvrk=dvrk)
-
-
-def find_rotations(values: np.ndarray, tolerance: float) -> list[tuple[int, str]]:
-    """Return (first column, QUATERNION_WXYZ or ROTATION_MATRIX) of rotations among numbers [R, C]: four of unit length
-    in either order, of which more than one changes, or nine that are a rotation matrix in every row. tolerance: of a
-    length, and of R^T R - I."""
-    values = values[np.isfinite(values).all(axis=1)].astype(np.float64)
-    rotations, place = [], 0
-    while len(values) and place <= values.shape[1] - 4:
-        four, nine = values[:, place : place + 4], values[:, place : place + 9]
-        matrices = nine.reshape(-1, 3, 3) if nine.shape[1] == 9 else np.zeros((1, 3, 3))
-        if rotation_error(matrices).max() < tolerance and (np.linalg.det(matrices) > 0).all():
-            rotations.append((place, named.ROTATION_MATRIX))
-            place += 9
-        elif np.abs(np.linalg.norm(four, axis=1) - 1).max() < tolerance and (np.ptp(four, axis=0) > 0).sum() > 1:
-            rotations.append((place, named.QUATERNION_WXYZ))
-            place += 4
-        else:
-            place += 1
-    return rotations
-
-
-def _rotation_asks(data: DataSet, episode: Episode, feature: Feature, columns: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns of a feature that may be a rotation by their numbers, as lines to choose from."""
-    values = data.columns(episode, {feature.key: len(feature.names)})[feature.key]
-    values, asks = values[:, [feature.names.index(column) for column in columns]], []
-    for place, kind in find_rotations(values, data.limits.unit_tolerance):
-        size, why = 4, "or quaternion_xyzw: their length is 1, nothing says their order"
-        if kind == named.ROTATION_MATRIX:
-            size, why = 9, "or column by column: list them so that they stand row by row"
-        if place >= 3:
-            asks.append(f"  position: {json.dumps(columns[place - 3 : place])}   # stands before the rotation")
-        asks.append(f"  {kind}: {json.dumps(columns[place : place + size])}   # {why}")
-    return tuple(asks)
 
 
 def _joint_name(column: str, body: str) -> str:

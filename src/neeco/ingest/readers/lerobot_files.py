@@ -15,7 +15,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_json, read_text, require_content, require_inside, visible_entries
-from neeco.capture.documents import as_float, printable
+from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.ingest.readers import file_state, one_line
 
 INFO = "meta/info.json"
@@ -38,7 +38,9 @@ class LeRobotLimits:
     pixels: int = 90_000_000  # limit on the pixels of an image, as for files of images
     images_at_once: int = 16  # images decoded at once, where Parquet holds them
     film_images: int = 10**7  # limit on the images of a video; larger timestamps are a clock's
-    unit_tolerance: float = 1e-3  # tolerance of a quaternion's length and of R^T R - I: rounding of float32 and text
+
+
+LIMITS = LeRobotLimits()
 
 
 class _NotThere(NeecoError):
@@ -74,12 +76,11 @@ class DataSet:
     stated of each episode, by its number."""
 
     path: Path
-    limits: LeRobotLimits
     version: int
     fps: float
     features: Mapping[str, Feature]
     data_path: str
-    video_path: str | None
+    video_path: str
     chunks_size: int
     records: Mapping[int, Record]
 
@@ -135,17 +136,17 @@ class DataSet:
 
     def absent(self, episode: Episode) -> dict[str, str]:
         """Return why features of an episode cannot be read, by key: their column or their camera's file is missing."""
-        there, where = {*self.films, *parquet_names(episode.data, self.limits)}, f"{episode.data}: has no column"
+        there, where = {*self.films, *parquet_names(episode.data)}, f"{episode.data}: has no column"
         columns = [key for key in self.features if key not in there]
         return {key: f"{where} {printable(key)}; download the data set again" for key in columns} | {**episode.absent}
 
     def columns(self, episode: Episode, widths: Mapping[str, int]) -> dict[str, np.ndarray]:
         """Return columns of an episode as `read_columns` does."""
-        return read_columns(episode.data, {"episode_index": 1, **widths}, self.limits, episode.number)
+        return read_columns(episode.data, {"episode_index": 1, **widths}, episode.number)
 
     def _file(self, field: str, values: Mapping[str, Any]) -> Path:
         """Return the file that a template of info.json names. Raises NeecoError when it leads out of the data set."""
-        template = getattr(self, field) or ""
+        template = getattr(self, field)
         try:
             name = _FIELD.sub(lambda match: format(values[match[1]], match[2] or ""), template)
         except (KeyError, ValueError, TypeError):
@@ -159,45 +160,41 @@ class DataSet:
         return require_inside(self.path / parts, _boundary(self.path))
 
 
-def read_data_set(path: Path, limits: LeRobotLimits) -> DataSet:
+def read_data_set(path: Path) -> DataSet:
     """Read meta/info.json and the list of episodes, once while they stay the same. Raises NeecoError naming field and
     remedy."""
     folder = path / EPISODES_3
     files = [path / INFO, path / EPISODES_2, *(folder.glob("chunk-*/*.parquet") if folder.is_dir() else ())]
-    return _described(path, limits, file_state(*sorted(file for file in files if file.exists())))
+    return _described(path, file_state(*sorted(file for file in files if file.exists())))
 
 
 @lru_cache(maxsize=4)
-def _described(path: Path, limits: LeRobotLimits, state: tuple[object, ...]) -> DataSet:
-    file = path / INFO
-    require_inside(file, _boundary(path))
-    info = read_json(file)
-    if not isinstance(info, dict):
-        raise NeecoError(f"{file}: expected an object with codebase_version, fps and features; download it again")
-    match = VERSIONS.fullmatch(str(info.get("codebase_version")))
+def _described(path: Path, state: tuple[object, ...]) -> DataSet:
+    file = require_inside(path / INFO, _boundary(path))
+    info = Node(read_json(file), str(file), "", RaisingReport())
+    version = info.child("codebase_version")
+    match = VERSIONS.fullmatch(str(version.value))
     if match is None:
-        version = printable(info.get("codebase_version"))
-        raise NeecoError(f"{file}: codebase_version: {version} is not read; convert the data set to v2.1 or v3.0")
-    fps, chunks = as_float(info.get("fps")) or 0.0, info.get("chunks_size", 1000)
-    stated: dict[str, Any] = {key: info.get(key) for key in ("features", "data_path", "video_path")}
-    valid = {
-        "fps": 0 < fps < 1e5,  # NaN compares false
-        "chunks_size": type(chunks) is int and chunks > 0,
-        "features": isinstance(stated["features"], dict) and len(stated["features"]) > 0,
-        "data_path": isinstance(stated["data_path"], str),
-        "video_path": isinstance(stated["video_path"], str | None),
-    }
-    if wrong := next((name for name, good in valid.items() if not good), None):
-        raise NeecoError(f"{file}: {wrong}: {printable(info.get(wrong))} is not valid; correct it")
-    features = {key: _feature(file, key, value, limits) for key, value in stated["features"].items()}
-    films = [key for key, feature in features.items() if feature.dtype == "video"]
-    records = _records_3(path, films, limits) if match[2] else _records_2(path)
+        version.error(f"{printable(version.value)} is not read", "convert the data set to v2.1 or v3.0")
+    features = info.child("features")
+    if not isinstance(features.value, dict) or not features.value:
+        features.error("expected an object of features", "download it again")
+    known = {key: _feature(features.child(key), key) for key in features.value}
+    films = [key for key, feature in known.items() if feature.dtype == "video"]
+    is_3 = match is not None and match[2] is not None
+    records = _records_3(path, films) if is_3 else _records_2(path)
     if not records:
         raise NeecoError(f"{path}: holds no episode; download the data set again, with all of meta")
     return DataSet(
-        path=path, limits=limits, version=3 if match[2] else 2, fps=fps, chunks_size=chunks, records=records,
-        **stated | {"features": features},
-    )  # fmt: skip
+        path=path,
+        version=3 if is_3 else 2,
+        fps=info.child("fps").number(above=0, below=1e5) or 0.0,
+        features=known,
+        data_path=info.child("data_path").text("correct it") or "",
+        video_path=str(info.child("video_path").value or ""),
+        chunks_size=(info.child("chunks_size").integer(1) if info.has("chunks_size") else None) or 1000,
+        records=records,
+    )
 
 
 def _records_2(path: Path) -> dict[int, Record]:
@@ -217,15 +214,15 @@ def _records_2(path: Path) -> dict[int, Record]:
     return records
 
 
-def _records_3(path: Path, films: Sequence[str], limits: LeRobotLimits) -> dict[int, Record]:
+def _records_3(path: Path, films: Sequence[str]) -> dict[int, Record]:
     """The length of each episode, by its number, and the places of its rows and images."""
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
     of_films = [f"videos/{key}/{name}" for key in films for name in FILM_COLUMNS]
     records: dict[int, Record] = {}
     for file in visible_entries(path / EPISODES_3, "chunk-*/*.parquet"):
-        there = parquet_names(require_inside(file, _boundary(path)), limits)
+        there = parquet_names(require_inside(file, _boundary(path)))
         names = [*columns, *(name for name in of_films if name in there)]
-        table = read_columns(file, dict.fromkeys(names, 1), limits)
+        table = read_columns(file, dict.fromkeys(names, 1))
         for row, values in enumerate(np.concatenate([table[name] for name in names], 1).tolist()):
             record = dict(zip(names, values, strict=True))
             counts = {name: _count(f"{file}: row {row}", value) for name, value in record.items() if "time" not in name}
@@ -239,59 +236,43 @@ def _count(where: str, value: Any) -> int:
     return int(value)
 
 
-def parquet_names(path: Path, limits: LeRobotLimits) -> list[str]:
+def parquet_names(path: Path) -> list[str]:
     """Return the columns of a Parquet file. Raises NeecoError."""
-    return list(_fragment(path, limits).physical_schema.names)
+    return list(_fragment(path).physical_schema.names)
 
 
-def read_columns(
-    path: Path, widths: Mapping[str, int], limits: LeRobotLimits, episode: int | None = None
-) -> dict[str, np.ndarray]:
-    """Return columns of numbers, or of lists of them, as float64 [R, C], only of the rows of an episode where one is
-    given. widths: how many numbers a row of each has. Raises NeecoError."""
-    parts = [part for part in batches(path, list(widths), limits, episode) if len(part)]
+def read_columns(path: Path, widths: Mapping[str, int], episode: int | None = None) -> dict[str, np.ndarray]:
+    """Return columns of numbers, or of lists of them, as float64 [R, C], NaN of what is null, only of the rows of an
+    episode where one is given. widths: how many numbers a row of each has. Raises NeecoError."""
+    parts = [part for part in batches(path, list(widths), episode) if len(part)]
     table = {}
     for name, width in widths.items():
-        try:
-            values = np.concatenate([_numbers(part.column(name)) for part in parts] or [np.zeros((0, width))])
-        except (ValueError, TypeError):
-            kind = parts[0].column(name).type
-            raise NeecoError(f"{path}: {name}: holds {kind}, no numbers, as many in each row; name another") from None
-        if values.shape[1] != width:
-            problem = f"has {values.shape[1]} numbers a row, not {width}"
-            raise NeecoError(f"{path}: {name}: {problem}; download the data set again")
-        table[name] = values
+        values = [np.zeros((0, width))]
+        for part in parts:
+            try:
+                numbers = np.array(part.column(name).to_pylist())
+                numbers = numbers.astype(np.str_ if numbers.dtype.kind in "SU" else np.float64).reshape(len(part), -1)
+            except (ValueError, TypeError):  # rows of several lengths, or no numbers
+                numbers = np.array([[""]])
+            if numbers.dtype.kind == "U":
+                kind = part.column(name).type
+                raise NeecoError(f"{path}: {name}: holds {kind}, no numbers, as many in each row; name another")
+            if numbers.shape[1] != width:
+                problem = f"has {numbers.shape[1]} numbers a row, not {width}"
+                raise NeecoError(f"{path}: {name}: {problem}; download the data set again")
+            values.append(numbers)
+        table[name] = np.concatenate(values)
     return table
 
 
-def _numbers(column: Any) -> np.ndarray:
-    """Return [R, C] of numbers or of lists of them, all of one length; NaN of what is null. Raises ValueError."""
-    from pyarrow import ExtensionArray, FixedSizeListArray, LargeListArray, ListArray, compute, types
-
-    count = len(column)
-    while isinstance(column, ExtensionArray | ListArray | LargeListArray | FixedSizeListArray):
-        if isinstance(column, ExtensionArray):
-            column = column.storage
-        elif len(compute.list_value_length(column).unique()) > 1:
-            raise ValueError("ragged")
-        else:
-            column = column.flatten()
-    if not any(is_kind(column.type) for is_kind in (types.is_floating, types.is_integer, types.is_boolean)):
-        raise ValueError("no numbers")
-    return np.asarray(column.to_numpy(zero_copy_only=False), np.float64).reshape(count, -1)
-
-
-def batches(
-    path: Path, columns: Sequence[str], limits: LeRobotLimits, episode: int | None, rows: int = 2**16
-) -> Iterator[Any]:
+def batches(path: Path, columns: Sequence[str], episode: int | None, rows: int = 2**16) -> Iterator[Any]:
     """Yield columns as pyarrow's record batches of at most so many rows. Raises NeecoError."""
     import pyarrow.dataset
 
-    file = _fragment(path, limits)
-    for name in columns:
-        if name not in file.physical_schema.names:
-            listed = printable(", ".join(file.physical_schema.names), 300).strip("'")
-            raise NeecoError(f"{path}: has no column {printable(name)}; its columns are {listed}")
+    file = _fragment(path)
+    if absent := [name for name in columns if name not in file.physical_schema.names]:
+        listed = printable(", ".join(file.physical_schema.names), 300).strip("'")
+        raise NeecoError(f"{path}: has no column {printable(absent[0])}; its columns are {listed}")
     wanted = None if episode is None else pyarrow.dataset.field("episode_index") == episode
     with one_line(path, *_DAMAGE):
         part = file if wanted is None else file.subset(filter=wanted)  # by the statistics of its row groups
@@ -299,21 +280,21 @@ def batches(
         for group in part.row_groups:
             data = file.metadata.row_group(group.id).to_dict()["columns"]
             read = [chunk for chunk in data if f"{chunk['path_in_schema']}.".startswith(leaves)]
-            if sum(chunk["total_uncompressed_size"] for chunk in read) > limits.group_bytes:
-                raise NeecoError(f"{path}: unpacks to over {limits.group_bytes >> 20} MiB; write smaller row groups")
+            if sum(chunk["total_uncompressed_size"] for chunk in read) > LIMITS.group_bytes:
+                raise NeecoError(f"{path}: unpacks to over {LIMITS.group_bytes >> 20} MiB; write smaller row groups")
         yield from part.to_batches(
             columns=list(columns), filter=wanted, batch_size=rows, batch_readahead=0, use_threads=False
         )
 
 
-def _fragment(path: Path, limits: LeRobotLimits) -> Any:
+def _fragment(path: Path) -> Any:
     import pyarrow.dataset
     import pyarrow.fs
 
     require_content(path)
     with one_line(path, *_DAMAGE):
         # a buffer: else all of a column is taken into memory, and images can stand in it
-        options = pyarrow.dataset.ParquetFragmentScanOptions(use_buffered_stream=True, buffer_size=limits.buffer_bytes)
+        options = pyarrow.dataset.ParquetFragmentScanOptions(use_buffered_stream=True, buffer_size=LIMITS.buffer_bytes)
         kind = pyarrow.dataset.ParquetFileFormat(default_fragment_scan_options=options)
         fragment = kind.make_fragment(str(path), pyarrow.fs.LocalFileSystem())
         fragment.physical_schema  # noqa: B018  # which reads the file's own description
@@ -325,16 +306,19 @@ def _boundary(path: Path) -> Path:
     return path.resolve().parents[1] if path.resolve().parent.name == "snapshots" else path
 
 
-def _feature(file: Path, key: str, value: Any, limits: LeRobotLimits) -> Feature:
-    dtype, shape = (value.get("dtype"), value.get("shape")) if isinstance(value, dict) else (None, None)
+def _feature(node: Node, key: str) -> Feature:
+    """Return one of the features of info.json. Raises NeecoError."""
+    dtype, shape, names = (node.child(name).value for name in ("dtype", "shape", "names"))
     sound = isinstance(shape, list) and all(type(side) is int and 0 <= side < 1e6 for side in shape)
-    if not isinstance(dtype, str) or not isinstance(shape, list) or not sound:
-        raise NeecoError(f"{file}: features: {printable(key)}: has no dtype and shape; correct it")
+    if not isinstance(dtype, str) or not sound:
+        node.error("has no dtype and shape", "correct it")
     count = math.prod(shape)
-    numeric = re.fullmatch(r"(float|int|uint)\d+|bool", dtype) is not None and count <= limits.numbers
-    depth = any(isinstance(entry, dict) and entry.get(name) for entry in (value, value.get("info"))
-                for name in ("is_depth_map", "video.is_depth_map"))  # fmt: skip
-    return Feature(key, dtype, tuple(shape), _names(key, shape, count, value.get("names")) if numeric else (), depth)
+    numeric = re.fullmatch(r"(float|int|uint)\d+|bool", dtype) is not None and count <= LIMITS.numbers
+    places = [
+        place.child(name) for place in (node, node.child("info")) for name in ("is_depth_map", "video.is_depth_map")
+    ]
+    depth = any(place.value for place in places)
+    return Feature(key, dtype, tuple(shape), _names(key, shape, count, names) if numeric else (), depth)
 
 
 def _names(key: str, shape: Sequence[int], count: int, stated: Any) -> tuple[str, ...]:

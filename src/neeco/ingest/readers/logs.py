@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from neeco.base.errors import NeecoError, counted
 from neeco.geometry.conventions import OPENCV
 from neeco.geometry.rotations import rotation_error
-from neeco.ingest.readers import Table, column_index, numbers, parse_number, read_table
+from neeco.ingest.readers import Table, column_index, numbers, read_table, to_numbers
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
 from neeco.ingest.readers.delimited import tool_columns
@@ -139,7 +139,7 @@ def _frame_names(table: Table) -> list[str]:
         if len(names) > 1 and any(meaning_of(cell).frame != named.BASE for cell in names):
             listed = ", ".join(names[:4])
             raise NeecoError(f"{table.where}: {name}: poses are stated in several frames ({listed}); export one only")
-        if len(names) == 1 and parse_number(names[0]) is None:
+        if len(names) == 1 and np.isnan(to_numbers(np.array(names, object))[0]):
             return names
     return []
 
@@ -303,10 +303,10 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     unit = named.split_unit(angle_name, "angle")[1] or angle_unit
     if unit is None:
         raise NeecoError(f"{path}: {angle_name}: radians or degrees? Name it {angle_name}_rad or {angle_name}_deg")
-    values, missing, bad = numbers(table, (count_name, angle_name))
-    wrong = [*bad, *((int(row), "has an empty cell") for row in np.flatnonzero(missing))]
-    if wrong:
-        row, what = min(wrong)
+    values = numbers(table, (count_name, angle_name))
+    if np.isnan(values).any():
+        row, slot = np.argwhere(np.isnan(values))[0].tolist()
+        what = f"{(count_name, angle_name)[slot]}: a number is missing"
         raise NeecoError(f"{path}: line {table.lines[row]}: {what}; repair or remove the line")
     order = np.argsort(values[:, 0], kind="stable")
     counts, angles, lines = values[order, 0], values[order, 1] * named.UNITS["angle"][unit], table.lines[order]

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
-from neeco.ingest.readers import Body, RecordingFormat, Table, numbers, parse_number
+from neeco.ingest.readers import Body, RecordingFormat, Table, numbers, to_numbers
 from neeco.ingest.readers.columns import UNITS, canonical_unit
 from neeco.ingest.readers.delimited import read_cells, unique_names
 
@@ -58,7 +58,7 @@ class MotiveExport(RecordingFormat):
             }
             if not set(letters) <= set(places):
                 raise NeecoError(f"{path}: {part}: a rigid body has no columns of it; export the take with 6 DoF data")
-            return numbers(raw, [places[letter] for letter in letters])[0]
+            return numbers(raw, [places[letter] for letter in letters])
 
         kind, unit = preamble.get("Rotation Type", QUATERNION).lower(), canonical_unit(preamble.get("Length Units", ""))
         if kind not in (QUATERNION, *ORDERS):
@@ -82,8 +82,9 @@ def _times(raw: Table, axes: np.ndarray, preamble: dict[str, str]) -> np.ndarray
     """[R] s: as they stand there, else of the frames at the export's rate."""
     for index, name in enumerate(axes):
         if name.startswith("time (sec"):
-            return numbers(raw, [str(index)])[0][:, 0]
-    rate = parse_number(preamble.get("Export Frame Rate", preamble.get("Capture Frame Rate", ""))) or 0.0
+            return numbers(raw, [str(index)])[:, 0]
+    stated = preamble.get("Export Frame Rate", preamble.get("Capture Frame Rate", ""))
+    rate = float(to_numbers(np.array(stated, object)))
     if not 0 < rate < 1e6:  # NaN compares false
         raise NeecoError(f"{raw.path}: has no column of times and no Export Frame Rate; export the take with its times")
-    return numbers(raw, ["0"])[0][:, 0] / rate
+    return numbers(raw, ["0"])[:, 0] / rate

@@ -16,10 +16,10 @@ from typing import BinaryIO
 
 import numpy as np
 
-from neeco.base.errors import NeecoError, counted
+from neeco.base.errors import NeecoError
 from neeco.base.files import open_file, require_content
 from neeco.capture.documents import printable
-from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, one_line, parse_number, read_once
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, one_line, read_once, to_numbers
 from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.frame_names import NamedFrame, meaning_of, of_dvrk
 
@@ -112,8 +112,28 @@ class FrameSequence:
     @cached_property
     def _stamps(self) -> dict[int, float]:
         """PLUS's timestamps s, by frame."""
-        numbers = ((frame, parse_number(text)) for frame, text in self.fields.get(TIME, {}).items())
-        return {frame: stamp for frame, stamp in numbers if stamp is not None and np.isfinite(stamp)}
+        texts = self.fields.get(TIME, {})
+        stamps = to_numbers(np.array([*texts.values()], object)).tolist()
+        return {frame: stamp for frame, stamp in zip(texts, stamps, strict=True) if np.isfinite(stamp)}
+
+    def read_frames(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
+        """Yield the numbers and bytes of frames: those asked for of raw data, all of packed data in their order, piece
+        by piece; the last may be shorter."""
+        (file, start), length = self.data, self.frame_bytes
+        with open_file(file, "images of a sequence") as stream:
+            for number in () if self.packed else numbers:
+                stream.seek(start + number * length)
+                yield number, stream.read(length)
+            stream.seek(start)
+            machine, frame, number = zlib.decompressobj(zlib.MAX_WBITS | 32), b"", 0  # zlib or gzip
+            while self.packed:
+                packed = machine.unconsumed_tail or stream.read(LIMITS.chunk_bytes)
+                frame += machine.decompress(packed, length - len(frame))
+                if len(frame) == length:
+                    yield number, frame
+                    frame, number = b"", number + 1
+                elif machine.eof or not packed:
+                    return
 
     def statuses(self, name: str) -> dict[int, str]:
         """Return the status of each frame that has a transform."""
@@ -226,49 +246,18 @@ class SequenceImages(VideoSource):
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         sequence, wanted = self.sequence, {self.frames[int(index)]: int(index) for index in indices}
-        (file, start), length = sequence.data, sequence.frame_bytes
-        shape = (sequence.size[1], sequence.size[0], sequence.channels)
+        file, shape = sequence.data[0], (sequence.size[1], sequence.size[0], sequence.channels)
         with one_line(file, "its images are damaged", "copy or export the sequence again"):
-            for number, content in _frames(file, start, length, None if sequence.packed else sorted(wanted)):
+            for number, content in sequence.read_frames(sorted(wanted)):
                 if number == sequence.count:
                     raise _fault(file, "holds more images than its header says")
-                if len(content) < length:
-                    break
-                if number in wanted:
+                if number in wanted and len(content) == sequence.frame_bytes:
                     pixels = np.frombuffer(content, np.uint8).reshape(shape)
                     yield wanted.pop(number), np.broadcast_to(pixels, (*shape[:2], 3)).copy()
                 if not wanted and number + 1 < sequence.count:
                     return
         if wanted:
             raise _fault(file, "its images end early")
-
-
-def _frames(file: Path, start: int, length: int, numbers: Sequence[int] | None) -> Iterator[tuple[int, bytes]]:
-    """Yield the numbers and bytes of frames: those of raw data, or (None) all of packed data in their order."""
-    with open_file(file, "images of a sequence") as stream:
-        for number in numbers or ():
-            stream.seek(start + number * length)
-            yield number, stream.read(length)
-        if numbers is None:
-            yield from enumerate(_packed_frames(stream, start, length))
-
-
-def _packed_frames(stream: BinaryIO, start: int, length: int) -> Iterator[bytes]:
-    """Yield frames of so many bytes, which streams of zlib or gzip, one after the other, unpack to piece by piece; what
-    is left at the end as a last, shorter one."""
-    stream.seek(start)
-    machine, packed, unpacked = zlib.decompressobj(zlib.MAX_WBITS | 32), b"", bytearray()  # of either kind
-    while packed := packed or stream.read(LIMITS.chunk_bytes):
-        unpacked += machine.decompress(packed, LIMITS.chunk_bytes)
-        packed = machine.unconsumed_tail
-        if machine.eof:
-            packed = machine.unused_data
-            machine = zlib.decompressobj(zlib.MAX_WBITS | 32)
-        while len(unpacked) >= length:
-            yield bytes(memoryview(unpacked)[:length])
-            del unpacked[:length]
-    if unpacked:
-        yield bytes(unpacked)
 
 
 class PlusSequence(RecordingFormat):
@@ -296,7 +285,8 @@ class PlusSequence(RecordingFormat):
             # what is the same in every frame is a calibration (ImageToProbe), no motion
             fixed = len(texts) > 1 and len(set(texts.values())) == 1
             statuses = [status.lower() for status in sequence.statuses(name).values()]
-            problem = None if GOOD in statuses else _unusable(_status_words(name, statuses[0]))
+            why = f"no frame can be used: {name}{TRANSFORM}{STATUS} is {printable(statuses[0].upper(), 20)}"
+            problem = None if GOOD in statuses else f"{why}; record again, or name another transform"
             kind, title = (Kind.OTHER, "fixed transform") if fixed else (Kind.POSES, "transform")
             stream = Stream(name, kind, title, len(texts), _rate(len(texts), span), body=body, problem=problem)
             streams.append(replace(stream, hints=meaning.hints, asks=meaning.asks))
@@ -309,28 +299,18 @@ class PlusSequence(RecordingFormat):
             raise NeecoError(f"{path}: {what}; name a log of poses")
         wanted = None if stream is None else stream.removesuffix(TRANSFORM)
         name = self.choose(path, wanted, Kind.POSES).name
-        statuses, dropped = sequence.statuses(name), dict[str, list[int]]()
-        rows, frames, (_, stated_in, meaning) = [], [], _ends(name)
-        for frame, text in sorted(sequence.fields[name + TRANSFORM].items()):
-            numbers = [parse_number(word) for word in text.split()]
-            if statuses[frame].lower() != GOOD:
-                dropped.setdefault(_status_words(name, statuses[frame]), []).append(frame)
-            elif frame not in sequence.times or len(numbers) != 16 or not np.isfinite(np.array(numbers, float)).all():
-                dropped.setdefault(f"they have no {TIME}, or no 16 numbers", []).append(frame)
-            else:
-                rows.append([sequence.times[frame], *numbers])
-                frames.append(frame)
-        table = Table(
-            path, HEADER, np.array(rows, np.float64).reshape(-1, 17), np.array(frames, np.int64), stream=name,
+        statuses, texts = sequence.statuses(name), sequence.fields[name + TRANSFORM]
+        _, stated_in, meaning = _ends(name)
+        rows = np.full((len(texts), len(HEADER) + 1), "", object)
+        for row, frame in zip(rows, sorted(texts), strict=True):
+            words = texts[frame].split()
+            if frame in sequence.times and len(words) == len(HEADER) - 1:
+                row[:-1] = [repr(sequence.times[frame]), *words]
+            row[-1] = statuses[frame]
+        return Table(
+            path, (*HEADER, name + TRANSFORM + STATUS), rows, np.array(sorted(texts), np.int64), stream=name,
             record="frame", stated_in=stated_in, meaning=meaning,
         )  # fmt: skip
-        if not rows:
-            raise NeecoError(f"{table.where}: {_unusable(next(iter(dropped)))}")
-        notes = (
-            f"{table.title}: {counted(len(left), 'frame')} dropped: {why} ({table.list_rows(left)})"
-            for why, left in dropped.items()
-        )
-        return replace(table, notes=tuple(notes))
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         sequence = read_sequence(path)
@@ -342,14 +322,6 @@ class PlusSequence(RecordingFormat):
 
 def _rate(count: int, span: float) -> float | None:
     return (count - 1) / span if span > 0 and count > 1 else None
-
-
-def _status_words(name: str, status: str) -> str:
-    return f"{name}{TRANSFORM}{STATUS} is {printable(status.upper(), 20)}"
-
-
-def _unusable(why: str) -> str:
-    return f"no frame can be used: {why}; record again, or name another transform"
 
 
 def _ends(name: str) -> tuple[str, str, NamedFrame]:

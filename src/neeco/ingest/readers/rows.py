@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neeco.base.errors import NeecoError, counted
+from neeco.capture.documents import printable
 from neeco.ingest.readers import Table, column_index, numbers
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import JointColumns, PoseColumns, RecognisedColumns
@@ -22,7 +23,6 @@ class RowSettings:
 
     min_samples: int = 4  # least rows of a usable log
     max_wrong: float = 0.05  # limit on the share of wrong (not missing) rows; with more, the file is refused
-    max_unreadable: float = 0.5  # limit on the share of rows whose cells are no numbers
     states: int = 8  # number of states listed in the notes on dropped rows
     max_same_time: float = 0.5  # limit on the share of rows at the time of another; with more, the times are too coarse
     stuck_s: float = 0.5  # time in s without change of a pose, which a tracker's noise rules out,
@@ -116,20 +116,17 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, recognised: Recog
 
 
 def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
-    """Return numbers [R, C], without rows of missing or unreadable cells. Raises NeecoError when those are most."""
-    table = rows.table
-    values, missing, bad = numbers(table, names)
-    rows.drop(missing, f"no value for {', '.join(names)}" if len(names) < 3 else "values are missing")
-    bad = [(row, what) for row, what in bad if rows.keep[row]]
-    if len(bad) > max(3, SETTINGS.max_unreadable * rows.keep.sum()):
-        first = f"{table.record} {table.lines[bad[0][0]]}: {bad[0][1]}"
-        similar = f"{len(bad)} of {counted(len(table.rows), 'row')} like it"
-        raise NeecoError(f"{table.where}: {first} ({similar}); name other columns or repair the file")
-    if bad:
-        rows.drop([row for row, _ in bad], f"not readable, first: {bad[0][1]}")
-    if not rows.keep.any():
-        what = f"{', '.join(names)}: no row has values"
-        raise NeecoError(f"{table.where}: {what}; name other columns or another file in the recording")
+    """Return numbers [R, C], and drop rows without all of them. Raises NeecoError when no row is left."""
+    table, values = rows.table, numbers(rows.table, names)
+    lacking = np.argwhere(np.isnan(values) & rows.keep[:, None])
+    if len(lacking):
+        row, slot = lacking[0].tolist()
+        cell = str(table.rows[row, column_index(table, names[slot])])
+        first = f"{names[slot]} is {printable(cell, 24)}, not a number"
+        rows.drop(np.isnan(values).any(axis=1), f"values are missing, first: {first}")
+        if not rows.keep.any():
+            what = f"{table.record} {table.lines[row]}: {first}, and no row has values of {', '.join(names)}"
+            raise NeecoError(f"{table.where}: {what}; name other columns or another file in the recording")
     return values
 
 

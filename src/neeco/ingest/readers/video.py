@@ -363,7 +363,7 @@ def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[
     if column is None:
         raise NeecoError(f"{table_path}: header: no column of times found; call one t_s")
     scale = scale_of(table_path, (column,), "time", None, recognised.time_unit, "")
-    times, lines = numbers(table, (column,))[0][:, 0] * scale, table.lines
+    times, lines = numbers(table, (column,))[:, 0] * scale, table.lines
     by_name = {file.name: file for file in files} | {file.stem: file for file in files}
     columns = [[Path(str(cell)).name for cell in table.rows[:, index]] for index in range(len(table.header))]
     names = next((cells for cells in columns if sum(cell in by_name for cell in cells) > 0.5 * len(cells)), None)

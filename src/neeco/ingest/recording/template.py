@@ -72,7 +72,7 @@ _QUESTIONS = (
     (r"^# intrinsics: .*no calibration was found", "which lens? Remove the # and give a calibration's file or numbers"),
     (r"^ +# clock: .*its own", "is it the clock of the poses? Remove the #; else give its offset in sync, below"),
     (r"is not clear: ", "which columns hold it? Name them"),
-    (r"^ +# +(?:frame|quaternion\w*|rotation\w*|euler\w*): ", "what do its poses mean? Correct it, remove the #"),
+    (r"^ +# frame: ", "what are its poses stated in? Correct it, remove the #"),
 )
 
 
@@ -422,13 +422,10 @@ def _instrument_lines(files: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
     clock = "em" if log.stream is None else log.stream.clock
-    asks = log.says.asks
-    lines = [*log.lines(), *([f"clock: {clock}"] if clock else [])]
-    lines += [f"# {ask}" for ask in asks if not ask.startswith(" ")]
+    lines = [*log.lines(), *([f"clock: {clock}"] if clock else []), *(f"# {ask}" for ask in log.says.asks)]
     if log.stream is not None and log.stream.columns is not None:  # others are recognised again when read
         stated = (("position", columns.position), (columns.form, columns.rotation))
         lines += ["columns:", *(f"  {key}: [{', '.join(map(_scalar, names))}]" for key, names in stated if names)]
-        lines += [f"  # {ask.strip()}" for ask in asks if ask.startswith(" ")]
     lines += [f"# columns: {what} is not clear: {why}" for what, why in columns.unclear.items()]
     return lines + _unit_lines(columns, {"length": of_length})
 
