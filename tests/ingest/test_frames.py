@@ -222,18 +222,3 @@ def test_the_frame_of_another_camera_is_not_that_of_the_video(tmp_path):
                 bag.image(f"/{side}/image_raw", time, np.zeros((8, 8, 3), np.uint8), "rgb8", f"{side}_eye")
     assert_seen(read_pose_log(PoseColumns(bag.path, stream="/needle/left")))
     assert read_pose_log(PoseColumns(bag.path, stream="/needle/right")).frame == BASE
-
-
-def test_static_transforms_tell_the_axes_that_a_frames_name_leaves_open(tmp_path):
-    bag_world = pytest.importorskip("bag_world")
-    optical, offset = "camera_optical_frame", np.array([0.0, 0.015, 0.0])  # m, in the link's axes
-    turn = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]).as_quat(scalar_first=True)  # link from optical
-    with bag_world.BagWriter(tmp_path, "recording-mcap") as bag:
-        bag.tf(0.0, offset, turn, "camera_link", optical, static=True)
-        for time in TIMES:
-            bag.pose("/tool/pose", time, np.array(BODY) / 1000 + offset, [1, 0, 0, 0], "camera_link")
-            bag.pose("/needle/pose", time, np.array(SEEN) / 1000, [1, 0, 0, 0], optical)
-            bag.image("/camera/image_raw", time, np.zeros((8, 8, 3), np.uint8), "rgb8", optical)
-    for stream in ("/tool/pose", "/needle/pose"):
-        assert_seen(read_pose_log(PoseColumns(bag.path, stream=stream)))
-    assert "# poses are stated in camera_link, turned by the bag's static transforms" in write_template(bag.path)

@@ -1,9 +1,10 @@
 """Poses and readings at any time, from noisy logs: robust local regression (LOESS, Cleveland 1979), never across a gap.
 
 At each time a quadratic is fitted to the samples around it, weighted by nearness (tricube) and by their residuals
-(bisquare). Rotations are fitted as rotation vectors about their local mean. The window's width is the one that best
-predicts each sample from its neighbours. Where a cubic through the four samples around predicts better than any window,
-motion between samples exceeds their noise, as in logs of few samples a second. Then nothing is smoothed.
+(bisquare). Rotations are fitted as sign-continuous quaternions, which are normalised then. The window's width is the
+one that best predicts each sample from its neighbours. Where a cubic through the four samples around predicts better
+than any window, motion between samples exceeds their noise, as in logs of few samples a second. Then nothing is
+smoothed.
 SciPy's smoothing splines with robust weights are as exact on positions, but up to 28 % worse on rotations.
 """
 
@@ -53,13 +54,14 @@ def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> 
     """
     times = np.asarray(times, dtype=np.float64)
     widths = pose_smoothing(log) if smooth_s is None else Smoothing(smooth_s, smooth_s)
-    positions, rotations = _Series(log, log.positions), _RotationSeries(log, log.quats)
+    positions, quats = _Series(log, log.positions), _Series(log, log.quats)
     valid = positions.covers(times)
     poses = np.full((len(times), 4, 4), np.nan)
     poses[valid] = np.eye(4)
     poses[valid, :3, 3] = positions.fit(times[valid], widths.position_s)
     if valid.any():
-        poses[valid, :3, :3] = _rotation(rotations.fit(times[valid], widths.rotation_s)).as_matrix()
+        turns = Rotation.from_quat(quats.fit(times[valid], widths.rotation_s), scalar_first=True)
+        poses[valid, :3, :3] = turns.as_matrix()
     return poses, valid
 
 
@@ -77,7 +79,7 @@ def readings_at(log: ReadingLog, times: np.ndarray, smooth_s: float | None = Non
 @lru_cache(maxsize=32)
 def pose_smoothing(log: PoseLog) -> Smoothing:
     """Choose the windows that best predict each sample of this log from its neighbours (leave-one-out validation)."""
-    return Smoothing(_Series(log, log.positions).best_width(), _RotationSeries(log, log.quats).best_width())
+    return Smoothing(_Series(log, log.positions).best_width(), _Series(log, log.quats).best_width())
 
 
 @lru_cache(maxsize=32)
@@ -87,7 +89,7 @@ def reading_smoothing(log: ReadingLog) -> float:
 
 
 class _Series:
-    """Samples [T, D] of a log, in stretches without gaps: vectors, or what else has differences (`relative`)."""
+    """Samples [T, D] of a log, in stretches without gaps."""
 
     def __init__(self, log: SampleLog, values: np.ndarray) -> None:
         self.times, self.values = log.times, values
@@ -115,36 +117,18 @@ class _Series:
         share = np.where(span > 0, (times - self.times[left]) / np.where(span > 0, span, 1), 0.0)
         if not len(times):
             return np.zeros((0, self.values.shape[1]))
-        start = self.values[left]
-        result = self.moved(start, share[:, None] * self.relative(start, self.values[right]))
+        result = np.asarray(self.values[left] + share[:, None] * (self.values[right] - self.values[left]))
         if width == 0:
             outer = np.stack([left - 1, left, right, right + 1], axis=-1)  # [N, 4]
             rows = np.flatnonzero((left < right) & (outer[:, 0] >= self.first[left]) & (outer[:, 3] < self.last[left]))
             if len(rows):
-                around, start = self.values[outer[rows]], self.values[left[rows]]
                 weights = _lagrange(self.times[outer[rows]], times[rows])[..., None]
-                result[rows] = self.moved(start, (self.relative(start[:, None], around) * weights).sum(1))
+                result[rows] = (self.values[outer[rows]] * weights).sum(1)
         else:
-            steps = self.relative(self.values[:-1], self.values[1:])
-            noise = _noise(np.insert(np.cumsum(steps, axis=0), 0, 0.0, axis=0))
+            noise = _noise(self.values)
             for rows, index, used, offsets in self._windows(times, width, leave_out):
-                around = self.values[index]
-                middle = self.mean(around, used * _tricube(offsets))
-                vectors = self.relative(middle[:, None], around)
-                result[rows] = self.moved(middle, _local_polynomial(offsets, used, vectors, noise))
+                result[rows] = _local_polynomial(offsets, used, self.values[index], noise)
         return result
-
-    def relative(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Difference vectors [..., D] of values from `start`."""
-        return values - start
-
-    def moved(self, start: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-        """Values at difference vectors from `start`."""
-        return start + vectors
-
-    def mean(self, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Weighted means [N, D] of values [N, K, D]."""
-        return np.asarray((values * weights[..., None]).sum(1) / weights.sum(1)[:, None])
 
     def best_width(self) -> float:
         """Return the half width s with the smallest prediction errors."""
@@ -156,7 +140,7 @@ class _Series:
         first, *others = (steps * self.step for steps in SETTINGS.widths)
         widths = [0.0, first, *(width for width in others if width <= SETTINGS.max_width_s)]
         fitted = [self.fit(self.times[chosen], width, chosen) for width in widths]
-        errors = [np.linalg.norm(self.relative(values, self.values[chosen]), axis=1) for values in fitted]
+        errors = [np.linalg.norm(values - self.values[chosen], axis=1) for values in fitted]
         # outliers do not count for one width or another
         limit = 5 * max(float(np.median(errors[0])), 1e-12)
         scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in errors]
@@ -189,21 +173,6 @@ class _Series:
         right = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
         left = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
         return left, right
-
-
-class _RotationSeries(_Series):
-    """Unit quaternions wxyz [T, 4], sign-continuous, whose differences are rotation vectors [3] rad."""
-
-    def relative(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
-        start, values = np.broadcast_arrays(start, values)
-        turns = _rotation(start.reshape(-1, 4)).inv() * _rotation(values.reshape(-1, 4))
-        return turns.as_rotvec().reshape(*values.shape[:-1], 3)
-
-    def moved(self, start: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-        return (_rotation(start) * Rotation.from_rotvec(vectors)).as_quat(scalar_first=True)
-
-    def mean(self, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        return np.asarray((values * weights[..., None]).sum(1))  # a rotation once it is normalised
 
 
 def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray, noise: float) -> np.ndarray:
@@ -258,7 +227,3 @@ def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 def _tricube(offsets: np.ndarray) -> np.ndarray:
     return np.clip(1 - np.abs(offsets) ** 3, 0, None) ** 3
-
-
-def _rotation(quats: np.ndarray) -> Rotation:
-    return Rotation.from_quat(quats, scalar_first=True)

@@ -25,7 +25,7 @@ from neeco.geometry.rotations import rigid
 from neeco.ingest.calibration.camera_fields import cameras_in
 from neeco.ingest.calibration.stereo import RosCamera, from_projections
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, file_state
-from neeco.ingest.readers.columns import BASE, CAMERA, PoseColumns
+from neeco.ingest.readers.columns import BASE, PoseColumns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, camera_order, meaning_of, of_dvrk
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import SETTINGS as LOGS
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
 CHAIN_HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 POSE_HEADER = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-MM_PER_M = 1000.0
 _DVRK = re.compile(r"(?:^|/)(PSM\d|ECM|MTM[LR]|SUJ)(?:/|$)", re.IGNORECASE)
 _DVRK_POSE = re.compile(r"(^|/)(PSM\d|ECM)/(measured_cp|position_cartesian_current)$", re.IGNORECASE)
 _DVRK_JOINTS = re.compile(r"(^|/)PSM\d/((jaw/)?measured_js|state_joint_current|state_jaw_current)$", re.IGNORECASE)
@@ -79,14 +78,11 @@ class RosBag(RecordingFormat):
         if len(poses.frames) > 1:
             listed = ", ".join(sorted(poses.frames)[:4])
             raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
-        values, (meaning, turned) = poses.table(), _meaning(survey, chosen)
-        if turned is not None:
-            valid = np.linalg.norm(values[:, 3:], axis=1) > 0
-            turn = Rotation.from_matrix(turned[:3, :3])
-            values[:, :3] = turn.apply(values[:, :3]) + turned[:3, 3] / MM_PER_M
-            values[valid, 3:] = (turn * Rotation.from_quat(values[valid, 3:])).as_quat()
-        stated_in = next(iter(poses.frames), None) or None
-        return replace(survey.table(chosen, poses, POSE_HEADER, values), stated_in=stated_in, meaning=meaning)
+        stated_in, table = (
+            next(iter(poses.frames), None) or None,
+            survey.table(chosen, poses, POSE_HEADER, poses.table()),
+        )
+        return replace(table, stated_in=stated_in, meaning=_meaning(survey, chosen))
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         from neeco.ingest.readers._bagfile import open_topic
@@ -131,7 +127,7 @@ def _streams(survey: Survey) -> tuple[Stream, ...]:
         survey.stream(name, log, Kind.IMAGES if log.stamps or log.bad else Kind.OTHER)
         for name, log in sorted(survey.images.items(), key=lambda item: camera_order(item[0]))
     ]
-    meanings = {name: _meaning(survey, name)[0] for name in sorted(survey.poses)}
+    meanings = {name: _meaning(survey, name) for name in sorted(survey.poses)}
     arms = {name for name in meanings if _DVRK_POSE.search(name)}
     poses = [_pose_stream(survey, name, meanings, arms) for name in meanings]
     return (*images, *poses, *(_joint_stream(survey, name) for name in sorted(survey.joints)), *survey.others)
@@ -173,20 +169,12 @@ def _image_frames(survey: Survey) -> set[str]:
     return set() if first is None else survey.images[first].frames - {""}
 
 
-def _meaning(survey: Survey, name: str) -> tuple[NamedFrame, np.ndarray | None]:
-    """Return the meaning of the frame of a stream's poses (BASE for several frames, which are refused when read), and
-    the transform from there to the images' frame, [4, 4] mm, where the name leaves the axes open but static transforms
-    state them."""
-    frames, images = survey.poses[name].frames, _image_frames(survey)
+def _meaning(survey: Survey, name: str) -> NamedFrame:
+    """Return the meaning of the frame of a stream's poses; BASE for several frames, which are refused when read."""
+    frames = survey.poses[name].frames
     if len(frames) != 1:
-        return NamedFrame(BASE), None
-    frame, meaning = next(iter(frames)), meaning_of(next(iter(frames)), images, dvrk=of_dvrk(name))
-    if meaning.frame is None and len(images) == 1 and frame not in images:
-        image = next(iter(images))
-        turned = _fixed_transform(survey, frame, image) if meaning_of(image, images).frame is not None else None
-        if turned is not None:
-            return NamedFrame(CAMERA, f"{frame}, turned by the bag's static transforms to {image}, the images'"), turned
-    return meaning, None
+        return NamedFrame(BASE)
+    return meaning_of(next(iter(frames)), _image_frames(survey), dvrk=of_dvrk(name))
 
 
 def _info_topic(survey: Survey, stream: str | None, of_right: bool) -> str | None:
@@ -250,18 +238,6 @@ def _chained(survey: Survey, stream: str) -> Table:
         survey.path, CHAIN_HEADER, rows, np.arange(1, len(rows) + 1), stream=stream, record="message",
         stated_in=frame, meaning=meaning,
     )  # fmt: skip
-
-
-def _fixed_transform(survey: Survey, child: str, frame: str) -> np.ndarray | None:
-    """Return frame_from_child [4, 4] mm where static transforms join the two; None elsewhere."""
-    try:
-        ups, downs = _path(survey, str(survey.path), child, frame)
-    except NeecoError:
-        return None
-    if not all(survey.poses[f"tf:{edge}"].static for edge in (*ups, *downs)):
-        return None
-    once = np.zeros(1)
-    return np.asarray((np.linalg.inv(_composed(survey, downs, once)) @ _composed(survey, ups, once))[0])
 
 
 def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str], list[str]]:
