@@ -126,7 +126,9 @@ def episodes(
     instruments: Sequence[InstrumentLogs], poses: Mapping[str, PoseLog], clocks: Mapping[str, ClockOffset]
 ) -> Episodes:
     """A recording in memory with pose logs alone."""
-    recording = Recording(Path("recording.yaml"), VideoFile(Path("video.mp4")), instruments=tuple(instruments))
+    recording = Recording(
+        path=Path("recording.yaml"), video=VideoFile(Path("video.mp4")), instruments=tuple(instruments)
+    )
     video = VideoSource(Path("video.mp4"), (WIDTH, HEIGHT), (), np.zeros(2))
     joints: dict[str, dict] = {name: {} for name in poses}
     part = Episode(

@@ -158,7 +158,7 @@ def _log(arm: Arm) -> PoseLog:
 
 
 def _data(arms: dict[str, Arm], bases: dict[str, StatedBase]) -> Episodes:
-    instruments = [InstrumentLogs(name, base=base) for name, base in bases.items()]
+    instruments = [InstrumentLogs(name=name, camera_from_base=base) for name, base in bases.items()]
     logs = {name: _log(arm) for name, arm in arms.items()}
     return episodes(instruments, logs, {"ros": ClockOffset(0.0, 0.0, GIVEN)})
 

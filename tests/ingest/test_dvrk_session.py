@@ -110,7 +110,7 @@ def test_the_right_camera_may_stand_first(world):
 def test_a_template_of_a_session_is_complete(world, session):
     text = write_template(session)
     recording = read_recording(world.text(text, "recording.yaml"))
-    assert (recording.video, recording.stream) == (session, "endoscope_20260117_153206.left")
+    assert (recording.file, recording.stream) == (session, "endoscope_20260117_153206.left")
     (instrument,) = recording.instruments
     assert instrument.name == "PSM1"
     assert instrument.poses.stream == "/PSM1/measured_cp"

@@ -17,7 +17,7 @@ from neeco.ingest.pipeline import assign_splits, ingest
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.recording.compatibility import episode_names, separate
 from neeco.ingest.recording.file import read_recording
-from neeco.ingest.recording.model import Recording
+from neeco.ingest.recording.model import Recording, VideoFile
 from neeco.ingest.sources import sources_of
 from neeco.ingest.timing.episodes import EPISODES
 from neeco.ingest.timing.reading import read_episodes
@@ -141,7 +141,7 @@ def test_splits_name_what_there_is(tmp_path, splits, words):
 
 def test_names_come_from_files_or_from_their_folders_and_differ() -> None:
     def named(*paths: str) -> tuple[str, ...]:
-        return episode_names([Recording(Path(path), None) for path in paths])
+        return episode_names([Recording(path=Path(path), video=VideoFile(Path())) for path in paths])
 
     assert named("a/one.yaml", "a/two.yaml") == ("one", "two")
     assert named("/day 1/recording.yaml", "/day2/recording.yaml") == ("day_1", "day2")

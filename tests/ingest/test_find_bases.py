@@ -276,7 +276,7 @@ def test_the_pose_of_a_tip_is_turned_into_the_shafts_with_readings_of_the_same_m
     late = log.times > 0.5
     joint = ReadingLog(Path("yaw.csv"), "encoder", log.times[late], yaw[late])
     item = InstrumentLogs(
-        "psm1", base=StatedBase(), kinematics=tree, joints={"yaw": JointColumns(Path("yaw.csv"), "encoder")}
+        name="psm1", camera_from_base=StatedBase(), kinematics=tree, joints={"yaw": JointColumns(Path("yaw.csv"), "encoder")}
     )
     part = replace(
         part,

@@ -66,7 +66,7 @@ def test_a_template_takes_the_slaves_on_the_videos_clock(trial, world):
     place = trial.parent / "recording.yaml"
     place.write_text(write_template(trial.parent))
     recording = read_recording(place)
-    assert recording.video == trial.parent / "Suturing_B001_capture1.avi"
+    assert recording.file == trial.parent / "Suturing_B001_capture1.avi"
     assert [item.name for item in recording.instruments] == ["slave_left", "slave_right"]
     assert recording.clocks == ("video",)
     for number, instrument in zip((2, 3), recording.instruments, strict=True):

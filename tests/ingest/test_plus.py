@@ -125,7 +125,7 @@ def test_a_template_of_a_sequence_is_complete(world, transforms):
     path = sequence(world.folder / "surgery.igs.mha", frame_fields(TIMES, tools), film())
     text = write_template(path)
     recording = read_recording(world.text(text, "recording.yaml"))
-    assert recording.video == path
+    assert recording.file == path
     (instrument,) = recording.instruments
     assert instrument.poses.stream == "StylusToTracker"
     assert recording.laparoscope.stream == "ScopeToTracker"
@@ -257,7 +257,7 @@ def test_a_folder_lists_what_it_cannot_read(world, transforms):
     text = write_template(world.folder)
     assert "ct.mha: holds no fields of frames" in text
     recording = read_recording(world.text(text, "recording.yaml"))
-    assert recording.video.name == "surgery.mha"
+    assert recording.file.name == "surgery.mha"
     assert json.dumps(recording.instruments[0].poses.stream) == '"StylusToTracker"'
 
 

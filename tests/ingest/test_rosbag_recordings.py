@@ -107,7 +107,7 @@ def test_a_dvrks_bag_becomes_a_recording_by_one_command(tmp_path, kind, names, c
     assert main(["ingest", "--init", str(bag.path)]) == 0
     text = (tmp_path / "recording.yaml").read_text()
     recording = read_recording(tmp_path / "recording.yaml")
-    assert (recording.video, recording.stream) == (bag.path, LEFT)
+    assert (recording.file, recording.stream) == (bag.path, LEFT)
     assert [item.name for item in recording.instruments] == ["PSM1", "PSM2"]
     assert all(set(item.joints) == {"wrist_pitch", "wrist_yaw", "jaw"} for item in recording.instruments)
     assert text.count("# kinematics: {dvrk_tool: TOOL.json}") == 2

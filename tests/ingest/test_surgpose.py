@@ -76,7 +76,7 @@ def test_the_right_video_is_the_second_camera_of_a_scope_that_stands_still(world
 
 def test_a_template_of_the_folder_is_complete(world, trajectory):
     recording = read_recording(world.text(write_template(trajectory), "recording.yaml"))
-    assert (recording.video, recording.stream) == (trajectory, "regular/left_video.mp4")
+    assert (recording.file, recording.stream) == (trajectory, "regular/left_video.mp4")
     assert [instrument.name for instrument in recording.instruments] == ["PSM1", "PSM3"]
     for instrument in recording.instruments:
         assert instrument.poses.clock == "video"

@@ -156,7 +156,7 @@ def read_right_camera(
     _, lens, right_from_left, calibration = recording.read_stereo()
     video = source.open()
     lens.check_size(video.size, calibration)
-    one_clock = isinstance(source, VideoFile) and source.file == recording.video
+    one_clock = isinstance(source, VideoFile) and source.file == recording.file
     pairs = _pairs(video.times, times, selected, one_clock)
     if 2 * len(pairs) < len(selected):
         raise NeecoError(

@@ -43,8 +43,9 @@ def _of_episode(recording: Recording, episode: int) -> Recording:
         moved.append(key)
         return replace(value, stream=reader.of_episode(value.stream, episode))
 
-    places = {"source": "video", "instruments": "instruments", "laparoscope": "laparoscope", "stereo": "stereo"}
-    streams = {field: in_episode(getattr(recording, field), key) for field, key in places.items()}
+    streams = {
+        key: in_episode(getattr(recording, key), key) for key in ("video", "instruments", "laparoscope", "stereo")
+    }
     changed = replace(recording, **streams, episode=f"episode_{episode}")
     if not moved:
         raise NeecoError(

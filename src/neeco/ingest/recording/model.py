@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from neeco.base.errors import NeecoError
-from neeco.base.settings import Fault
+from neeco.base.settings import Fault, printable
 from neeco.capture.documents import Node
 from neeco.capture.kinematics import KinematicTree
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.readers import DELIMITED, RecordingFormat, VideoSource, format_of
-from neeco.ingest.readers.columns import JointColumns, PoseColumns
+from neeco.ingest.readers.columns import TRACKER_CLOCK, VIDEO_CLOCK, JointColumns, PoseColumns
+from neeco.ingest.readers.frame_names import CAMERA_FRAMES
 from neeco.ingest.readers.video import open_images, open_video
-from neeco.ingest.recording.base import StatedBase
-from neeco.ingest.recording.sections import Count, File, Name, Positive, columns, integer, number, ranges
+from neeco.ingest.recording.base import BASE_KEY, WORLD_KEY, StatedBase, parse_base, parse_world_base
+from neeco.ingest.recording.sections import (
+    Count,
+    File,
+    Name,
+    Positive,
+    columns,
+    existing_file,
+    integer,
+    joint_log,
+    links,
+    number,
+    pose_log,
+    ranges,
+    word,
+)
 
 STILL, MOVING = "still", "moving"  # what `camera` may say of a scope
 MIN_FRAMES = 10  # from which cameras can be found
@@ -80,25 +95,75 @@ class ShaftInVideo:
     fixed_trocar: bool | None = None
 
 
-@dataclass(frozen=True)
-class InstrumentLogs:
+@dataclass(frozen=True, kw_only=True)
+class StatedBases:
+    """The pose of a base relative to a still camera, or to the tracker of a scope that moves; one of the two."""
+
+    camera_from_base: Annotated[StatedBase, parse_base] | None = None
+    world_from_base: Annotated[StatedBase, parse_world_base] | None = None
+
+    @property
+    def base(self) -> StatedBase | None:
+        if self.camera_from_base is not None and self.world_from_base is not None:
+            raise Fault(WORLD_KEY, f"{BASE_KEY} is given, too; keep the one that it stands still to")
+        return self.camera_from_base or self.world_from_base
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstrumentLogs(StatedBases):
     """One instrument: its poses (None: it was not tracked), its joints' readings, by joint, its links, and the stated
     pose of the base that its poses are in; or its shaft, where the poses are found in the video, and its roll where
     that was logged."""
 
-    name: str
-    _: KW_ONLY
-    poses: PoseColumns | None = None
-    joints: Mapping[str, JointColumns] = field(default_factory=dict)
-    kinematics: KinematicTree | None = None
-    base: StatedBase | None = None
+    name: Name
+    poses: Annotated[PoseColumns, pose_log] | None = None
+    joints: dict[str, Annotated[JointColumns, joint_log]] = field(default_factory=dict)
+    kinematics: Annotated[KinematicTree, links] | None = None
     from_video: ShaftInVideo | None = None
-    roll: JointColumns | None = None
+    roll: Annotated[JointColumns, joint_log] | None = None
+
+    def __post_init__(self) -> None:
+        if self.roll is not None and self.from_video is None:
+            raise Fault("roll", "belongs to an instrument from_video; logged poses hold the roll already")
+        if self.from_video is not None and self.poses is not None:
+            raise Fault("from_video", "poses are logged; leave out one of poses and from_video")
+        if self.base is not None and self.poses is not None and self.poses.frame in CAMERA_FRAMES:
+            raise Fault(self.base.key, "its poses are in the camera's frame already; leave out one of the two")
+        for reading in self.kinematics.readings if self.kinematics is not None else ():
+            if reading not in self.joints:
+                names = ", ".join(self.joints) or "none"
+                raise Fault("kinematics", f"{printable(reading)} is no joint of it; name the recorded ones ({names})")
 
     @property
     def placed(self) -> bool:
         """Whether its poses are logged or found in the video."""
         return self.poses is not None or self.from_video is not None
+
+    def completed(self, file: Path | None, stated: StatedBases, shared: Sequence[str]) -> InstrumentLogs:
+        """Return it with the clocks and the base that nothing states. file: of the images; stated: the base of all
+        instruments that state none; shared: joints that several have."""
+
+        def with_clock(log: JointColumns, own: str) -> JointColumns:
+            """In the file of the poses, or of the images, it shares their clock."""
+            clock = poses.clock if poses is not None and log.path == poses.path else own
+            return replace(log, clock=log.clock or (VIDEO_CLOCK if clock == own and log.path == file else clock))
+
+        poses = None if self.poses is None else with_clock_of(self.poses, file)
+        joints = {
+            joint: with_clock(log, f"{self.name}.{joint}" if joint in shared else joint)
+            for joint, log in self.joints.items()
+        }
+        roll = None if self.roll is None else with_clock(self.roll, "roll")
+        bases = StatedBases() if poses is None or poses.frame in CAMERA_FRAMES else self if self.base else stated
+        return replace(
+            self, poses=poses, joints=joints, roll=roll, camera_from_base=bases.camera_from_base,
+            world_from_base=bases.world_from_base,
+        )  # fmt: skip
+
+
+def with_clock_of(log: PoseColumns, file: Path | None) -> PoseColumns:
+    """Return a log with its clock; in the file of the images, it shares theirs."""
+    return replace(log, clock=log.clock or (VIDEO_CLOCK if log.path == file else TRACKER_CLOCK))
 
 
 def _episode_names(node: Node) -> tuple[str, ...]:
@@ -141,54 +206,130 @@ class IngestSettings:
     scene_distance_mm: Positive = 100.0  # from the cameras to the tissue, where nothing measures it
 
 
-@dataclass(frozen=True)
-class StereoPartner:
-    """The right camera of a stereo scope: its frames; the file that states its pose to the left one (None: that of the
-    frames); and, of several in that file, the stream whose camera it is."""
+@dataclass(frozen=True, kw_only=True)
+class CameraFrames:
+    """The frames of a camera: one of a video and a folder of images."""
 
-    source: VideoFile | ImageFolder
-    calibration: Path | None = None
-    stream: str | None = None
+    video: VideoFile | None = None
+    images: ImageFolder | None = None
 
-
-@dataclass(frozen=True)
-class Recording:
-    """A recording. path: the file that states it (for messages); source: the frames; intrinsics: a calibration
-    file, (fl_x, fl_y, cx, cy) px or None (the file's own, else estimated); sync: t_log = t_video + offset s of each
-    clock that is known; frames: how many to keep; camera: STILL, MOVING or None (to be detected); episodes: by number,
-    those of its data set that are meant instead of the one that its streams name; episode: what this one of several is
-    called, where the file names it."""
-
-    path: Path
-    source: VideoFile | ImageFolder
-    _: KW_ONLY
-    intrinsics: Path | tuple[float, ...] | None = None
-    instruments: tuple[InstrumentLogs, ...] = ()
-    laparoscope: PoseColumns | None = None
-    sync: Mapping[str, float] = field(default_factory=dict)
-    frames: int | None = None
-    splits: Splits | None = None
-    notes: tuple[str, ...] = ()
-    settings: IngestSettings = field(default_factory=IngestSettings)
-    camera: str | None = None
-    stereo: StereoPartner | None = None
-    episodes: tuple[int, ...] = ()
-    episode: str = ""
+    def __post_init__(self) -> None:
+        if (self.video is None) == (self.images is None):
+            problem = "missing or twice; give either `video: FILE` or `images: {folder: FOLDER, fps: 25}`"
+            raise Fault("video", problem)
 
     @property
-    def video(self) -> Path | None:
+    def source(self) -> VideoFile | ImageFolder:
+        frames = self.video or self.images
+        assert frames is not None
+        return frames
+
+    @property
+    def file(self) -> Path | None:
         """The video's file; None where the frames are a folder of images."""
-        return self.source.file if isinstance(self.source, VideoFile) else None
+        return None if self.video is None else self.video.file
 
     @property
     def stream(self) -> str | None:
         """The stream of the video's file that holds the frames, where it holds several."""
-        return self.source.stream if isinstance(self.source, VideoFile) else None
+        return None if self.video is None else self.video.stream
+
+
+@dataclass(frozen=True)
+class CalibrationFile:
+    """A calibration of two cameras, or a recording that holds one. stream: whose camera is the right one."""
+
+    shorthand: ClassVar[str] = "file"
+    file: File
+    stream: Name | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoPartner(CameraFrames):
+    """The right camera of a stereo scope: its frames, and what states its pose to the left one (None: the file of the
+    frames does)."""
+
+    calibration: CalibrationFile | None = None
+
+
+def _intrinsics(node: Node) -> Path | tuple[float, ...]:
+    if isinstance(node.value, str):
+        return existing_file(node)
+    return tuple(node.numbers(4, "fl_x, fl_y, cx, cy in pixels, or a calibration file") or ())
+
+
+def _episodes(node: Node) -> tuple[int, ...]:
+    """Return the numbers of a list of numbers and ranges such as "3-7"."""
+    spans = ranges(node)
+    count = sum(last + 1 - first for first, last in spans)
+    if count > MAX_EPISODES:
+        raise Fault(node.field, f"{count} are too many for one capture; list {MAX_EPISODES} at most")
+    numbers = [number for first, last in spans for number in range(first, last + 1)]
+    twice = next((number for number in numbers if numbers.count(number) > 1), None)
+    if twice is not None:
+        raise Fault(node.field, f"{twice} is listed twice; list each once")
+    return tuple(numbers)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingKeys(CameraFrames, StatedBases):
+    """The keys of recording.yaml. intrinsics: a calibration file, (fl_x, fl_y, cx, cy) px or None (the file's own, else
+    estimated); sync: t_log = t_video + offset s of each clock that is known; frames: how many to keep; camera: STILL,
+    MOVING or None (to be detected); episodes: by number, those of its data set that are meant instead of the one that
+    its streams name."""
+
+    camera: Annotated[str, word(STILL, MOVING)] | None = None
+    stereo: StereoPartner | None = None
+    episodes: Annotated[tuple[int, ...], _episodes] = ()
+    intrinsics: Annotated[Any, _intrinsics] = None
+    instruments: tuple[InstrumentLogs, ...] = ()
+    laparoscope: Annotated[PoseColumns, pose_log] | None = None
+    sync: Any = field(default_factory=dict)
+    frames: Annotated[int, integer(MIN_FRAMES)] | None = None
+    splits: Splits | None = None
+    settings: IngestSettings = field(default_factory=IngestSettings)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        names = [item.name for item in self.instruments]
+        for index, name in enumerate(names):
+            if name in names[:index]:
+                place = f"instruments[{index}].name"
+                raise Fault(place, f"{printable(name)} names two instruments; give each its own")
+        if len(names) > 1 and any(item.from_video for item in self.instruments):
+            raise Fault("instruments", "one that is found in the video must be the only one; film one at a time")
+        joints = [joint for item in self.instruments for joint in item.joints]
+        by = None if self.splits is None else self.splits.unseen_by
+        if by is not None and by not in joints:
+            listed = ", ".join(joints) or "none"
+            raise Fault("splits.unseen_by", f"no joint is called {printable(by)}; the joints are {listed}")
+        if self.stereo is not None and self.stereo.source == self.source:
+            raise Fault("stereo.video", "these are the left camera's images; name the right camera's")
+        of_bag = self.file is not None and format_of(self.file) is not None
+        if (
+            self.stereo is not None
+            and self.stereo.calibration is None
+            and not (of_bag and self.stereo.file == self.file)
+        ):
+            raise Fault("stereo.calibration", "missing; give the file of a stereo calibration, or a bag that holds it")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording(RecordingKeys):
+    """A recording. path: the file that states it (for messages); episode: what this one of several is called, where the
+    file names it."""
+
+    path: Path
+    notes: tuple[str, ...] = ()
+    episode: str = ""
 
     @property
     def logs(self) -> tuple[PoseColumns | JointColumns, ...]:
         """All logs of poses and readings."""
-        return logs_of(self.instruments, self.laparoscope)
+        logs: list[PoseColumns | JointColumns | None] = [self.laparoscope]
+        for instrument in self.instruments:
+            logs += [instrument.poses, instrument.roll, *instrument.joints.values()]
+        return tuple(log for log in logs if log is not None)
 
     @property
     def clocks(self) -> tuple[str, ...]:
@@ -199,13 +340,13 @@ class Recording:
         """Return the lenses of the two cameras, right_from_left [4, 4] mm, and the file that states them. Raises
         NeecoError."""
         assert self.stereo is not None
-        source = self.stereo.source
-        right = source if isinstance(source, VideoFile) else VideoFile(Path())
-        file = self.stereo.calibration or right.file
+        stated = self.stereo.calibration
+        file = stated.file if stated is not None else self.stereo.file
+        assert file is not None
         reader = _streams_of(file)
         if reader is None:
             return *read_stereo(file), file
-        calibration = reader.stereo(file, self.stream, self.stereo.stream or right.stream)
+        calibration = reader.stereo(file, self.stream, (stated and stated.stream) or self.stereo.stream)
         if calibration is None:
             raise NeecoError(f"{file}: {reader.format}: states no stereo calibration; give one as stereo.calibration")
         return *calibration, file
@@ -216,15 +357,15 @@ class Recording:
         if self.intrinsics is None and self.stereo is not None:
             left, _, _, file = self.read_stereo()
             return left, str(file)
-        if self.intrinsics is None and self.video is not None and (reader := format_of(self.video)) is not None:
-            return reader.lens(self.video, self.stream), str(self.video)
+        if self.intrinsics is None and self.file is not None and (reader := format_of(self.file)) is not None:
+            return reader.lens(self.file, self.stream), str(self.file)
         if isinstance(self.intrinsics, Path) and (reader := _streams_of(self.intrinsics)) is not None:
             if (lens := reader.lens(self.intrinsics, self.stream)) is None:
                 raise NeecoError(f"{self.intrinsics}: states no lens of these images; give a calibration")
             return lens, str(self.intrinsics)
         if isinstance(self.intrinsics, Path) and self.intrinsics.suffix.lower() == ".ini":  # which two cameras share
             return read_stereo(self.intrinsics)[0], str(self.intrinsics)
-        flags = self.path == getattr(self.source, "folder", self.video)  # not a file that states a recording
+        flags = self.path == getattr(self.source, "folder", self.file)  # not a file that states a recording
         place = "--intrinsics" if flags else f"{self.path}: intrinsics"
         where = str(self.intrinsics) if isinstance(self.intrinsics, Path) else place
         try:
@@ -242,13 +383,3 @@ def _streams_of(file: Path) -> RecordingFormat | None:
         return None
     reader.require_package(file)
     return reader
-
-
-def logs_of(
-    instruments: Sequence[InstrumentLogs], laparoscope: PoseColumns | None
-) -> tuple[PoseColumns | JointColumns, ...]:
-    """Return all logs of a recording."""
-    logs: list[PoseColumns | JointColumns | None] = [laparoscope]
-    for instrument in instruments:
-        logs += [instrument.poses, instrument.roll, *instrument.joints.values()]
-    return tuple(log for log in logs if log is not None)

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-from neeco.base.settings import Fault, printable
+from neeco.base.settings import Fault, join_places, printable, read
 from neeco.capture.documents import Node
+from neeco.capture.kinematics import KinematicTree
+from neeco.capture.readers import read_dvrk_tool, read_urdf
+from neeco.capture.readers.kinematics import DVRK_READINGS, parse_kinematics
+from neeco.ingest.readers import columns as named
+from neeco.ingest.readers.columns import FORMS, JointColumns, PoseColumns, Units
+from neeco.ingest.readers.frame_names import FRAMES
 
 Parser = Callable[[Node], Any]
+_EULER = re.compile(r"(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})")  # no axis twice in a row
 MAX_NUMBER = 1e12  # of any key: more is a slip, and overflows what is computed from it
 
 
@@ -86,3 +94,129 @@ Name = Annotated[str, text]
 File = Annotated[Path, existing_file]
 Positive = Annotated[float, number(above=0.0)]
 Count = Annotated[int, integer(1)]
+Names = tuple[str, ...]
+
+
+def _words(node: Node) -> Names:
+    return tuple(str(item) for item in (node.value if isinstance(node.value, list) else [node.value]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseColumnsSection:
+    """Columns of a log of poses, with at most one form of rotation."""
+
+    time: Annotated[Names, columns(1, 2)] | None = None
+    position: Annotated[Names, columns(3)] | None = None
+    quaternion: Annotated[Names, columns(4)] | None = None
+    quaternion_wxyz: Annotated[Names, columns(4)] | None = None
+    quaternion_xyzw: Annotated[Names, columns(4)] | None = None
+    rotation_vector: Annotated[Names, columns(3)] | None = None
+    euler: Annotated[Names, columns(3)] | None = None
+    rotation_matrix: Annotated[Names, columns(9)] | None = None
+    matrix: Annotated[Names, columns(12, 16)] | None = None
+    euler_convention: Name | None = None
+    state: Name | None = None
+    good: Annotated[Names, _words] = ("OK",)
+
+    def __post_init__(self) -> None:
+        forms = [form for form in ("quaternion", *FORMS) if getattr(self, form) is not None]
+        if len(forms) > 1:
+            raise Fault(forms[1], f"the rotation is already given by {forms[0]}; keep one of them")
+        if forms and self.rotation[1] is None:
+            raise Fault("quaternion", "the names do not say the order; use quaternion_wxyz or quaternion_xyzw")
+        if self.matrix and self.position:
+            raise Fault("position", "the 4x4 matrix holds the position already; remove it (or use rotation_matrix)")
+        if (self.euler or self.euler_convention is not None) and not _EULER.fullmatch(self.euler_convention or ""):
+            problem = "missing" if self.euler_convention is None else f"{printable(self.euler_convention)} is none"
+            raise Fault("euler_convention", f"{problem}; name three axes in order: ZYX intrinsic, zyx extrinsic")
+
+    @property
+    def rotation(self) -> tuple[Names | None, str | None]:
+        """The columns of the rotation, and their form."""
+        if self.quaternion:
+            return self.quaternion, named.quaternion_form(self.quaternion)
+        return next(((getattr(self, form), form) for form in FORMS if getattr(self, form)), (None, None))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointColumnsSection:
+    """Columns of a log of a joint."""
+
+    time: Annotated[Names, columns(1, 2)] | None = None
+    value: Annotated[Names, columns(1)] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogSection:
+    """Keys of every log, or its file alone."""
+
+    shorthand: ClassVar[str] = "file"
+    file: File
+    stream: Name | None = None
+    clock: Name = ""
+    units: Units = field(default_factory=Units)
+    rate_hz: Positive | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseSection(LogSection):
+    """A log of poses."""
+
+    columns: PoseColumnsSection = field(default_factory=PoseColumnsSection)
+    tool: Name | None = None
+    frame: Annotated[str, word(*FRAMES)] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointSection(LogSection):
+    """A log of a joint's readings."""
+
+    columns: JointColumnsSection = field(default_factory=JointColumnsSection)
+    calibration: File | None = None
+    limits: Annotated[tuple[float, float], lambda node: node.range("rad")] | None = None
+
+
+def pose_log(node: Node) -> PoseColumns:
+    """Return a log of poses; its clock is "" where the recording names none."""
+    log: PoseSection = read(PoseSection, node)
+    (rotation, form), stated = log.columns.rotation, log.columns
+    return PoseColumns(
+        log.file, log.clock, time=stated.time, position=stated.position, rotation=rotation, form=form,
+        euler_convention=stated.euler_convention, state=stated.state, good=stated.good, units=log.units,
+        rate_hz=log.rate_hz, tool=log.tool, stream=log.stream, frame=log.frame,
+    )  # fmt: skip
+
+
+def joint_log(node: Node) -> JointColumns:
+    """Return a log of a joint; its clock as that of `pose_log`."""
+    log: JointSection = read(JointSection, node)
+    return JointColumns(
+        log.file, log.clock, time=log.columns.time, value=(log.columns.value or (None,))[0], units=log.units,
+        rate_hz=log.rate_hz, calibration=log.calibration, limits=log.limits, stream=log.stream,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinksFile:
+    """A tool file of the dVRK, or a URDF. readings: the recording's names of its joints."""
+
+    dvrk_tool: File | None = None
+    urdf: File | None = None
+    root: Name | None = None
+    pose_of: Name | None = None
+    readings: dict[str, str] = field(default_factory=dict)
+
+
+def links(node: Node) -> KinematicTree | None:
+    """Return the links of an instrument, from a file or as transforms.json has them."""
+    if not node.has("dvrk_tool") and not node.has("urdf"):
+        return parse_kinematics(node)
+    stated: LinksFile = read(LinksFile, node)
+    if stated.urdf is not None:
+        return read_urdf(stated.urdf, stated.root, stated.pose_of, stated.readings)
+    for key in stated.readings.keys() - {*DVRK_READINGS}:
+        raise Fault(
+            join_places(node.field, "readings", key), f"unknown key; the keys here are {', '.join(DVRK_READINGS)}"
+        )
+    assert stated.dvrk_tool is not None
+    return read_dvrk_tool(stated.dvrk_tool, stated.readings)

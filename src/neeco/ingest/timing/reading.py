@@ -123,10 +123,10 @@ def _check_partner(recording: Recording) -> str:
     assert recording.stereo is not None
     left, right, _, calibration = recording.read_stereo()
     right.check_size(recording.stereo.source.open().size, calibration)
-    reader = None if recording.video is None else format_of(recording.video)
+    reader = None if recording.file is None else format_of(recording.file)
     stated = None
     with suppress(NeecoError):  # what the file states is not used
-        stated = None if reader is None or recording.video is None else reader.lens(recording.video, recording.stream)
+        stated = None if reader is None or recording.file is None else reader.lens(recording.file, recording.stream)
     if stated is None or abs(left.fl_x / stated.fl_x - 1) < READING.same_focal:
         return ""
     return (
@@ -198,7 +198,7 @@ def _length_notes(recording: Recording, video: VideoSource, logs: Sequence[PoseL
     notes: list[str] = []
     times = video.times
     for log in logs:
-        if log.clock != VIDEO_CLOCK or log.path == recording.video:
+        if log.clock != VIDEO_CLOCK or log.path == recording.file:
             continue
         if log.image_hz is not None:
             rows = round(float(log.times[-1]) * log.image_hz) + 1
