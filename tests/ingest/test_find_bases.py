@@ -45,7 +45,7 @@ def _data(world, base, clocks=None):
     poses = type(world)(world.masks, world.camera_from_world, times, False).poses_at(0.0)
     quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     log = PoseLog(path=None, clock="ros", times=times, positions=poses[:, :3, 3], quats=quats, gaps=(), notes=())
-    return episodes([InstrumentLogs("psm1", base=base)], {"psm1": log}, clocks or {})
+    return episodes([InstrumentLogs(name="psm1", camera_from_base=base)], {"psm1": log}, clocks or {})
 
 
 def _black(world, cameras=STILL):
@@ -174,7 +174,7 @@ def test_a_base_is_as_far_off_among_misplaced_cameras_as_it_states(monkeypatch):
         error = generator.normal(size=6) * np.repeat([np.radians(1.5), 3.0], 3)
         stated = generator.normal(size=6) * np.repeat([np.radians(1.0), 1.5], 3)
         base, cameras = moved(WORLD_FROM_BASE, stated), moved(np.linalg.inv(world.camera_from_world), error)
-        items = (InstrumentLogs("psm1", base=StatedBase(base, 1.5, 1.0, to_world=True)),)
+        items = (InstrumentLogs(name="psm1", world_from_base=StatedBase(base, 1.5, 1.0, to_world=True)),)
         data = replace(logged, parts=(replace(part, recording=replace(part.recording, instruments=items)),))
         _, found = find_bases(data, _black(world, cameras), lambda rows: world.masks[rows], silent, registration)
         beside = step(moved(WORLD_FROM_BASE, error), found["psm1"].world_from_base)
@@ -276,7 +276,10 @@ def test_the_pose_of_a_tip_is_turned_into_the_shafts_with_readings_of_the_same_m
     late = log.times > 0.5
     joint = ReadingLog(Path("yaw.csv"), "encoder", log.times[late], yaw[late])
     item = InstrumentLogs(
-        name="psm1", camera_from_base=StatedBase(), kinematics=tree, joints={"yaw": JointColumns(Path("yaw.csv"), "encoder")}
+        name="psm1",
+        camera_from_base=StatedBase(),
+        kinematics=tree,
+        joints={"yaw": JointColumns(Path("yaw.csv"), "encoder")},
     )
     part = replace(
         part,

@@ -58,28 +58,19 @@ def test_a_tool_that_drops_out_takes_no_other_with_it(world, polaris):
         ({}, r"holds 3 tools; say which as `tool` in the recording: .*0x01: 8700340.*, .*needle driver"),
         ({"tool": "0x07"}, r"tool: '0x07' is none of them; say which"),
         # the second Tx is the first tool's first marker
-        (
-            {"position": ("Tx#2", "Ty#2", "Tz#2"), "rotation": ("Q0#2", "Qx#2", "Qy#2", "Qz#2")},
-            r"columns: Tx#2 is a marker's, no tool's; name the tool instead",
-        ),
-        (
-            {"position": ("Tx", "Ty", "Tz"), "rotation": ("Q0#2", "Qx#2", "Qy#2", "Qz#2")},
-            r"columns: Tx, .*Qz#2 are of several tools",
-        ),
+        ({"position": ("Tx#2", "Ty#2", "Tz#2")}, "holds 3 tools; say which"),
     ],
 )
-def test_what_mixes_tools_is_refused(polaris, source, message):
-    if "rotation" in source:
-        source = source | {"form": "quaternion_wxyz"}
+def test_of_several_tools_one_is_named(polaris, source, message):
     with pytest.raises(NeecoError, match=message) as caught:
         read_pose_log(PoseColumns(polaris, **source))
     assert "\n" not in str(caught.value)
 
 
-def test_columns_of_one_tool_may_be_named(world, polaris):
+def test_columns_of_a_tool_may_be_named(world, polaris):
     source = PoseColumns(
-        polaris, time=("Time [sec]",), position=("Tx#4", "Ty#4", "Tz#4"), rotation=("Q0#2", "Qx#2", "Qy#2", "Qz#2"),
-        form="quaternion_wxyz", state="State#4", units=Units(length="mm"),
+        polaris, tool="0x02", time=("Time [sec]",), position=("Tx", "Ty", "Tz"), rotation=("Q0", "Qx", "Qy", "Qz"),
+        form="quaternion_wxyz", state="State", units=Units(length="mm"),
     )  # fmt: skip
     assert len(read_pose_log(source).times) == len(world.times) - 4
 

@@ -210,15 +210,11 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
     """The columns of the tool that `source` names, under their plain names, and those that stand before all tools; what
     is no export of several tools stays as it is.
 
-    Raises NeecoError where there are several tools and none is named, or columns are named that are not all one tool's:
-    the second `Tx` is the first tool's first marker.
+    Raises NeecoError where there are several tools and none is named: the second `Tx` is the first tool's first marker.
     """
     if not table.bodies:
         if source.tool is not None:
             raise NeecoError(f"{table.path}: tool: there are no columns of tools or rigid bodies; leave it out")
-        return table
-    if source.tool is None and (source.position or source.rotation):
-        _refuse_mixed(table, source)
         return table
     wanted = None if source.tool is None else _canonical(source.tool)
     chosen = [body for body in table.bodies if wanted is None or wanted in {_canonical(body.name), *body.aliases}]
@@ -236,17 +232,6 @@ def tool_names(table: Table) -> tuple[str, ...]:
     """Return the name of each body of an export of several; () for other tables, and for NDI's with one tool."""
     single = len(table.bodies) == 1 and table.bodies[0].aliases
     return () if single else tuple(body.name for body in table.bodies)
-
-
-def _refuse_mixed(table: Table, source: PoseColumns) -> None:
-    """Raise NeecoError where the columns that the recording names are not all one tool's own."""
-    named = [*(source.position or ()), *(source.rotation or ()), *([source.state] if source.state else [])]
-    places = {name: table.header.index(name) for name in named if name in table.header}
-    owners = {name: [body.name for body in table.bodies if place in body.columns] for name, place in places.items()}
-    strangers = [name for name, bodies in owners.items() if not bodies]
-    if strangers or len({bodies[0] for bodies in owners.values()}) > 1:
-        what = f"{strangers[0]} is a marker's, no tool's" if strangers else f"{', '.join(places)} are of several tools"
-        raise NeecoError(f"{table.path}: columns: {what}; name the tool instead, as `tool` in the recording")
 
 
 def _canonical(name: str) -> str:

@@ -183,7 +183,7 @@ def correct_placement(
     progress("correcting the instrument's place", 0, 0)
     stated = StatedBase(np.eye(4), 0.0, 0.0, to_world=True)
     observed = _Observed(views, moving)
-    arm = _among_cameras(_arm(data, replace(items[0], base=stated), observed), registration)
+    arm = _among_cameras(_arm(data, replace(items[0], world_from_base=stated), observed), registration)
     try:
         base, _ = _find(arm, observed, observed.visible, alone=True)
     except NeecoError:  # the images do not determine it
