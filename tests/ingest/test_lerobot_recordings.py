@@ -6,14 +6,10 @@ import importlib
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.readers import format_of, read_table
-from neeco.ingest.readers.interpolate import poses_at, readings_at
-from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.registration import hand_eye
 
@@ -23,45 +19,9 @@ pytest.importorskip("pyarrow")
 CLOCKS = {"em": 0.04, "jaw_angle": -0.01}
 
 
-@pytest.fixture(scope="module")
-def written() -> dict[str, bytes]:
-    """The data sets' files by their place, once they are written: those of every recording are alike."""
-    return {}
-
-
 @pytest.fixture
-def sets(recorded, written):
-    module = importlib.import_module("lerobotsets")
-    if not written:
-        before = set(recorded.folder.rglob("*"))
-        module.write_data_sets(recorded.folder, CLOCKS)
-        new = [path for path in set(recorded.folder.rglob("*")) - before if path.is_file()]
-        written.update({str(path.relative_to(recorded.folder)): path.read_bytes() for path in new})
-    for name, content in written.items():
-        (recorded.folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (recorded.folder / name).write_bytes(content)
-    return module
-
-
-@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
-def test_states_and_images_read_back(recorded, sets, version):
-    original = read_recording(recorded.folder / "recording.yaml")
-    film, instrument = original.source.open(), original.instruments[0]
-    path = recorded.folder / "lerobot" / version / "set"
-    poses, _ = poses_at(read_pose_log(instrument.poses), film.times + CLOCKS["em"])
-    jaw, _ = readings_at(read_reading_log(instrument.joints["jaw_angle"]), film.times + CLOCKS["jaw_angle"])
-    pictures = [pixels for _, pixels in film.read(range(recorded.frames))]
-    for episode, count in ((0, recorded.frames), (1, recorded.frames // 2)):
-        rows = read_table(path, f"episode {episode}/{sets.STATE}").rows
-        np.testing.assert_allclose(1000 * rows[:, 1:4], poses[:count, :3, 3], atol=1e-4)  # float32
-        off = Rotation.from_quat(rows[:, 4:8]).inv() * Rotation.from_matrix(poses[:count, :3, :3])
-        assert off.magnitude().max() < 1e-6
-        np.testing.assert_allclose(rows[:, -1], jaw[:count], atol=1e-6)
-        video = format_of(path).open_images(path, f"episode {episode}/{sets.CAMERA}")
-        np.testing.assert_allclose(video.times, film.times[:count], atol=1e-5)
-        shown = np.stack([pixels for _, pixels in video.read(range(count))]).astype(float)
-        errors = [[np.abs(one - other).mean() for other in pictures] for one in shown]
-        assert np.argmin(errors, axis=1).tolist() == list(range(count))
+def sets(recorded):
+    importlib.import_module("lerobotsets").write_data_sets(recorded.folder, CLOCKS)
 
 
 def test_the_same_capture_comes_of_it(recorded, sets, tmp_path):

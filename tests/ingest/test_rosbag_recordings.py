@@ -24,7 +24,6 @@ from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers import _bagfile, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
-from neeco.ingest.readers.rosbag import RosBag
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 from neeco.ingest.request import IngestRequest
@@ -297,22 +296,22 @@ def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Pat
     assert "its files are packed as a whole; unpack one with `zstd -d`" in refusal(lambda: read_arm(path))
 
 
-def test_metadata_larger_than_any_recorder_writes_is_refused(tmp_path: Path, bags: dict[str, Path]) -> None:
-    path, narrow = _copy(bags["recording-db3"], tmp_path), RosBag()
-    narrow.limits = _bagfile.BagLimits(metadata_bytes=100)
-    assert "metadata.yaml: is too large; write it anew with `ros2 bag reindex`" in refusal(lambda: narrow.streams(path))
+def test_metadata_larger_than_any_recorder_writes_is_refused(tmp_path, bags, monkeypatch):
+    path = _copy(bags["recording-db3"], tmp_path)
+    monkeypatch.setattr(_bagfile, "LIMITS", _bagfile.BagLimits(metadata_bytes=100))
+    said = refusal(lambda: known(path).streams(path))
+    assert "metadata.yaml: is too large; write it anew with `ros2 bag reindex`" in said
 
 
-def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path) -> None:
+def test_chunks_that_unpack_without_measure_are_refused(tmp_path, monkeypatch):
     """The limit is lowered: a bomb of its real size would take seconds to make."""
-    narrow = RosBag()
-    narrow.limits = _bagfile.BagLimits(chunk_bytes=60_000)
+    monkeypatch.setattr(_bagfile, "LIMITS", _bagfile.BagLimits(chunk_bytes=60_000))
     for kind, packed in (("a.bag", "bz2"), ("b.bag", "lz4"), ("c.bag", None), ("d-mcap", "zstd"), ("e-db3", "zstd")):
         with BagWriter(tmp_path, kind, packed=packed) as bag:
             for time in range(4):
                 bag.pose("/dvrk/PSM1/measured_cp", float(time), [0, 0, 0], [1, 0, 0, 0])
                 bag.image(LEFT, float(time), np.zeros((200, 200, 3), np.uint8), "rgb8")
-        assert "a chunk of its messages" in refusal(lambda bag=bag: narrow.open_images(bag.path))
+        assert "a chunk of its messages" in refusal(lambda bag=bag: known(bag.path).open_images(bag.path))
 
 
 def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further() -> None:

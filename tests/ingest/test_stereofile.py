@@ -218,7 +218,7 @@ def test_a_baseline_of_no_known_unit_is_refused(tmp_path, scale):
     [
         ({"T_0": 4.3}, "T: puts the right camera to the left"),
         ({"R_0": 0.5}, "R: is no rotation"),
-        ({"fc_x": "wide"}, "fc_: 'wide' is not a number"),
+        ({"fc_x": "wide"}, r"fc_: 'wide, .*' are not all numbers"),
         ({"fc_x": -3}, "positive focal lengths"),
         ({"T_2": "nan"}, "are not all numbers"),
     ],

@@ -271,23 +271,17 @@ def assign_splits(
         whole = tuple(episodes)[-max(1, len(episodes) // SPLITS.test_every) :]
     every = SPLITS.test_every if rule.test_every is None else rule.test_every
     splits = np.full(len(frames), "train", dtype=object)
-    if whole:
-        splits[_inside(frames, tuple(episodes[name] for name in whole))] = "test"
-        words = f"test: {_listed(whole)}"
-    elif rule.test:
-        splits[_inside(frames, rule.test)] = "test"
-        words = "test: video frames " + _ranges(rule.test)
+    if whole or rule.test:
+        splits[_inside(frames, whole, rule.test, episodes)] = "test"
+        words = f"test: {_listed(whole, rule.test)}"
     elif every:
         splits[frames % every == every // 2] = "test"
         words = f"test: video frames whose number leaves {every // 2} when divided by {every}"
     else:
         words = "test: none"
-    if rule.unseen_episodes:
-        splits[_inside(frames, tuple(episodes[name] for name in rule.unseen_episodes))] = "unseen"
-        return splits, f"{words}; unseen: {_listed(rule.unseen_episodes)}"
-    if rule.unseen:
-        splits[_inside(frames, rule.unseen)] = "unseen"
-        return splits, f"{words}; unseen: video frames {_ranges(rule.unseen)}"
+    if rule.unseen_episodes or rule.unseen:
+        splits[_inside(frames, rule.unseen_episodes, rule.unseen, episodes)] = "unseen"
+        return splits, f"{words}; unseen: {_listed(rule.unseen_episodes, rule.unseen)}"
     if rule.unseen_fraction == 0:
         return splits, f"{words}; unseen: none"
     unseen, why = _extremes(poses, joints, rule.unseen_fraction, rule.unseen_by)
@@ -299,16 +293,18 @@ def assign_splits(
     return splits, f"{words}; unseen: {why}; {left_out}"
 
 
-def _inside(frames: np.ndarray, ranges: tuple[tuple[int, int], ...]) -> np.ndarray:
-    return np.any([(frames >= first) & (frames <= last) for first, last in ranges], axis=0)
+def _inside(
+    frames: np.ndarray, names: Sequence[str], ranges: Sequence[tuple[int, int]], episodes: Mapping[str, tuple[int, int]]
+) -> np.ndarray:
+    """Return which frames [N] are of the named episodes, or, where none is, in the ranges (first, last)."""
+    spans = [episodes[name] for name in names] or ranges
+    return np.any([(frames >= first) & (frames <= last) for first, last in spans], axis=0)
 
 
-def _listed(episodes: tuple[str, ...]) -> str:
-    return f"the recording{'s' * (len(episodes) > 1)} {', '.join(episodes)}"
-
-
-def _ranges(ranges: tuple[tuple[int, int], ...]) -> str:
-    return ", ".join(f"{first}-{last}" for first, last in ranges)
+def _listed(names: Sequence[str], ranges: Sequence[tuple[int, int]]) -> str:
+    if names:
+        return f"the recording{'s' * (len(names) > 1)} {', '.join(names)}"
+    return "video frames " + ", ".join(f"{first}-{last}" for first, last in ranges)
 
 
 def _extremes(

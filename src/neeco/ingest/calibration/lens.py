@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from scipy.optimize import least_squares
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import require_file
@@ -223,23 +224,21 @@ def _border_edge(outside: np.ndarray) -> np.ndarray:
 
 
 def _fit_circle(points: np.ndarray) -> tuple[float, float, float] | None:
-    """Centre and radius of the circle through most points [M, 2] (algebraic fit, Kasa 1976, reweighted)."""
+    """Centre and radius of the circle through most points [M, 2]: Kasa's (1976), then with a robust loss."""
     if len(points) < 30:
         return None
     center = points.mean(axis=0)
     local = points - center
-    design = np.column_stack([2 * local, np.ones(len(local))])
-    weights = np.ones(len(local))
-    for _ in range(20):
-        normal = design.T @ (design * weights[:, None]) + 1e-9 * np.eye(3)
-        a, b, c = np.linalg.solve(normal, design.T @ (weights * (local**2).sum(axis=1)))
-        radius = float(np.sqrt(max(c + a * a + b * b, 1e-9)))
-        residuals = np.hypot(local[:, 0] - a, local[:, 1] - b) - radius
-        scale = max(1.48 * float(np.median(np.abs(residuals))), 0.3)
-        weights = 1 / (1 + (residuals / (2 * scale)) ** 2) ** 2
-    if np.median(np.abs(residuals)) > max(BORDERS.max_misfit * radius, 1.0):
+    a, b, c = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), (local**2).sum(axis=1))[0]
+
+    def misfits(circle: np.ndarray) -> np.ndarray:
+        return np.asarray(np.hypot(local[:, 0] - circle[0], local[:, 1] - circle[1]) - circle[2])
+
+    start = np.array([a, b, np.sqrt(max(c + a * a + b * b, 1e-9))])
+    x, y, radius = least_squares(misfits, start, loss="cauchy", f_scale=0.6).x
+    if np.median(np.abs(misfits(np.array([x, y, radius])))) > max(BORDERS.max_misfit * radius, 1.0):
         return None
-    return float(center[0] + a), float(center[1] + b), radius
+    return float(center[0] + x), float(center[1] + y), float(radius)
 
 
 def _divides_dark_from_bright(

@@ -199,40 +199,34 @@ def _of_ini(path: Path) -> dict[str, Any]:
         reason = " ".join(str(error).replace("<string>", path.name).split())[:160]
         raise NeecoError(f"{path}: not readable as an .ini file ({reason}); save the calibration again") from None
     converted: dict[str, Any] = {}
-    poses = []
     for section, side in (("StereoLeft", "left"), ("StereoRight", "right")):
         if not parser.has_section(section):
             raise NeecoError(f"{path}: [{section}]: missing; expected {EXPECTED}")
-        values = dict(parser[section])
-        numbers = {
-            stem: [_number(path, f"[{section}] {stem}", values[key]) for key in _indexed(stem, values)]
-            for stem in ("fc_", "cc_", "res_", "kc_", "r_", "t_")
-        }
-        for stem, count in (("fc_", 2), ("cc_", 2)):
-            if len(numbers[stem]) != count:
-                raise NeecoError(f"{path}: [{section}] {stem}x, {stem}y: missing; save the calibration again")
-        size = numbers["res_"] if len(numbers["res_"]) == 2 else [None, None]
-        converted[side] = _camera_keys(numbers["fc_"], numbers["cc_"], numbers["kc_"], size)
-        poses.append((numbers["r_"], numbers["t_"]))
-    (turn, shift), right = poses
-    if any(shift) or (turn and not np.allclose(turn, np.eye(3).ravel()[: len(turn)], atol=1e-6)):
-        raise NeecoError(f"{path}: [StereoLeft] R, T: the left camera must be the origin; give the right one's from it")
-    return converted | {"R": right[0], "T": right[1]}
-
-
-def _indexed(stem: str, values: dict[str, str]) -> list[str]:
-    """Return the keys `stem` and x, y or 0, 1, 2 ... up to the first gap."""
-    keys = [key for key in (f"{stem}x", f"{stem}y") if key in values]
-    while f"{stem}{len(keys)}" in values:
-        keys.append(f"{stem}{len(keys)}")
-    return keys
-
-
-def _number(path: Path, field: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise NeecoError(f"{path}: {field}: {printable(text)} is not a number; save the calibration again") from None
+        numbers: dict[str, list[float]] = {}
+        for stem, ends in (
+            ("fc", "xy"),
+            ("cc", "xy"),
+            ("res", "xy"),
+            ("kc", range(8)),
+            ("r", range(9)),
+            ("t", range(3)),
+        ):
+            texts = [parser[section].get(f"{stem}_{end}") for end in ends]
+            try:
+                numbers[stem] = [float(text) for text in texts if text is not None]
+            except ValueError:
+                what = f"{printable(', '.join(map(str, texts)))} are not all numbers; save the calibration again"
+                raise NeecoError(f"{path}: [{section}] {stem}_: {what}") from None
+            if stem in ("fc", "cc") and len(numbers[stem]) != 2:
+                raise NeecoError(f"{path}: [{section}] {stem}_x, {stem}_y: missing; save the calibration again")
+        size = numbers["res"] if len(numbers["res"]) == 2 else [None, None]
+        converted[side] = _camera_keys(numbers["fc"], numbers["cc"], numbers["kc"], size)
+        if side == "left" and (
+            any(numbers["t"]) or not np.allclose(numbers["r"], np.eye(3).ravel()[: len(numbers["r"])])
+        ):
+            what = "the left camera must be the origin; give the right one's from it"
+            raise NeecoError(f"{path}: [StereoLeft] R, T: {what}")
+    return converted | {"R": numbers["r"], "T": numbers["t"]}
 
 
 def _one_camera(path: Path) -> RosCamera:

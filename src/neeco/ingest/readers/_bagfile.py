@@ -80,6 +80,9 @@ class BagLimits:
     other_clock_s: float = 1.0  # limit on the s between stamps and receipt for one clock
 
 
+LIMITS = BagLimits()
+
+
 class _UnusableError(Exception):
     """A message that cannot be used, and the reason."""
 
@@ -137,7 +140,6 @@ class Bag:
     """An open bag: a reader of all of it, and one of each of its files."""
 
     path: Path
-    limits: BagLimits
     reader: Any
     sources: list[Any]
 
@@ -159,7 +161,7 @@ class Bag:
                 for connection, received, data in source.messages(wanted, start, stop) if wanted else ():
                     if not 0 <= received < 2**63:
                         raise ReaderError("a message has an invalid time of receipt")
-                    data = unpack(data, "zstd" if packed else "none", self.limits.chunk_bytes)
+                    data = unpack(data, "zstd" if packed else "none", LIMITS.chunk_bytes)
                     try:
                         message = deserialize(data, connection.msgtype)
                     except Exception:  # rosbags raises nearly anything of damaged ones; a message hides no other
@@ -180,13 +182,13 @@ class Bag:
 
 
 @contextmanager
-def open_bag(path: Path, limits: BagLimits) -> Iterator[Bag]:
+def open_bag(path: Path) -> Iterator[Bag]:
     """Open a bag for the block: a ROS 1 `.bag`, a ROS 2 folder, or one `.mcap` or `.db3` of it. Raises NeecoError when
     it cannot be read, as `Bag.messages` does."""
     for file in visible_entries(path) if path.is_dir() else [path]:
         require_content(file)
     metadata = path / "metadata.yaml"
-    if metadata.is_file() and metadata.stat().st_size > limits.metadata_bytes:
+    if metadata.is_file() and metadata.stat().st_size > LIMITS.metadata_bytes:
         raise NeecoError(f"{metadata}: is too large; write it anew with `ros2 bag reindex`")
     if re.search(rb"compression_mode: [\"']?file", read_head(metadata, 1 << 20), re.I):
         raise NeecoError(f"{path}: its files are packed as a whole; unpack one with `zstd -d` and give that")
@@ -198,8 +200,8 @@ def open_bag(path: Path, limits: BagLimits) -> Iterator[Bag]:
             stack.callback(reader.close)
             sources = reader.storages if path.is_dir() else [reader]
             for source in sources:
-                _limit_chunks(source, limits.chunk_bytes)
-        yield Bag(path, limits, reader, sources)
+                _limit_chunks(source)
+        yield Bag(path, reader, sources)
 
 
 def unpack(data: bytes, compression: str, max_bytes: int) -> bytes:
@@ -214,7 +216,7 @@ def unpack(data: bytes, compression: str, max_bytes: int) -> bytes:
     return unpacked
 
 
-def _limit_chunks(reader: Any, max_bytes: int) -> None:
+def _limit_chunks(reader: Any) -> None:
     """Have an open ROS 1 or MCAP reader refuse chunks that do not fit into memory. Raises ReaderError.
 
     An index states the unpacked size of MCAP's chunks; ROS 1 bags state none, so these are unpacked up to the limit.
@@ -223,12 +225,12 @@ def _limit_chunks(reader: Any, max_bytes: int) -> None:
         if not reader.chunks and reader.metadata.message_count:
             raise ReaderError("its messages are not in chunks")
         for listed in reader.chunks:
-            _check_size(max(listed.uncompressed_size, listed.compressed_size), max_bytes)
+            _check_size(max(listed.uncompressed_size, listed.compressed_size), LIMITS.chunk_bytes)
     elif isinstance(reader, Ros1Reader):
         names = {decompress: name for name, decompress in decompressors.items()}
         for place, chunk in reader.chunks.items():
-            _check_size(chunk.datasize, max_bytes)
-            limited = partial(unpack, compression=names[chunk.decompressor], max_bytes=max_bytes)
+            _check_size(chunk.datasize, LIMITS.chunk_bytes)
+            limited = partial(unpack, compression=names[chunk.decompressor], max_bytes=LIMITS.chunk_bytes)
             reader.chunks[place] = chunk._replace(decompressor=limited)
 
 
@@ -253,9 +255,8 @@ class Samples:
     height), and encodings, in the order of their appearance."""
 
     type: str
-    limits: BagLimits
-    static: bool = False
     _: KW_ONLY
+    static: bool = False
     stamps: array[int] = field(default_factory=lambda: array("q"))
     received: array[int] = field(default_factory=lambda: array("q"))
     frames: set[str] = field(default_factory=set)
@@ -276,7 +277,7 @@ class Samples:
             self.bad[str(error)] += 1
             return
         for name in values:
-            if name not in self.columns and (self.type != JOINTS or len(self.columns) < self.limits.joints):
+            if name not in self.columns and (self.type != JOINTS or len(self.columns) < LIMITS.joints):
                 self.columns[name] = array("d", [np.nan]) * len(self.stamps)
         for name, column in self.columns.items():
             column.append(values.get(name, np.nan))
@@ -289,9 +290,8 @@ class Samples:
         if message is None:
             raise _UnusableError("is damaged")
         if self.type in IMAGE:
-            raw = hasattr(message, "encoding")
-            encoding, size = _inspect(message) if raw else _inspect_compressed(message)
-            if not 0 < size[0] * size[1] <= self.limits.pixels:
+            encoding, size = _inspect(message)
+            if not 0 < size[0] * size[1] <= LIMITS.pixels:
                 raise _UnusableError(f"has {size[0]}x{size[1]} pixels")
             self.sizes[size] = self.encodings[encoding] = None
             self.numbers.append(len(self.arrived) - 1)
@@ -331,17 +331,14 @@ class Samples:
 
 
 def _inspect(message: Any) -> tuple[str, tuple[int, int]]:
-    """Return the encoding and size of an Image. Raises _UnusableError."""
-    encoding, size = message.encoding, (message.width, message.height)
-    if encoding not in ENCODINGS:
-        raise _UnusableError(f"is in encoding {printable(encoding, 24)}, which is not read")
-    if message.step < size[0] * ENCODINGS[encoding][0] or len(message.data) < message.step * size[1]:
-        raise _UnusableError("has fewer pixels than its size says")
-    return encoding, size
-
-
-def _inspect_compressed(message: Any) -> tuple[str, tuple[int, int]]:
-    """Return the same of a CompressedImage."""
+    """Return the encoding and size of an Image or CompressedImage. Raises _UnusableError."""
+    if hasattr(message, "encoding"):
+        encoding, size = message.encoding, (message.width, message.height)
+        if encoding not in ENCODINGS:
+            raise _UnusableError(f"is in encoding {printable(encoding, 24)}, which is not read")
+        if message.step < size[0] * ENCODINGS[encoding][0] or len(message.data) < message.step * size[1]:
+            raise _UnusableError("has fewer pixels than its size says")
+        return encoding, size
     try:
         with Image.open(BytesIO(message.data), formats=FORMATS) as image:
             kind, size, mode = str(image.format), image.size, image.mode
@@ -372,7 +369,6 @@ class Survey:
     and P; origin: ns, of all times."""
 
     path: Path
-    limits: BagLimits
     poses: dict[str, Samples] = field(default_factory=dict)
     joints: dict[str, Samples] = field(default_factory=dict)
     images: dict[str, Samples] = field(default_factory=dict)
@@ -386,19 +382,17 @@ class Survey:
                 # its fields have capitals in ROS 1
                 fields = {name: getattr(message, name if hasattr(message, name) else name.lower()) for name in "KDRP"}
                 self.lenses[topic] = message, {name: list(map(float, values)) for name, values in fields.items()}
-        elif kind in TRANSFORMS:
-            for item in [] if message is None else message.transforms:
-                name = f"tf:{plain(item.child_frame_id).lstrip('/')}"
-                if name in self.poses or len(self.poses) < self.limits.bodies:
-                    self._log(self.poses, name, kind, topic.endswith("tf_static")).add(received, item)
-        else:
-            streams = self.images if kind in IMAGE else self.poses if kind in POSE else self.joints
-            self._log(streams, topic, kind).add(received, message)
-
-    def _log(self, logs: dict[str, Samples], name: str, kind: str, static: bool = False) -> Samples:
-        if name not in logs:
-            logs[name] = Samples(kind, self.limits, static)
-        return logs[name]
+            return
+        items, is_tf = [(topic, message)], kind in TRANSFORMS
+        if is_tf:
+            transforms = [] if message is None else message.transforms
+            items = [(f"tf:{plain(item.child_frame_id).lstrip('/')}", item) for item in transforms]
+        streams = self.images if kind in IMAGE else self.joints if kind == JOINTS else self.poses
+        for name, item in items:
+            if name not in streams and len(streams) < LIMITS.bodies:
+                streams[name] = Samples(kind, static=is_tf and topic.endswith("tf_static"))
+            if name in streams:
+                streams[name].add(received, item)
 
     def seconds(self, log: Samples) -> np.ndarray:
         """Return times [N] s from the origin: the stamps or, where those are 0, the times of receipt, ns."""
@@ -424,7 +418,7 @@ class Survey:
             what = "its headers have no times" if none.all() else f"{int(none.sum())} headers have no time"
             notes.append(f"{what}; those of receipt are taken")
         late = 0.0 if none.all() else float(np.median((received - stamps)[~none])) * 1e-9
-        if abs(late) > self.limits.other_clock_s:
+        if abs(late) > LIMITS.other_clock_s:
             why = f"its headers' times are {late:.2f} s before those of receipt, on another clock"
             notes.append(f"{why}; where the streams do not share one, name its `clock` and give `sync`")
         notes += [f"{counted(count, noun)} left out: one {why}" for why, count in log.bad.items()]
@@ -432,10 +426,10 @@ class Survey:
 
 
 @lru_cache(maxsize=4)
-def survey_of(path: Path, state: tuple[object, ...], limits: BagLimits) -> Survey:
+def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
     """Read a bag once; `state` of its files distinguishes it from another of its name."""
-    survey = Survey(path=path, limits=limits)
-    with open_bag(path, limits) as bag:
+    survey = Survey(path=path)
+    with open_bag(path) as bag:
         kinds: dict[str, str] = {}
         unread, topics = [], sorted({connection.topic for connection in bag.reader.connections})
         for topic in topics:
@@ -446,7 +440,7 @@ def survey_of(path: Path, state: tuple[object, ...], limits: BagLimits) -> Surve
             if problem is None and types[0] in READ:
                 kinds[topic] = types[0]
                 if types[0] in IMAGE:
-                    survey.images[topic] = Samples(types[0], limits)
+                    survey.images[topic] = Samples(types[0])
                 continue
             unread += [] if problem is None else [f"{plain(topic)} ({types[0]}) {problem}"]
             words = types[0] if problem is None else f"{types[0]}, which {problem}"
@@ -466,15 +460,14 @@ class BagImages(VideoSource):
     """Images of a topic. arrived: ns, of each of its messages; numbers: which message each frame is."""
 
     topic: str
-    limits: BagLimits
     arrived: np.ndarray
     numbers: np.ndarray
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = np.array(sorted({int(index) for index in indices}), np.int64)
         steps = np.diff(self.numbers[wanted])
-        cuts = np.flatnonzero((steps <= 0) | (steps > self.limits.skipped_images)) + 1
-        with open_bag(self.path, self.limits) as bag:
+        cuts = np.flatnonzero((steps <= 0) | (steps > LIMITS.skipped_images)) + 1
+        with open_bag(self.path) as bag:
             for stretch in np.split(wanted, cuts):
                 numbers = {int(self.numbers[index]): int(index) for index in stretch}
                 times = self.arrived[list(numbers)]
@@ -498,7 +491,7 @@ def open_topic(survey: Survey, topic: str) -> BagImages:
     log, where = survey.images[topic], f"{survey.path}: {topic}"
     seconds, notes = survey.seconds(log), survey.notes(topic, log, "image")
     times, order = np.unique(seconds, return_index=True)
-    if len(times) < survey.limits.min_images:
+    if len(times) < LIMITS.min_images:
         why, count = log.bad.most_common(1)[0] if log.bad else ("", 0)
         problem = f": {count} are not: one {why}" if count else ", by their times" if len(seconds) > len(times) else ""
         raise NeecoError(f"{where}: {len(times)} of {len(log.arrived)} images can be used{problem}; name another topic")
@@ -512,7 +505,4 @@ def open_topic(survey: Survey, topic: str) -> BagImages:
         left_out = f"{counted(doubled, 'image')} left out: one shares its time with another"
         notes = (*notes, f"{survey.path.name}: {topic}: {left_out}")
     numbers, arrived = np.array(log.numbers, np.int64)[order], np.array(log.arrived, np.int64)
-    return BagImages(
-        survey.path, next(iter(log.sizes)), notes, times, topic=topic, limits=survey.limits, arrived=arrived,
-        numbers=numbers,
-    )  # fmt: skip
+    return BagImages(survey.path, next(iter(log.sizes)), notes, times, topic=topic, arrived=arrived, numbers=numbers)

@@ -32,7 +32,7 @@ from neeco.ingest.readers.logs import SETTINGS as LOGS
 from neeco.ingest.readers.logs import read_pose_log
 
 if TYPE_CHECKING:
-    from neeco.ingest.readers._bagfile import BagLimits, Samples, Survey
+    from neeco.ingest.readers._bagfile import Samples, Survey
 
 DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
 CHAIN_HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
@@ -55,7 +55,6 @@ class RosBag(RecordingFormat):
     suffixes = (".bag", ".mcap", ".db3")
     package = "rosbags"
     extra = "ros"
-    limits: BagLimits | None = None  # None: the usual ones
 
     def claims(self, path: Path) -> bool:
         if not path.is_dir():
@@ -115,10 +114,10 @@ class RosBag(RecordingFormat):
 
     def _survey(self, path: Path) -> Survey:
         self.require_package(path)
-        from neeco.ingest.readers._bagfile import BagLimits, survey_of
+        from neeco.ingest.readers._bagfile import survey_of
 
         files = visible_entries(path) if path.is_dir() else [path]
-        return survey_of(path, file_state(*files), self.limits or BagLimits())
+        return survey_of(path, file_state(*files))
 
 
 @lru_cache(maxsize=4)

@@ -113,28 +113,24 @@ def _read(path: Path) -> tuple[_ByArm, _ByArm]:
 def _by_arm(file: Path, parse: Callable[[Any], np.ndarray], expected: str) -> _ByArm:
     """Read {frame: {arm: values}}."""
     document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", FastYamlLoader)
-    arms: dict[str, dict[int, np.ndarray | None]] = {}
-    try:
-        for key in document if all(re.fullmatch(r"\d{1,9}", str(key), re.ASCII) for key in document) else ():
-            for arm, value in document[key].items():
-                rows = arms.setdefault(str(arm), {})
-                rows[int(key)] = None  # missing, unless it can be parsed
-                with suppress(KeyError, IndexError, TypeError, ValueError, OverflowError):
-                    rows[int(key)] = parse(value)
-    except (AttributeError, ValueError, TypeError):
-        arms = {}
-    tables = {}
-    for arm, rows in arms.items():
-        frames, sound = sorted(rows), [row for row in rows.values() if row is not None]
-        bad = [frame for frame in frames if rows[frame] is None]
-        if len(bad) > ROWS.max_wrong * len(rows) or len({len(row) for row in sound}) != 1:
-            where = f"{file}: frame {(bad or frames)[0]}: {printable(arm)}"
-            raise NeecoError(f"{where}: expected {expected} in every frame; copy it again")
-        missing = np.full(len(sound[0]), np.nan)
-        filled = [missing if row is None else row for row in (rows[frame] for frame in frames)]
-        tables[arm] = (np.array(frames, np.int64), np.array(filled))
-    if not tables:
+    frames = document if isinstance(document, dict) else {}
+    if not frames or not all(
+        re.fullmatch(r"\d{1,9}", str(key), re.ASCII) and isinstance(arms, dict) for key, arms in frames.items()
+    ):
         raise NeecoError(f"{file}: expected states of arms by frame, as in '0': {{PSM1: ...}}; copy it again")
+    tables = {}
+    for arm in dict.fromkeys(arm for arms in frames.values() for arm in arms):
+        rows: dict[int, np.ndarray] = {}
+        numbers = sorted(int(key) for key, arms in frames.items() if arm in arms)
+        for key, arms in frames.items():
+            with suppress(KeyError, IndexError, TypeError, ValueError, OverflowError):  # missing, where it is no state
+                rows[int(key)] = parse(arms[arm])
+        bad = [number for number in numbers if number not in rows]
+        if len(bad) > ROWS.max_wrong * len(numbers) or len({len(row) for row in rows.values()}) != 1:
+            where = f"{file}: frame {(bad or numbers)[0]}: {printable(arm)}"
+            raise NeecoError(f"{where}: expected {expected} in every frame; copy it again")
+        missing = np.full(len(next(iter(rows.values()))), np.nan)
+        tables[str(arm)] = np.array(numbers, np.int64), np.array([rows.get(number, missing) for number in numbers])
     return tables
 
 
