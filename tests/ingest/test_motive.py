@@ -19,21 +19,18 @@ from neeco.ingest.recording.template import write_template
 SCALES = {"Meters": 1e-3, "Millimeters": 1.0, "Centimeters": 0.1}
 
 
-def export(world, kind="Quaternion", unit="Meters", bodies=("scissors", "laparoscope"), parent=False, times=True):
+def export(world, unit="Meters", bodies=("scissors", "laparoscope"), parent=False, times=True):
     """Every body on the world's path, the second 7 mm off; its markers and one of no body; lost in rows 20 and 21."""
     turns, places = world.rotations(world.times), world.positions(world.times)
-    angles = turns.as_quat() if kind == "Quaternion" else turns.as_euler(kind, degrees=True)
-    axes = "XYZW" if kind == "Quaternion" else kind
-    order = [axes.index(axis) for axis in ("XYZW" if kind == "Quaternion" else "XYZ")]
     lines = [[] for _ in range(6)]
     columns = []
     for number, name in enumerate(bodies):
         place = (places + np.array([0, 7 * number, 0])) * SCALES[unit]
-        parts = [("Rotation", axis) for axis in sorted(axes, key="XYZW".index)] + [("Position", axis) for axis in "XYZ"]
+        parts = [("Rotation", axis) for axis in "XYZW"] + [("Position", axis) for axis in "XYZ"]
         own = [("Rigid Body", name, part, axis) for part, axis in (*parts, ("Mean Marker Error", ""))]
         own += [("Rigid Body Marker", f"{name}:Marker1", "Position", axis) for axis in "XYZ"]
         own += [("Rigid Body Marker", f"{name}:Marker1", "Marker Quality", "")]
-        values = np.column_stack([angles[:, order], place, np.full((len(place), 5), 1e-4)]).astype(object)
+        values = np.column_stack([turns.as_quat(), place, np.full((len(place), 5), 1e-4)]).astype(object)
         values[20:22] = ""
         columns.append(values)
         for kind_, called, part, axis in own:
@@ -44,7 +41,7 @@ def export(world, kind="Quaternion", unit="Meters", bodies=("scissors", "laparos
         for line, cell in zip(lines, ("Marker", '"Unlabeled 1"', '"2B"', "", "Position", axis), strict=True):
             line.append(cell)
     preamble = "Format Version,1.23,Take Name,take,Take Notes,,Capture Frame Rate,40.000000,Export Frame Rate,40.000000"
-    preamble += f",Total Exported Frames,200,Rotation Type,{kind},Length Units,{unit},Coordinate Space,Global"
+    preamble += f",Total Exported Frames,200,Rotation Type,Quaternion,Length Units,{unit},Coordinate Space,Global"
     first = ["Frame", "Time (Seconds)"] if times else ["Frame"]
     blanks = "," * (len(first) - 1)
     names = ["Type", "Name", "ID", "Parent", "", ""]
@@ -65,8 +62,6 @@ def export(world, kind="Quaternion", unit="Meters", bodies=("scissors", "laparos
         {},
         {"unit": "Millimeters", "parent": True},
         {"unit": "Centimeters", "times": False},
-        {"kind": "XYZ"},
-        {"kind": "ZYX", "unit": "Millimeters"},
     ],
 )
 def test_a_rigid_body_is_named_and_its_units_are_the_exports(world, options):
@@ -105,7 +100,7 @@ def test_a_template_lists_every_body(world):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("Rotation Type,Quaternion", "Rotation Type,Screw", "Rotation Type: 'screw' is not read"),
+        ("Rotation Type,Quaternion", "Rotation Type,XYZ", "Rotation Type: 'xyz' is not read"),
         ("Rigid Body,", "Bone,", "holds no rigid bodies"),
         (",Rotation,", ",Spin,", "rotation: a rigid body has no columns of it"),
         ("Length Units,Meters", "Length Units,Feet", r"in which length unit\?"),

@@ -30,7 +30,7 @@ def folder(world):
     world.write(HEADER, world.rows(), "logs/camera.csv")
     world.write("t_s,hall_raw", np.column_stack([world.times, 1000 + world.times]), "logs/jaw.csv")
     world.write("hall_raw,angle_rad", [[900, 0.0], [1500, 0.5], [2000, 1.0]], "logs/jaw_calibration.csv")
-    world.text(json.dumps({"note": "pulse", "em_minus_video_s": 0.038, "jaw_minus_video_s": -0.01}), "logs/sync.json")
+    world.text(json.dumps({"note": "pulse", "clocks": {"em": 0.038, "jaw_angle": -0.01}}), "logs/sync.json")
     return world.folder
 
 
@@ -300,23 +300,10 @@ def test_mistakes_are_told_with_their_key(world, folder, old, new, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("content", "offsets"),
-    [
-        ({"clocks": {"em": 0.5, "jaw_angle": 2}}, {"em": 0.5, "jaw_angle": 2.0}),
-        ({"em_minus_video_s": 1.0}, {"em": 1.0}),
-        ({"clocks": None, "em_minus_video_s": 1.0}, {"em": 1.0}),
-        ({"jaw_angle_minus_video_s": 1.0, "note": "x"}, {"jaw_angle": 1.0}),
-    ],
-)
-def test_sync_files(world, folder, content, offsets):
-    assert flags(folder, sync=world.text(json.dumps(content), "sync.json")).sync == offsets
-
-
 def test_an_offset_of_a_log_that_was_not_given_is_noted(folder):
     recording = flags(folder, joint=())
     assert recording.sync == {"em": 0.038}
-    assert any("'jaw_minus_video_s' belongs to no log" in note for note in recording.notes)
+    assert any("'clocks.jaw_angle' belongs to no log" in note for note in recording.notes)
 
 
 @pytest.mark.parametrize(

@@ -67,18 +67,6 @@ def ini(folder, **changes):
     return path
 
 
-def intuitive_json(folder):
-    cameras = [
-        {"f": [matrix[0, 0], matrix[1, 1]], "c": [matrix[0, 2], matrix[1, 2]], "k": bends.tolist()}
-        for matrix, bends in ((LEFT, LEFT_BENDS), (RIGHT, RIGHT_BENDS))
-    ]
-    extrinsics = {"om": TURN.as_rotvec().tolist(), "T": SHIFT.tolist()}
-    data = {"width": SIZE[0], "height": SIZE[1], "intrinsics": cameras, "extrinsics": extrinsics}
-    path = folder / "camcal.json"
-    path.write_text(json.dumps({"data": data}), encoding="utf-8")
-    return path
-
-
 def scared_json(folder):
     values = {"KL": LEFT, "KR": RIGHT, "DL": [LEFT_BENDS], "DR": [RIGHT_BENDS], "R": TURN.as_matrix()}
     calibration = {name: as_rows(value) for name, value in values.items()} | {"T": as_rows(SHIFT[:, None])}
@@ -175,7 +163,7 @@ def orb_slam_3(folder):
 @pytest.mark.parametrize(
     "write",
     [
-        *(opencv_yaml, opencv_two_files, opencv_xml, ini, intuitive_json, scared_json),
+        *(opencv_yaml, opencv_two_files, opencv_xml, ini, scared_json),
         *(ros_pair, ros_left_file, kalibr, orb_slam, orb_slam_3),
     ],
 )
@@ -249,7 +237,7 @@ def test_one_camera_is_no_rig(tmp_path):
         read_stereo(tmp_path)
 
 
-@pytest.mark.parametrize("write", [opencv_yaml, ini, intuitive_json, scared_json, ros_left_file])
+@pytest.mark.parametrize("write", [opencv_yaml, ini, scared_json, ros_left_file])
 def test_no_bytes_make_reading_raise(tmp_path, write):
     path = write(tmp_path)
     refusals([path], [lambda: np.testing.assert_array_equal(np.isfinite(read_stereo(path)[2]), True)], 25)

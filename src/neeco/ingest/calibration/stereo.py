@@ -59,7 +59,7 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     Read are OpenCV's stereo YAML or XML (`M1 D1 M2 D2 R T`, or `K1 ...`; R and T may stand in `extrinsics.yml` next to
     `intrinsics.yml`), Kalibr's camchain, settings of ORB-SLAM (`LEFT.K ...`, `Camera1.fx ...`), ROS's camera_info of
     two cameras (a folder with a left and a right file, or the left file, the right one next to it), the da Vinci's
-    `.ini` ([StereoLeft], [StereoRight]) and JSON (`intrinsics`, `extrinsics`, or `KL DL KR DR R T`). T is in mm or m,
+    `.ini` ([StereoLeft], [StereoRight]) and SCARED's JSON (`KL DL KR DR R T`). T is in mm or m,
     by its length, and is refused where both could be. Raises NeecoError naming file, field and remedy.
     """
     path = Path(path)
@@ -70,11 +70,8 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     document = _of_ini(path) if path.suffix.lower() == ".ini" else read_calibration(path)
     if not isinstance(document, dict):
         raise NeecoError(f"{path}: holds no keys; expected {EXPECTED}")
-    for key in ("data", "camera-calibration"):
-        if isinstance(document.get(key), dict):
-            document = document[key]
-    if "intrinsics" in document and "extrinsics" in document:
-        document = _of_intuitive(path, document)
+    if isinstance(document.get("camera-calibration"), dict):
+        document = document["camera-calibration"]
     cameras = cameras_in(path, document)
     if len(cameras) == 2:
         return _two_cameras(path, document, *cameras)
@@ -170,23 +167,6 @@ def _camera_keys(
 ) -> dict[str, Any]:
     """Return a camera in the keys of ORB-SLAM."""
     return dict(zip(("fx", "fy", "cx", "cy", "width", "height"), (*focal, *center, *size), strict=True)) | {"d": bends}
-
-
-def _of_intuitive(path: Path, document: dict[Any, Any]) -> dict[str, Any]:
-    """Return `intrinsics: [{f, c, k}, {f, c, k}]` and `extrinsics: {om, T}` of the da Vinci's calibrations, in the keys
-    of OpenCV."""
-    cameras, extrinsics = document["intrinsics"], document["extrinsics"]
-    if not isinstance(cameras, list) or len(cameras) != 2 or not all(isinstance(camera, dict) for camera in cameras):
-        raise NeecoError(f"{path}: intrinsics: expected two cameras, left and right, each with f, c and k; write them")
-    if not isinstance(extrinsics, dict):
-        raise NeecoError(f"{path}: extrinsics: expected om and T; write them")
-    converted: dict[str, Any] = {"R": extrinsics.get("om"), "T": extrinsics.get("T")}
-    for number, (side, camera) in enumerate(zip(("left", "right"), cameras, strict=True)):
-        f, c = (matrix_numbers(path, camera.get(key), f"intrinsics[{number}].{key}") for key in ("f", "c"))
-        if len(f) != 2 or len(c) != 2:
-            raise NeecoError(f"{path}: intrinsics[{number}]: f and c take two numbers each; correct them")
-        converted[side] = _camera_keys(f, c, camera.get("k", []), (document.get("width"), document.get("height")))
-    return converted
 
 
 def _of_ini(path: Path) -> dict[str, Any]:

@@ -1,8 +1,8 @@
-"""Exports of OptiTrack's Motive as CSV: rigid bodies by name, units and rotation type in the preamble.
+"""Exports of OptiTrack's Motive as CSV: rigid bodies by name, units in the preamble.
 
 A preamble of pairs (`Length Units,Meters`), then a line each of the types, names and IDs (since Motive 3 of the
 parents, too) of what the columns belong to, one of what they hold (Rotation, Position), and one of their axes. Cells
-are empty where a body was not tracked. Angles are in degrees, about the body's own axes, in `Rotation Type`'s order.
+are empty where a body was not tracked.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
@@ -21,7 +20,7 @@ from neeco.ingest.readers.delimited import read_cells, unique_names
 
 FIRST = b"Format Version"  # words of a file
 BODY_TYPE = "rigid body"
-QUATERNION, ORDERS = "quaternion", ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")  # rotation types
+QUATERNION = "quaternion"  # the rotation type that is read
 QUATS = ("qx", "qy", "qz", "qw")
 
 
@@ -61,20 +60,14 @@ class MotiveExport(RecordingFormat):
             return numbers(raw, [places[letter] for letter in letters])
 
         kind, unit = preamble.get("Rotation Type", QUATERNION).lower(), canonical_unit(preamble.get("Length Units", ""))
-        if kind not in (QUATERNION, *ORDERS):
+        if kind != QUATERNION:
             raise NeecoError(f"{path}: Rotation Type: {printable(kind)} is not read; export quaternions")
         suffix = f"_{unit}" if unit in UNITS["length"] else ""
         header, columns, bodies = ["t_s"], [_times(raw, axes, preamble)], []
         for name in dict.fromkeys(names[kinds == BODY_TYPE]):
-            quats = values(name, "rotation", "xyzw" if kind == QUATERNION else kind)
-            if kind != QUATERNION:
-                valid, angles = np.isfinite(quats).all(axis=1), quats
-                quats = np.full((len(angles), 4), np.nan)
-                if valid.any():
-                    quats[valid] = Rotation.from_euler(kind.upper(), angles[valid], degrees=True).as_quat()
             bodies.append(Body(name, tuple(range(len(header), len(header) + 7))))
             header += [*(axis + suffix for axis in "xyz"), *QUATS]
-            columns += [values(name, "position", "xyz"), quats]
+            columns += [values(name, "position", "xyz"), values(name, "rotation", "xyzw")]
         return Table(path, unique_names(header), np.column_stack(columns), lines, bodies=tuple(bodies))
 
 

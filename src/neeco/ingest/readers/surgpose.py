@@ -24,7 +24,7 @@ from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_lengths, read_once
 from neeco.ingest.readers.rosbag import DVRK_HINT
 from neeco.ingest.readers.rows import SETTINGS as ROWS
-from neeco.ingest.readers.video import open_images, open_video
+from neeco.ingest.readers.video import open_video
 
 POSE_FILE, JOINT_FILE = "api_cp_data.yaml", "api_jp_data.yaml"
 FRAMES_PER_SECOND = 30.0
@@ -32,7 +32,7 @@ JOINTS_BEHIND = "_joints"  # the stream's name, after the arm's
 JOINT_NAMES = ("yaw_rad", "pitch_rad", "insertion_m", "roll_rad", "wrist_pitch_rad", "wrist_yaw_rad", "jaw_rad")
 WRIST = (("wrist_pitch", "wrist_pitch_rad"), ("wrist_yaw", "wrist_yaw_rad"), ("jaw", "jaw_rad"))
 POSE_HEADER = ("t_s", *(f"m{row}{column}{'_m' if column == 3 else ''}" for row in range(3) for column in range(4)))
-LIGHTS = ("regular", "", "green")  # folders of the videos; what is green shows the ultraviolet paint
+GREEN = "green"  # folder of videos that show the ultraviolet paint
 _ByArm = dict[str, tuple[np.ndarray, np.ndarray]]  # frames [T], and rows [T, C] of each, by arm
 
 
@@ -76,8 +76,7 @@ class SurgPose(RecordingFormat):
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         name = self.choose(path, stream, Kind.IMAGES).name
-        file = path / name
-        video = open_images(file, FRAMES_PER_SECOND) if file.is_dir() else open_video(file)
+        file, video = path / name, open_video(path / name)
         states = max(int(frames[-1]) + 1 for frames, _ in _read(path)[0].values())
         notes = compare_lengths(file, video, states, FRAMES_PER_SECOND)
         return replace(video, notes=(*video.notes, *notes))
@@ -95,11 +94,9 @@ class SurgPose(RecordingFormat):
 
 
 def _videos(path: Path) -> list[str]:
-    """Videos, or folders of their frames, the left one in usual light first."""
-    names = ("video.mp4", "video", "frames")
-    places = [[Path(light) / f"{side}_{name}" for name in names] for light in LIGHTS for side in ("left", "right")]
-    found = (next((place for place in group if (path / place).exists()), None) for group in places)
-    return [place.as_posix() for place in found if place is not None]
+    """Videos, the left one in usual light first."""
+    found = [file.relative_to(path).as_posix() for file in sorted(path.glob("**/*_video.mp4"))]
+    return sorted(found, key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
 
 
 def _read(path: Path) -> tuple[_ByArm, _ByArm]:

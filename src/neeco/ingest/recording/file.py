@@ -16,8 +16,6 @@ from neeco.ingest.readers.columns import VIDEO_CLOCK
 from neeco.ingest.recording.model import Recording, RecordingKeys, with_clock_of
 from neeco.ingest.recording.sections import MAX_NUMBER, existing_file
 
-_OFFSET_SUFFIX = "_minus_video_s"  # of clocks' names in sync files
-
 
 def read_recording(path: Path) -> Recording:
     """Read recording.yaml; paths in it are relative to it. Raises NeecoError naming file, key and remedy."""
@@ -56,39 +54,28 @@ def recording_of(document: Any, path: Path) -> Recording:
 
 
 def _sync(node: Node, clocks: tuple[str, ...]) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return offsets s by clock, from a mapping or a JSON file: {"clocks": {"em": 0.038}} or
-    {"em_minus_video_s": 0.038}; and notes on those of no log."""
+    """Return offsets s by clock, from a mapping or a JSON file, as in {"clocks": {"em": 0.038}}; and notes on those of
+    no log."""
     if node.value is None:
         return {}, ()
-    if not isinstance(node.value, str):
-        return _offsets(node, node.value, clocks)
-    file = existing_file(node)
-    require_file(file, "clock offsets as JSON")
-    document = read_json(file)
-    stated = document if isinstance(document, dict) else {}
-    others = {key: value for key, value in stated.items() if key.endswith(_OFFSET_SUFFIX)}
-    with faults_in(file):
-        stated = stated if isinstance(stated.get("clocks"), dict) else others
-        return _offsets(Node(document, str(file)), stated or None, clocks)
-
-
-def _offsets(node: Node, stated: Any, clocks: tuple[str, ...]) -> tuple[dict[str, float], tuple[str, ...]]:
-    if isinstance(stated, dict) and isinstance(stated.get("clocks"), dict):
-        node, stated = node.child("clocks"), stated["clocks"]
-    if not isinstance(stated, dict):
+    if isinstance(node.value, str):
+        file = existing_file(node)
+        require_file(file, "clock offsets as JSON")
+        with faults_in(file):
+            stated = Node(read_json(file), str(file)).child("clocks")
+            return _sync(stated.at([] if stated.value is None else stated.value, stated.field), clocks)
+    if not isinstance(node.value, dict):
         expected = 'expected clock offsets in s, as in {"clocks": {"em": 0.038}}'
-        raise Fault(node.field or "clocks", f"{expected}, or a JSON file of them; correct it")
+        raise Fault(node.field, f"{expected}, or a JSON file of them; correct it")
     offsets, notes = dict[str, float](), []
-    for key, value in stated.items():
-        place, name = join_places(node.field, str(key)), str(key).removesuffix(_OFFSET_SUFFIX)
-        seconds = as_float(value)
+    for name, value in node.value.items():
+        place, seconds = join_places(node.field, str(name)), as_float(value)
         if seconds is None or not abs(seconds) < MAX_NUMBER:
             raise Fault(place, f"{printable(value)} is not an offset in seconds; t_log = t_video + offset")
-        longer = [clock for clock in clocks if clock.startswith(name + "_")]  # "jaw" for jaw_angle
-        if name in clocks or len(longer) == 1:
-            offsets[name if name in clocks else longer[0]] = seconds
-        elif likely := nearest(name, clocks) or " or ".join(longer):
+        if name not in clocks and (likely := nearest(str(name), clocks)):
             raise Fault(place, f"no log has the clock {printable(name)}; did you mean {likely}?")
+        if name in clocks:
+            offsets[name] = seconds
         else:
             notes.append(f"{Path(node.file).name}: {printable(place)} belongs to no log of this recording; ignored")
     return offsets, tuple(notes)

@@ -285,8 +285,8 @@ def _classify_table(files: _FolderFiles, name: str, file: Path) -> None:
 
 def _is_sync(file: Path) -> bool:
     with suppress(NeecoError):
-        stated = document if isinstance(document := read_json(file), dict) else {}
-        offsets = stated.get("clocks") or {key: stated[key] for key in stated if key.endswith("_minus_video_s")}
+        document = read_json(file)
+        offsets = document.get("clocks") if isinstance(document, dict) else None
         return isinstance(offsets, dict) and bool(offsets) and {*map(type, offsets.values())} <= {int, float}
     return False
 
