@@ -11,7 +11,6 @@ import pytest
 from bag_world import KINDS, BagWriter, known, refusal
 from scipy.spatial.transform import Rotation
 
-from neeco.base.errors import NeecoError
 from neeco.ingest.readers import (
     Kind,
     VideoSource,
@@ -125,13 +124,6 @@ def test_streams_say_what_there_is(tmp_path: Path, kind: str) -> None:
     assert found[LEFT].type == "sensor_msgs/Image (rgb8, 24x16)"
     assert found["/chatter"].type == "std_msgs/String"
     assert found[ARM].rate_hz == pytest.approx(1 / STEP)
-
-
-@pytest.mark.parametrize(("frame", "meant"), [("ECM", CAMERA), ("/ecm", CAMERA), ("PSM1_base", BASE), ("", BASE)])
-def test_poses_in_a_cameras_frame_are_known_as_such(tmp_path: Path, frame: str, meant: str) -> None:
-    path = whole(tmp_path, frame=frame)  # its images are of `camera`
-    assert poses(path).frame == meant
-    assert read_pose_log(PoseColumns(path, stream=ARM, frame=BASE)).frame == BASE
 
 
 def test_a_dvrks_poses_in_the_images_own_frame_have_either_axes_and_are_asked_for(tmp_path: Path) -> None:
@@ -421,19 +413,10 @@ def test_another_recordings_bag_gives_its_only_pair_of_cameras(tmp_path: Path) -
     np.testing.assert_array_equal(of_these[2], of_others[2])
 
 
-@pytest.mark.parametrize(
-    ("baseline", "left", "right", "words"),
-    [
-        (0.0, "left", "right", "/stereo/right/camera_info: projection_matrix: has no baseline (its 4th number is 0)"),
-        (0.0055, "right", "left", "/stereo/right/camera_info: projection_matrix: has a baseline, so it is the right"),
-        (0.5, "left", "right", "/stereo/right/camera_info: T: 0.5 long, which is no stereo scope's"),
-    ],
-)
-def test_a_calibration_of_no_stereo_scope_is_refused(tmp_path, baseline, left, right, words):
-    path = write_stereo(tmp_path, baseline=baseline)
-    with pytest.raises(NeecoError) as caught:
-        known(path).stereo(path, f"/stereo/{left}/image_raw", f"/stereo/{right}/image_raw")
-    assert words in str(caught.value)
+def test_cameras_calibrated_one_by_one_are_no_stereo_scope(tmp_path: Path) -> None:
+    path = write_stereo(tmp_path, baseline=0.0)
+    said = refusal(lambda: known(path).stereo(path, "/stereo/left/image_raw", "/stereo/right/image_raw"))
+    assert "/stereo/right/camera_info: projection_matrix: has no baseline (its 4th number is 0)" in said
 
 
 def test_a_bag_without_the_right_cameras_camera_info_says_what_to_give(tmp_path: Path) -> None:
