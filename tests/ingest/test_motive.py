@@ -68,7 +68,7 @@ def test_a_rigid_body_is_named_and_its_units_are_the_exports(world, options):
     path = export(world, **options)
     kept = np.delete(np.arange(len(world.times)), [20, 21])
     for number, name in enumerate(("scissors", "Laparoscope")):
-        log = read_pose_log(PoseColumns(path, tool=name))
+        log = read_pose_log(PoseColumns(path, stream=name))
         np.testing.assert_allclose(log.times, world.times[kept], atol=1e-6)
         np.testing.assert_allclose(
             log.positions, world.positions(world.times)[kept] + np.array([0, 7 * number, 0]), atol=1e-6
@@ -79,7 +79,9 @@ def test_a_rigid_body_is_named_and_its_units_are_the_exports(world, options):
 
 
 def test_of_several_bodies_one_is_named_and_the_only_one_need_not_be(world):
-    with pytest.raises(NeecoError, match=r"holds 2 tools; say which as `tool` in the recording: .*scissors"):
+    with pytest.raises(
+        NeecoError, match=r"holds 2 streams of poses; name one as `stream` in the recording: .*scissors"
+    ):
         read_pose_log(PoseColumns(export(world)))
     assert len(read_pose_log(PoseColumns(export(world, bodies=("scissors",)))).times) == 198
 
@@ -88,11 +90,11 @@ def test_a_template_lists_every_body(world):
     export(world, bodies=("scissors", "grasper", "laparoscope"))
     (world.folder / "video.mp4").write_bytes(b"film")
     recording = read_recording(world.text(write_template(world.folder), "recording.yaml"))
-    assert [(item.name, item.poses.tool) for item in recording.instruments] == [
+    assert [(item.name, item.poses.stream) for item in recording.instruments] == [
         ("scissors", "scissors"),
         ("grasper", "grasper"),
     ]
-    assert recording.laparoscope.tool == "laparoscope"
+    assert recording.laparoscope.stream == "laparoscope"
     for log in (*(item.poses for item in recording.instruments), recording.laparoscope):
         assert len(read_pose_log(log).times) == 198
 

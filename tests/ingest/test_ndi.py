@@ -37,7 +37,7 @@ def polaris(world):
 
 @pytest.mark.parametrize("tool", ["0x02", "2", "Port 0x02", "needle driver", "Needle Driver"])
 def test_a_tool_is_named_by_port_or_name(world, polaris, tool):
-    log = read_pose_log(PoseColumns(polaris, tool=tool))
+    log = read_pose_log(PoseColumns(polaris, stream=tool))
     kept = np.delete(world.times, [7, 8, 20, 21])
     np.testing.assert_allclose(log.positions, world.positions(kept), atol=1e-6)
     for state in ("MISSING", "Partially Out Of Vol"):
@@ -45,20 +45,20 @@ def test_a_tool_is_named_by_port_or_name(world, polaris, tool):
 
 
 def test_a_tool_that_drops_out_takes_no_other_with_it(world, polaris):
-    log = read_pose_log(PoseColumns(polaris, tool="endoscope"))
+    log = read_pose_log(PoseColumns(polaris, stream="endoscope"))
     np.testing.assert_allclose(log.positions, world.positions(world.times[:150]) / 2, atol=1e-6)
     assert any("50 rows dropped: State is 'Disabled'" in note for note in log.notes)
-    log = read_pose_log(PoseColumns(polaris, tool="8700340"))
+    log = read_pose_log(PoseColumns(polaris, stream="8700340"))
     np.testing.assert_array_equal(log.positions, [[900.0, 901.0, 902.0]] * len(world.times))
 
 
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ({}, r"holds 3 tools; say which as `tool` in the recording: .*0x01: 8700340.*, .*needle driver"),
-        ({"tool": "0x07"}, r"tool: '0x07' is none of them; say which"),
+        ({}, r"holds 3 streams of poses; name one as `stream` in the recording: 8700340, needle driver, endoscope"),
+        ({"stream": "0x07"}, r"stream: holds no '0x07'; name one of 8700340, needle driver, endoscope"),
         # the second Tx is the first tool's first marker
-        ({"position": ("Tx#2", "Ty#2", "Tz#2")}, "holds 3 tools; say which"),
+        ({"position": ("Tx#2", "Ty#2", "Tz#2")}, "holds 3 streams of poses; name one"),
     ],
 )
 def test_of_several_tools_one_is_named(polaris, source, message):
@@ -69,25 +69,26 @@ def test_of_several_tools_one_is_named(polaris, source, message):
 
 def test_columns_of_a_tool_may_be_named(world, polaris):
     source = PoseColumns(
-        polaris, tool="0x02", time=("Time [sec]",), position=("Tx", "Ty", "Tz"), rotation=("Q0", "Qx", "Qy", "Qz"),
+        polaris, stream="0x02", time=("Time [sec]",), position=("Tx", "Ty", "Tz"), rotation=("Q0", "Qx", "Qy", "Qz"),
         form="quaternion_wxyz", state="State", units=Units(length="mm"),
     )  # fmt: skip
     assert len(read_pose_log(source).times) == len(world.times) - 4
 
 
-def test_a_tool_in_another_file_is_refused(world):
-    path = world.write("t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz", world.rows())
-    with pytest.raises(NeecoError, match=r"tool: there are no columns of tools"):
-        read_pose_log(PoseColumns(path, tool="0x01"))
+def test_recordings_may_still_call_it_a_tool(world, polaris):
+    (world.folder / "video.mp4").write_bytes(b"film")
+    text = "video: video.mp4\ninstruments: [{name: a, poses: {file: log.csv, tool: needle driver}}]\n"
+    recording = read_recording(world.text(text, "recording.yaml"))
+    assert recording.instruments[0].poses.stream == "needle driver"
 
 
 def test_a_template_lists_every_tool(world, polaris):
     (world.folder / "video.mp4").write_bytes(b"film")
     recording = read_recording(world.text(write_template(world.folder), "recording.yaml"))
     poses = [instrument.poses for instrument in recording.instruments]
-    assert [(instrument.name, instrument.poses.tool) for instrument in recording.instruments] == [
+    assert [(instrument.name, instrument.poses.stream) for instrument in recording.instruments] == [
         ("tool_8700340", "8700340"), ("needle_driver", "needle driver"),
     ]  # fmt: skip
-    assert recording.laparoscope.tool == "endoscope"
+    assert recording.laparoscope.stream == "endoscope"
     assert len(read_pose_log(recording.laparoscope).times) == 150
     assert [len(read_pose_log(log).times) for log in poses] == [200, 196]

@@ -36,26 +36,13 @@ ENTRY_POINTS = "neeco.readers"  # the group in which installed packages name the
 
 
 @dataclass(frozen=True)
-class Body:
-    """One of several bodies whose poses share the rows of a table. columns: by their index, of which the second
-    and later ones of a name end in `#2`, ...; without that, they are named as a table of this body alone would name
-    them; title, aliases: what messages call it, and a recording may."""
-
-    name: str
-    columns: tuple[int, ...]
-    title: str = ""
-    aliases: frozenset[str] = frozenset()
-
-
-@dataclass(frozen=True)
 class Table:
     """The content of a log file, or of one stream of it. header: column names, all different; rows [R, C]: cells as
     text, stripped, "" where missing (dtype object), or numbers, NaN where missing; lines: int64 [R] the file's line (or
     record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in:
     the file's own name of the frame that poses are stated in, meaning: what that says (None: nothing, taken as a base);
     notes: what reading it changed or left out, in words; image_hz: images a second of the video, where every row is the
-    state of one of its images; None: rows have times of their own; bodies: where the columns of several stand next to
-    each other, behind those that all share."""
+    state of one of its images; None: rows have times of their own."""
 
     path: Path
     header: tuple[str, ...]
@@ -68,7 +55,6 @@ class Table:
     meaning: NamedFrame | None = None
     notes: tuple[str, ...] = ()
     image_hz: float | None = None
-    bodies: tuple[Body, ...] = ()
 
     @property
     def frame(self) -> str | None:

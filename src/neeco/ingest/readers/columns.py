@@ -62,10 +62,9 @@ class PoseColumns:
 
     time: one column, or two (whole seconds, nanoseconds); position: x, y, z (not with a 4x4 matrix); rotation: as
     many columns as `form` takes; euler_convention: as scipy names it, "XYZ" intrinsic, "xyz" extrinsic; state: a
-    column of which only the values `good` mark measured rows; rate_hz: where time counts frames; tool: which, by port,
-    name or serial number, in an NDI export of several; stream: which, of a file that holds several; frame: what the
-    poses are stated in, of `frames.FRAMES` (CAMERA, BASE: a robot's base, a tracker's frame); None: the file says so,
-    else BASE.
+    column of which only the values `good` mark measured rows; rate_hz: where time counts frames; stream: which, of a
+    file that holds several; frame: what the poses are stated in, of `frames.FRAMES` (CAMERA, BASE: a robot's base, a
+    tracker's frame); None: the file says so, else BASE.
     """
 
     path: Path
@@ -80,7 +79,6 @@ class PoseColumns:
     good: tuple[str, ...] = ("OK",)
     units: Units = field(default_factory=Units)
     rate_hz: float | None = None
-    tool: str | None = None
     stream: str | None = None
     frame: str | None = None
 

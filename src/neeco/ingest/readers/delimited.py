@@ -9,7 +9,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
 
@@ -18,8 +18,8 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes
 from neeco.capture.documents import printable
-from neeco.ingest.readers import DELIMITED, Body, RecordingFormat, Table, to_numbers
-from neeco.ingest.readers.columns import UNITS, PoseColumns, canonical_unit
+from neeco.ingest.readers import DELIMITED, Kind, RecordingFormat, Stream, Table, read_once, to_numbers
+from neeco.ingest.readers.columns import TRACKER_CLOCK, UNITS, canonical_unit
 
 EXPECTED = "CSV with a header line"
 _COMMENT = re.compile(r"^\s*(?:#+|//|%\s)\s*")
@@ -51,17 +51,45 @@ class DelimitedText(RecordingFormat):
     holds = "poses or readings: CSV and its relatives with a header line, exports of NDI's trackers"
     suffixes = DELIMITED
 
+    def streams(self, path: Path) -> tuple[Stream, ...]:
+        """Return the tools of an export of several; () of other tables."""
+        *_, lines, tools = _parsed(path)
+        return tuple(tool_stream(tool.name, len(lines)) for tool in tools) if len(tools) > 1 else ()
+
     def read(self, path: Path, stream: str | None = None) -> Table:
-        """Raises NeecoError when absent, empty, binary or without a header line."""
-        if stream is not None:
+        """Return a table; of an export of NDI the columns of one tool, under their plain names, and those that stand
+        before all tools. Raises NeecoError when absent, empty, binary or without a header line."""
+        header, rows, lines, tools = _parsed(path)
+        if not tools and stream is not None:
             raise NeecoError(f"{path}: stream: a table has no streams; leave it out")
-        text = read_cells(path)
-        names, start = _header(path, text)
-        used = ~text.comment & (np.arange(len(text.lines)) >= start)
-        if not used.any():
-            raise NeecoError(f"{path}: has a header but no rows; record again or name another file")
-        header, rows = unique_names(names), text.cells[used, : len(names)]
-        return Table(path, header, rows, text.lines[used], bodies=find_tools(header, rows))
+        if not tools:
+            return Table(path, header, rows, lines)
+        wanted = None if stream is None else _canonical(stream)
+        meant = next((tool.name for tool in tools if wanted in tool.aliases), stream)
+        streams = [tool_stream(tool.name, len(lines)) for tool in tools]
+        chosen = tools[streams.index(self.choose(path, meant, Kind.POSES, streams=streams))]
+        columns = [*range(tools[0].columns.start), *chosen.columns]
+        names = tuple(_NUMBERED.sub("", header[index]) for index in columns)
+        return Table(path, names, rows[:, columns], lines, stream=chosen.name if len(tools) > 1 else None)
+
+
+def tool_stream(name: str, count: int) -> Stream:
+    """Return the stream of a tracker's tool or rigid body."""
+    body = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
+    body = body if body[:1].isalpha() else f"tool_{body}"
+    return Stream(name, Kind.POSES, "tool", count, body=body, clock=TRACKER_CLOCK)
+
+
+@read_once
+def _parsed(path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, tuple[_Tool, ...]]:
+    """Return header, rows [R, C], their lines [R] and NDI's tools of a table. Raises NeecoError."""
+    text = read_cells(path)
+    names, start = _header(path, text)
+    used = ~text.comment & (np.arange(len(text.lines)) >= start)
+    if not used.any():
+        raise NeecoError(f"{path}: has a header but no rows; record again or name another file")
+    header, rows = unique_names(names), text.cells[used, : len(names)]
+    return header, rows, text.lines[used], _find_tools(header, rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,56 +210,35 @@ def _read_text(path: Path) -> str:
     return text
 
 
-def find_tools(header: Sequence[str], rows: np.ndarray) -> tuple[Body, ...]:
+@dataclass(frozen=True)
+class _Tool:
+    """A tool of an export of NDI. columns: by index; aliases: the words that mean it and no other."""
+
+    name: str
+    columns: range
+    aliases: frozenset[str]
+
+
+def _find_tools(header: Sequence[str], rows: np.ndarray) -> tuple[_Tool, ...]:
     """Return NDI's tools: the columns of each from its `Port` to its markers; named by name or serial number, else by
     port, where that is no other's."""
     plain = [_NUMBERED.sub("", name).strip() for name in header]
     starts = [index for index, name in enumerate(plain) if _PORT.match(name)]
-    tools: list[tuple[range, str, list[str]]] = []
+    tools: list[tuple[range, list[str]]] = []
     for start, end in pairwise([*starts, len(plain)]):
         names = [name.lower() for name in plain[start:end]]
         length = next((n for n, name in enumerate(names) if name == MARKERS or name in names[:n]), len(names))
         if {"q0", "tx"} <= set(names[:length]):
             match, cell = _PORT.match(plain[start]), next(filter(None, rows[:, start]), "")
             port, name = (match["port"], match["name"] or "") if match else ("", "")
-            title = plain[start] if port or name else cell or plain[start]
-            tools.append((range(start, start + length), title, [name, port or cell, plain[start], cell]))
-    shared = Counter(word for _, _, words in tools for word in {_canonical(word) for word in words if word})
+            words = [word for word in (name, port or cell, plain[start], cell) if word]
+            tools.append((range(start, start + length), words))
+    counts = Counter(word for _, words in tools for word in {_canonical(word) for word in words})
+    own = [[word for word in words if counts[_canonical(word)] == 1] for _, words in tools]
     return tuple(
-        Body(
-            next((word for word in words[:2] if word and shared[_canonical(word)] == 1), printable(title)),
-            tuple(columns), title=printable(title), aliases=frozenset(_canonical(word) for word in words if word),
-        )
-        for columns, title, words in tools
-    )  # fmt: skip
-
-
-def tool_columns(table: Table, source: PoseColumns) -> Table:
-    """The columns of the tool that `source` names, under their plain names, and those that stand before all tools; what
-    is no export of several tools stays as it is.
-
-    Raises NeecoError where there are several tools and none is named: the second `Tx` is the first tool's first marker.
-    """
-    if not table.bodies:
-        if source.tool is not None:
-            raise NeecoError(f"{table.path}: tool: there are no columns of tools or rigid bodies; leave it out")
-        return table
-    wanted = None if source.tool is None else _canonical(source.tool)
-    chosen = [body for body in table.bodies if wanted is None or wanted in {_canonical(body.name), *body.aliases}]
-    if len(chosen) != 1:
-        listed = ", ".join(body.title or printable(body.name) for body in table.bodies)
-        count, asked = len(chosen) or "none", printable(source.tool)
-        problem = f"holds {len(table.bodies)} tools" if wanted is None else f"tool: {asked} is {count} of them"
-        raise NeecoError(f"{table.path}: {problem}; say which as `tool` in the recording: {listed}")
-    columns = [*range(min(body.columns[0] for body in table.bodies)), *chosen[0].columns]
-    header = tuple(_NUMBERED.sub("", table.header[index]) for index in columns)
-    return replace(table, header=header, rows=table.rows[:, columns], stream=chosen[0].name, bodies=())
-
-
-def tool_names(table: Table) -> tuple[str, ...]:
-    """Return the name of each body of an export of several; () for other tables, and for NDI's with one tool."""
-    single = len(table.bodies) == 1 and table.bodies[0].aliases
-    return () if single else tuple(body.name for body in table.bodies)
+        _Tool((words or [f"tool {number}"])[0], columns, frozenset(map(_canonical, words)))
+        for number, ((columns, _), words) in enumerate(zip(tools, own, strict=True), 1)
+    )
 
 
 def _canonical(name: str) -> str:

@@ -21,7 +21,6 @@ from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Table, column_index, numbers, read_table, to_numbers
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
-from neeco.ingest.readers.delimited import tool_columns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_in, meaning_of, of_dvrk
 from neeco.ingest.readers.rows import Rows, drop_stuck, find_gaps, in_order, keep_measured, read_cells, read_times
 
@@ -80,7 +79,7 @@ class ReadingLog(SampleLog):
 
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
-    table = tool_columns(read_table(source.path, source.stream), source)
+    table = read_table(source.path, source.stream)
     stated = _given(table, time=source.time, position=source.position, rotation=source.rotation)
     recognised = named.recognise_pose(table.header, stated)
     table = with_named_frame(table, (*(source.position or recognised.position or ()), *(source.rotation or ())))

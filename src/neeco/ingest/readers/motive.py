@@ -14,9 +14,9 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
-from neeco.ingest.readers import Body, RecordingFormat, Table, numbers, to_numbers
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, to_numbers
 from neeco.ingest.readers.columns import UNITS, canonical_unit
-from neeco.ingest.readers.delimited import read_cells, unique_names
+from neeco.ingest.readers.delimited import Cells, read_cells, tool_stream
 
 FIRST = b"Format Version"  # words of a file
 BODY_TYPE = "rigid body"
@@ -25,7 +25,7 @@ QUATS = ("qx", "qy", "qz", "qw")
 
 
 class MotiveExport(RecordingFormat):
-    """One table, in which `tool` names a rigid body. Markers and skeletons are left out."""
+    """A stream is a rigid body. Markers and skeletons are left out."""
 
     format = "Motive export"
     holds = "poses of rigid bodies by name: OptiTrack's CSV with its preamble (Format Version, ...)"
@@ -33,51 +33,54 @@ class MotiveExport(RecordingFormat):
     def claims(self, path: Path) -> bool:
         return read_head(path, 64).lstrip(b'\xef\xbb\xbf"').startswith(FIRST)
 
+    def streams(self, path: Path) -> tuple[Stream, ...]:
+        start, places = _columns(path)
+        return tuple(tool_stream(name, len(read_cells(path).lines) - start) for name in places)
+
     def read(self, path: Path, stream: str | None = None) -> Table:
-        if stream is not None:
-            raise NeecoError(f"{path}: stream: an export is one table; name a rigid body as `tool` instead")
-        text = read_cells(path)
+        (start, places), streams, text = _columns(path), self.streams(path), read_cells(path)
+        meant = next((name for name in places if name.lower() == str(stream).lower()), stream)
+        name = self.choose(path, meant, Kind.POSES, streams=streams).name
+        wanted = [*(("position", axis) for axis in "xyz"), *(("rotation", axis) for axis in "xyzw")]
+        if absent := [part for part, axis in wanted if (part, axis) not in places[name]]:
+            raise NeecoError(f"{path}: {absent[0]}: a rigid body has no columns of it; export the take with 6 DoF data")
         preamble = dict(zip(text.cells[0, ::2], text.cells[0, 1::2], strict=False))
-        lower = np.char.lower(text.cells[: min(len(text.cells), 20)].astype(str))
-        types = np.flatnonzero((lower == BODY_TYPE).any(axis=1))
-        starts = np.flatnonzero(lower[:, 0] == "frame")
-        if not len(types) or not len(starts) or starts[0] < types[0] + 3:
-            raise NeecoError(f"{path}: holds no rigid bodies; export the take from Motive with its rigid bodies")
-        start, names = int(starts[0]), text.cells[types[0] + 1]
-        kinds, parts, axes = lower[types[0]], lower[start - 1], lower[start]
-        if start + 1 == len(text.lines):
-            raise NeecoError(f"{path}: has a header but no rows; export the take again")
-        cells, lines = text.cells[start + 1 :], text.lines[start + 1 :]
-        raw = Table(path, tuple(map(str, range(len(axes)))), cells, lines)
-
-        def values(name: str, part: str, letters: str) -> np.ndarray:
-            """[R, A] of a body's columns; NaN where it was not tracked."""
-            places = {
-                axes[i]: str(i) for i in range(len(axes)) if (names[i], kinds[i], parts[i]) == (name, BODY_TYPE, part)
-            }
-            if not set(letters) <= set(places):
-                raise NeecoError(f"{path}: {part}: a rigid body has no columns of it; export the take with 6 DoF data")
-            return numbers(raw, [places[letter] for letter in letters])
-
         kind, unit = preamble.get("Rotation Type", QUATERNION).lower(), canonical_unit(preamble.get("Length Units", ""))
         if kind != QUATERNION:
             raise NeecoError(f"{path}: Rotation Type: {printable(kind)} is not read; export quaternions")
         suffix = f"_{unit}" if unit in UNITS["length"] else ""
-        header, columns, bodies = ["t_s"], [_times(raw, axes, preamble)], []
-        for name in dict.fromkeys(names[kinds == BODY_TYPE]):
-            bodies.append(Body(name, tuple(range(len(header), len(header) + 7))))
-            header += [*(axis + suffix for axis in "xyz"), *QUATS]
-            columns += [values(name, "position", "xyz"), values(name, "rotation", "xyzw")]
-        return Table(path, unique_names(header), np.column_stack(columns), lines, bodies=tuple(bodies))
+        values = to_numbers(text.cells[start:, [places[name][place] for place in wanted]])
+        rows = np.column_stack([_times(path, text, start, preamble), values])
+        header = ("t_s", *(axis + suffix for axis in "xyz"), *QUATS)
+        return Table(path, header, rows, text.lines[start:], stream=name)
 
 
-def _times(raw: Table, axes: np.ndarray, preamble: dict[str, str]) -> np.ndarray:
+def _columns(path: Path) -> tuple[int, dict[str, dict[tuple[str, str], int]]]:
+    """Return the first row of numbers, and the columns of each rigid body by what they hold and their axis. Raises
+    NeecoError."""
+    text = read_cells(path)
+    lower = np.char.lower(text.cells[:20].astype(str))
+    types = np.flatnonzero((lower == BODY_TYPE).any(axis=1))
+    starts = np.flatnonzero(lower[:, 0] == "frame")
+    if not len(types) or not len(starts) or starts[0] < types[0] + 3:
+        raise NeecoError(f"{path}: holds no rigid bodies; export the take from Motive with its rigid bodies")
+    start = int(starts[0]) + 1
+    if start == len(text.lines):
+        raise NeecoError(f"{path}: has a header but no rows; export the take again")
+    places: dict[str, dict[tuple[str, str], int]] = {}
+    for column in np.flatnonzero(lower[types[0]] == BODY_TYPE).tolist():
+        part, axis = lower[start - 2, column], lower[start - 1, column]
+        places.setdefault(text.cells[types[0] + 1, column], {})[part, axis] = column
+    return start, places
+
+
+def _times(path: Path, text: Cells, start: int, preamble: dict[str, str]) -> np.ndarray:
     """[R] s: as they stand there, else of the frames at the export's rate."""
-    for index, name in enumerate(axes):
-        if name.startswith("time (sec"):
-            return numbers(raw, [str(index)])[:, 0]
+    for column, name in enumerate(text.cells[start - 1]):
+        if name.lower().startswith("time (sec"):
+            return to_numbers(text.cells[start:, column])
     stated = preamble.get("Export Frame Rate", preamble.get("Capture Frame Rate", ""))
     rate = float(to_numbers(np.array(stated, object)))
     if not 0 < rate < 1e6:  # NaN compares false
-        raise NeecoError(f"{raw.path}: has no column of times and no Export Frame Rate; export the take with its times")
-    return numbers(raw, ["0"])[:, 0] / rate
+        raise NeecoError(f"{path}: has no column of times and no Export Frame Rate; export the take with its times")
+    return to_numbers(text.cells[start:, 0]) / rate

@@ -183,7 +183,7 @@ def pose_log(node: Node) -> PoseColumns:
     return PoseColumns(
         log.file, log.clock, time=stated.time, position=stated.position, rotation=rotation, form=form,
         euler_convention=stated.euler_convention, state=stated.state, good=stated.good, units=log.units,
-        rate_hz=log.rate_hz, tool=log.tool, stream=log.stream, frame=log.frame,
+        rate_hz=log.rate_hz, stream=log.stream or log.tool, frame=log.frame,
     )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ from neeco.ingest.readers import Kind, Stream, VideoSource, format_of, read_tabl
 from neeco.ingest.readers.columns import (
     BASE,
     MATRIX,
-    PoseColumns,
+    TRACKER_CLOCK,
     RecognisedColumns,
     joint_columns,
     pose_bodies,
@@ -35,7 +35,6 @@ from neeco.ingest.readers.columns import (
     recognise_value,
     split_unit,
 )
-from neeco.ingest.readers.delimited import tool_columns, tool_names
 from neeco.ingest.readers.frame_names import NamedFrame, without_frame
 from neeco.ingest.readers.logs import with_named_frame
 from neeco.ingest.readers.rosbag import DVRK_WRIST
@@ -96,12 +95,11 @@ class _Frames:
 @dataclass(frozen=True)
 class _Log:
     """A log: its file, relative to the folder; says: the holder of remarks on the body (`hints`), and of keys that
-    nothing in the file answers (`asks`), its stream or the meaning of a table's frame; tool: which of several in an NDI
-    export; in_base: are its poses stated in a base's frame?"""
+    nothing in the file answers (`asks`), its stream or the meaning of a table's frame; in_base: are its poses stated in
+    a robot's base?"""
 
     file: str
     says: Stream | NamedFrame = IN_BASE
-    tool: str | None = None
     in_base: bool = False
 
     @property
@@ -111,15 +109,13 @@ class _Log:
     @property
     def stem(self) -> str:
         """A name for the log's body."""
-        if self.stream is None and self.tool is None:
+        if self.stream is None:
             return without_frame(Path(self.file).stem)
-        name = re.sub(r"[^A-Za-z0-9]+", "_", self.stream.name if self.stream else str(self.tool)).strip("_")
-        name = name if self.tool is None or name[:1].isalpha() else f"tool_{name}"
-        return without_frame((self.stream and self.stream.body) or name)
+        return without_frame(self.stream.body or re.sub(r"[^A-Za-z0-9]+", "_", self.stream.name).strip("_"))
 
     def lines(self) -> list[str]:
-        keys = [("file", self.file), ("stream", self.stream.name if self.stream else None), ("tool", self.tool)]
-        return [f"{key}: {_scalar(value)}" for key, value in keys if value is not None]
+        stream = [] if self.stream is None else [f"stream: {_scalar(self.stream.name)}"]
+        return [f"file: {_scalar(self.file)}", *stream]
 
 
 @dataclass(kw_only=True)
@@ -242,7 +238,7 @@ def _classify_stream(files: _FolderFiles, log: _Log, stream: Stream, path: Path)
     joints: Sequence[tuple[str | None, str]] = stream.joints or ()
     if stream.kind == Kind.POSES:
         header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
-        in_base = table.frame in (None, BASE) and not stream.asks
+        in_base = table.frame in (None, BASE) and not stream.asks and stream.clock != TRACKER_CLOCK
         files.poses.append((replace(log, in_base=in_base), recognise_pose(header)))
     elif stream.joints is None:  # every angle is one
         joints = [(None, column) for column in table.header if split_unit(column, "angle")[1]]
@@ -255,16 +251,6 @@ def _classify_table(files: _FolderFiles, name: str, file: Path) -> None:
         meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
     except NeecoError as error:
         files.leave_out(name, error, file)
-        return
-    tools = tool_names(table)
-    for tool in tools:
-        try:
-            of_tool = tool_columns(table, PoseColumns(file, tool=tool))
-        except NeecoError as error:
-            files.leave_out(f"{name}: {tool}", error, file)
-            continue
-        files.poses.append((_Log(name, tool=tool), recognise_pose(of_tool.header)))
-    if tools:
         return
     log, pose, (value, when) = _Log(name), recognise_pose(table.header), recognise_value(table.header)
     columns = [column for column in table.header if column]
@@ -421,7 +407,7 @@ def _instrument_lines(files: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
-    clock = "em" if log.stream is None else log.stream.clock
+    clock = TRACKER_CLOCK if log.stream is None else log.stream.clock
     lines = [*log.lines(), *([f"clock: {clock}"] if clock else []), *(f"# {ask}" for ask in log.says.asks)]
     if log.stream is not None and log.stream.columns is not None:  # others are recognised again when read
         stated = (("position", columns.position), (columns.form, columns.rotation))
