@@ -236,25 +236,29 @@ def pose_bodies(header: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Return the columns of every body that has a position, by the body's name: the words that distinguish the columns'
     prefixes, or all before `pose` and the like; "" for one body without a prefix."""
     plain = _by_plain_name(header, "length")
-    for prefixed, names in _POSITIONS:
+    _, prefixes = _first_choice(plain, _POSITIONS)
+    if prefixes == [""]:
+        return {"": tuple(header)}
+    words = [set(prefix.split("_")) for prefix in prefixes]
+    shared = set.intersection(*words) if len(words) > 1 else set(_POSE_WORDS)
+    return {
+        "_".join(word for word in prefix.split("_") if word not in shared) or prefix: tuple(
+            name for key, name in plain.items() if key.startswith(prefix + "_")
+        )
+        for prefix in prefixes
+    }
+
+
+def _first_choice(plain: Mapping[str, str], choices: _Choices) -> tuple[list[str], list[str]]:
+    """Return the first choice of names that is there, and the prefixes behind which all of them stand: [""] where they
+    have none."""
+    for prefixed, names in choices:
         if all(name in plain for name in names):
-            return {"": tuple(header)}
-        if prefixes := _prefixes(plain, names) if prefixed else []:
-            words = [set(prefix.split("_")) for prefix in prefixes]
-            shared = set.intersection(*words) if len(words) > 1 else set(_POSE_WORDS)
-            return {
-                "_".join(word for word in prefix.split("_") if word not in shared) or prefix: tuple(
-                    name for key, name in plain.items() if key.startswith(prefix + "_")
-                )
-                for prefix in prefixes
-            }
-    return {}
-
-
-def _prefixes(plain: Mapping[str, str], names: Sequence[str]) -> list[str]:
-    """Return the prefixes behind which all of some plain names stand."""
-    prefixes = [name.removesuffix("_" + names[0]) for name in plain if name.endswith("_" + names[0])]
-    return [prefix for prefix in prefixes if all(f"{prefix}_{name}" in plain for name in names)]
+            return names, [""]
+        firsts = [name.removesuffix("_" + names[0]) for name in plain if prefixed and name.endswith("_" + names[0])]
+        if prefixes := [prefix for prefix in firsts if all(f"{prefix}_{name}" in plain for name in names)]:
+            return names, prefixes
+    return [], []
 
 
 def recognise_value(header: Sequence[str], named: _Given = _NOTHING) -> tuple[str | None, RecognisedColumns]:
@@ -333,16 +337,12 @@ def _group(
 ) -> tuple[str, ...] | None:
     """The columns of the first choice of names that is there, behind one prefix if it may be."""
     plain = _by_plain_name(header, kind)
-    for prefixed, names in choices:
-        if all(name in plain for name in names):
-            return tuple(plain[name] for name in names)
-        prefixes = _prefixes(plain, names) if prefixed else []
-        if len(prefixes) == 1:
-            return tuple(plain[f"{prefixes[0]}_{name}"] for name in names)
-        if prefixes:
-            unclear[what] = f"several bodies ({', '.join(prefixes[:4])}); name the columns of one under columns.{what}"
-            return None
-    return None
+    names, prefixes = _first_choice(plain, choices)
+    if len(prefixes) > 1:
+        unclear[what] = f"several bodies ({', '.join(prefixes[:4])}); name the columns of one under columns.{what}"
+    if len(prefixes) != 1:
+        return None
+    return tuple(plain[f"{prefixes[0]}_{name}" if prefixes[0] else name] for name in names)
 
 
 def _matrix(header: Sequence[str]) -> tuple[str, ...] | None:

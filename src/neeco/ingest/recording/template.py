@@ -22,7 +22,7 @@ from neeco.base.files import read_json, require_content
 from neeco.base.placeholders import placeholder
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.calibration.stereo import read_stereo
-from neeco.ingest.readers import Kind, Stream, VideoSource, format_of, read_table
+from neeco.ingest.readers import DELIMITED, Kind, Stream, VideoSource, format_of, read_table
 from neeco.ingest.readers.columns import (
     BASE,
     MATRIX,
@@ -210,8 +210,8 @@ def _add_streams(files: _FolderFiles, path: Path, name: str) -> bool:
         reader.require_package(path)
         streams = reader.streams(path)
     except NeecoError as error:
-        files.leave_out(name, error, path, images=True)
-        return path.is_dir()
+        files.leave_out(name, error, path, images=path.suffix.lower() not in DELIMITED)
+        return True
     for stream in streams:
         log, title = _Log(name, stream), f"{name}: {stream.name}"
         used = stream.offered and stream.count > 0 and stream.problem is None
