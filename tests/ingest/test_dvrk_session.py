@@ -158,14 +158,6 @@ def test_no_bytes_make_reading_raise(session):
     refusals(files, [read], 30)
 
 
-def test_a_bag_without_its_reader_s_package_says_what_to_install(session, monkeypatch):
-    (session / "rosbag").mkdir()
-    change(session / "index.json", rosbags="rosbag")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(NeecoError, match=r"rosbag: ROS bag: needs rosbags; pip install '\.\[ros\]'"):
-        format_of(session).streams(session)
-
-
 def test_frames_earlier_than_any_before_them_are_left_out(world):
     session = write_session(world)
     numbers = [number if number < 20 else number - 12 for number in range(COUNT)]

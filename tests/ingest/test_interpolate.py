@@ -98,19 +98,6 @@ def test_isolated_samples_hold_only_at_their_time():
     assert values[1] == 4.0
 
 
-def test_readings_are_smoothed(world):
-    noisy = world.jaw(world.times) + np.random.default_rng(0).normal(0, 0.01, len(world.times))
-    log = ReadingLog(Path("log.csv"), "jaw", world.times, noisy)
-    values, _ = readings_at(log, QUERIES)
-    assert np.sqrt(((values - world.jaw(QUERIES)) ** 2).mean()) < 0.005
-
-
-def test_constant_readings_stay():
-    log = ReadingLog(Path("log.csv"), "jaw", np.arange(100) / 50, np.full(100, 0.4))
-    values, _ = readings_at(log, np.linspace(0, 1.9, 33))
-    np.testing.assert_allclose(values, 0.4, atol=1e-9)
-
-
 def test_a_log_too_coarse_for_its_motion_is_taken_as_it_is():
     times = np.arange(60) / 5.0
     truth = lambda seconds: 0.6 + 0.5 * np.sin(5 * seconds)  # noqa: E731 a jaw that opens within three samples

@@ -152,11 +152,6 @@ def test_nine_numbers_are_a_camera_matrix(world, name, text):
     assert read_lens(world.text(text, name)) == Lens(300.5, 301.5, 160.0, 120.0)
 
 
-def test_four_numbers_or_nothing():
-    assert read_lens((290, 291, 160, 128)) == Lens(290.0, 291.0, 160.0, 128.0)
-    assert read_lens(None) is None
-
-
 def test_a_field_of_view_is_a_focal_length(world):
     lens = read_lens(world.text(json.dumps({"camera_angle_x": np.pi / 2, "w": 200, "h": 100}), "transforms.json"))
     assert lens is not None
@@ -229,13 +224,6 @@ def test_undistorting_moves_points_to_where_the_pinhole_sees_them():
         near = straight[..., 0] * (np.hypot(columns - u, rows - v) < 8.0)
         found = np.array([(columns * near).sum(), (rows * near).sum()]) / near.sum()
         np.testing.assert_allclose(found, [u, v], atol=0.3)
-
-
-def test_a_pinhole_changes_nothing():
-    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
-    lens = Lens(30, 30, 16, 12)
-    assert lens.undistort(image) is image
-    assert lens.pinhole((32, 24)).size == (32, 24)
 
 
 def test_distortion_that_folds_the_image_is_refused():

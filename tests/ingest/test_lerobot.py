@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from pathlib import Path
@@ -490,10 +489,3 @@ def test_row_groups_that_unpack_to_more_than_memory_should_hold_are_refused(tmp_
     assert len(read(path, f"episode 33/{STATE}").rows) == 20
     monkeypatch.setattr(lerobot_files, "LIMITS", LeRobotLimits(group_bytes=100))
     assert "unpacks to over" in refusal(path, f"episode 33/{STATE}")
-
-
-def test_other_folders_are_none(tmp_path):
-    (tmp_path / "meta").mkdir()
-    assert format_of(tmp_path) is None
-    (tmp_path / "meta" / "info.json").write_text(json.dumps({"version": 1}))
-    assert format_of(tmp_path) is None

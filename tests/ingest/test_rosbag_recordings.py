@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bz2
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -26,8 +25,6 @@ from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK, JointColumns, Pose
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
-from neeco.ingest.request import IngestRequest
-from neeco.ingest.sources import sources_of
 from neeco.ingest.timing.reading import read_episodes
 
 SIZE = (64, 48)  # px
@@ -159,25 +156,6 @@ def test_bags_of_other_robots_offer_what_was_measured(tmp_path: Path) -> None:
     assert [item["name"] for item in document["instruments"]] == ["tool_left", "tool_right"]
     assert list(document["instruments"][1]["joints"]) == ["grip"]
     assert "joints" not in document["instruments"][0]
-
-
-def test_a_folder_with_a_bag_and_other_files_is_looked_through(tmp_path: Path) -> None:
-    for number, kind in enumerate(("first.bag", "second-db3"), 1):
-        with BagWriter(tmp_path, kind) as bag:
-            write_tool(bag, [f"/tool{number}/pose"])
-    (tmp_path / "notes.csv").write_text("t_s,x_mm\n1,2\n")
-    document = yaml.safe_load(write_template(tmp_path))
-    assert {item["poses"]["file"] for item in document["instruments"]} == {"first.bag", "second-db3"}
-
-
-def test_a_bag_alone_is_enough_where_it_holds_one_of_each(tmp_path: Path) -> None:
-    with BagWriter(tmp_path, "recording-db3") as bag:
-        write_tool(bag)
-    (recording,) = sources_of(IngestRequest(video=bag.path, instrument=bag.path), Path("out"))[1]
-    data = read_episodes([recording])
-    states, usable = data.with_assumed_clocks().states_at(data.times)
-    assert usable.all()
-    np.testing.assert_allclose(states["instrument"][0][20, :3, 3], 1000 * shaft(0.8), atol=0.01)
 
 
 def test_names_in_a_bag_are_names_and_no_more(tmp_path: Path) -> None:
@@ -312,13 +290,6 @@ def test_chunks_that_unpack_without_measure_are_refused(tmp_path, monkeypatch):
                 bag.pose("/dvrk/PSM1/measured_cp", float(time), [0, 0, 0], [1, 0, 0, 0])
                 bag.image(LEFT, float(time), np.zeros((200, 200, 3), np.uint8), "rgb8")
         assert "a chunk of its messages" in refusal(lambda bag=bag: known(bag.path).open_images(bag.path))
-
-
-def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further() -> None:
-    assert _bagfile.unpack(bz2.compress(bytes(1000)), "bz2", 1000) == bytes(1000)
-    for data in (bz2.compress(bytes(1001)), bz2.compress(bytes(900))[:-5], b"BZh"):
-        with pytest.raises((OSError, _bagfile.ReaderError)):
-            _bagfile.unpack(data, "bz2", 1000)
 
 
 def test_definitions_in_a_bag_are_never_executed(tmp_path: Path, bags: dict[str, Path]) -> None:
