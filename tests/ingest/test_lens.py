@@ -152,12 +152,6 @@ def test_nine_numbers_are_a_camera_matrix(world, name, text):
     assert read_lens(world.text(text, name)) == Lens(300.5, 301.5, 160.0, 120.0)
 
 
-def test_a_field_of_view_is_a_focal_length(world):
-    lens = read_lens(world.text(json.dumps({"camera_angle_x": np.pi / 2, "w": 200, "h": 100}), "transforms.json"))
-    assert lens is not None
-    assert (lens.fl_x, lens.cx, lens.cy) == (pytest.approx(100), 100, 50)
-
-
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [

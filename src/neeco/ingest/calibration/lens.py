@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -66,10 +65,6 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
     if not isinstance(document, dict):
         raise NeecoError(f"{path}: expected an object with fl_x, fl_y, cx, cy")
     size = image_size(path, document.get("w"), document.get("h"))
-    if "fl_x" not in document and size and isinstance(document.get("camera_angle_x"), int | float):
-        angle = float(document["camera_angle_x"])
-        focal = size[0] / 2 / math.tan(angle / 2) if angle else math.nan
-        document = {"fl_x": focal, "fl_y": focal, "cx": size[0] / 2, "cy": size[1] / 2} | document
     missing = [key for key in ("fl_x", "cx", "cy") if key not in document]
     if missing:
         raise NeecoError(f"{path}: {missing[0]}: missing; give fl_x, fl_y, cx, cy (and k1, k2, p1, p2 if distorted)")

@@ -12,8 +12,8 @@ from neeco.base.settings import Fault, faults_in, join_places, printable, read
 from neeco.capture.documents import Node, as_float
 from neeco.capture.model import SEPARATE_TISSUES
 from neeco.ingest.readers import format_of
-from neeco.ingest.readers.columns import VIDEO_CLOCK
-from neeco.ingest.recording.model import Recording, RecordingKeys, with_clock_of
+from neeco.ingest.readers.columns import TRACKER_CLOCK, VIDEO_CLOCK
+from neeco.ingest.recording.model import Recording, RecordingKeys, with_clock
 from neeco.ingest.recording.sections import MAX_NUMBER, existing_file
 
 
@@ -36,10 +36,11 @@ def recording_of(document: Any, path: Path) -> Recording:
     stated: RecordingKeys = read(RecordingKeys, Node(document, str(path)))
     names = [joint for item in stated.instruments for joint in item.joints]
     shared = [name for name in names if names.count(name) > 1]
+    scope = stated.laparoscope
     recording = replace(
         Recording(**vars(stated), path=path),
         instruments=tuple(item.completed(stated.file, stated, shared) for item in stated.instruments),
-        laparoscope=None if stated.laparoscope is None else with_clock_of(stated.laparoscope, stated.file),
+        laparoscope=None if scope is None else with_clock(scope, TRACKER_CLOCK, stated.file),
     )
     sync, notes = _sync(Node(stated.sync or None, str(path), "sync"), recording.clocks)
     reader = None if recording.file is None else format_of(recording.file)

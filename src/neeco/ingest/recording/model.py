@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -41,6 +41,7 @@ STILL, MOVING = "still", "moving"  # what `camera` may say of a scope
 MIN_FRAMES = 10  # from which cameras can be found
 MAX_SHAFT_MM = 40.0  # diameter
 MAX_EPISODES = 500  # of one capture
+Log = TypeVar("Log", PoseColumns, JointColumns)
 
 
 @dataclass(frozen=True)
@@ -142,18 +143,12 @@ class InstrumentLogs(StatedBases):
     def completed(self, file: Path | None, stated: StatedBases, shared: Sequence[str]) -> InstrumentLogs:
         """Return it with the clocks and the base that nothing states. file: of the images; stated: the base of all
         instruments that state none; shared: joints that several have."""
-
-        def with_clock(log: JointColumns, own: str) -> JointColumns:
-            """In the file of the poses, or of the images, it shares their clock."""
-            clock = poses.clock if poses is not None and log.path == poses.path else own
-            return replace(log, clock=log.clock or (VIDEO_CLOCK if clock == own and log.path == file else clock))
-
-        poses = None if self.poses is None else with_clock_of(self.poses, file)
+        poses = None if self.poses is None else with_clock(self.poses, TRACKER_CLOCK, file)
         joints = {
-            joint: with_clock(log, f"{self.name}.{joint}" if joint in shared else joint)
+            joint: with_clock(log, f"{self.name}.{joint}" if joint in shared else joint, file, poses)
             for joint, log in self.joints.items()
         }
-        roll = None if self.roll is None else with_clock(self.roll, "roll")
+        roll = None if self.roll is None else with_clock(self.roll, "roll", file, poses)
         bases = StatedBases() if poses is None or poses.frame in CAMERA_FRAMES else self if self.base else stated
         return replace(
             self, poses=poses, joints=joints, roll=roll, camera_from_base=bases.camera_from_base,
@@ -161,9 +156,11 @@ class InstrumentLogs(StatedBases):
         )  # fmt: skip
 
 
-def with_clock_of(log: PoseColumns, file: Path | None) -> PoseColumns:
-    """Return a log with its clock; in the file of the images, it shares theirs."""
-    return replace(log, clock=log.clock or (VIDEO_CLOCK if log.path == file else TRACKER_CLOCK))
+def with_clock(log: Log, own: str, file: Path | None, poses: PoseColumns | None = None) -> Log:
+    """Return a log with its clock, where nothing states one: that of the poses or the images (`file`) in whose file it
+    is, else its own."""
+    theirs = poses.clock if poses is not None and log.path == poses.path else VIDEO_CLOCK if log.path == file else own
+    return replace(log, clock=log.clock or theirs)
 
 
 def _episode_names(node: Node) -> tuple[str, ...]:

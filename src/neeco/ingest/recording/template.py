@@ -43,7 +43,6 @@ from neeco.ingest.recording.model import STILL, ImageFolder, VideoFile
 
 StandsStill = Callable[[VideoSource], bool]  # does a scope stand still, by its images?
 _EPISODES = re.compile(r"episodes (\d+) to (\d+)")
-_LEFT = re.compile("left", re.IGNORECASE)
 _NO_NAME = re.compile(r"[^A-Za-z0-9_]+")
 _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)", re.IGNORECASE)
 
@@ -342,36 +341,32 @@ def _second_camera(
 ) -> tuple[str | None, str, str]:
     """Return the line of the right camera's images, the line `stereo: …` where a calibration states both cameras, else
     the reason why it does not."""
-    namesake = _LEFT.sub(
-        lambda word: "RIGHT" if word[0].isupper() else "Right" if word[0][0].isupper() else "right",
-        left.stream or left.name,
-    )
-    tries: list[tuple[str, str, Callable[[], Any]]] = []  # line, source of the calibration, reader
+    namesake = left.stream or left.name
+    for one, other in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
+        namesake = namesake.replace(one, other)
     reader = None if left.stream is None else format_of(left.file)
+    tries: list[tuple[str, Callable[[], Any]]] = []  # source of the calibration, reader
     if reader is None or left.stream is None:
         line = next((item.line for item in others if item.name == namesake), None)
         folder = left.file.parents[left.name.count("/")]
-        tries = [(line, name, partial(read_stereo, folder / name)) for name in calibrations if line]
+        tries = [(name, partial(read_stereo, folder / name)) for name in calibrations if line]
     else:
-        streams = [item for item in reader.streams(left.file) if item.kind == Kind.IMAGES and not item.problem]
-        names = [item.name for item in streams if item.count and item.name != left.stream]
-        lines = {name: left.line.replace(left.stream, name) for name in names}
-        line = lines.get(namesake)
-        for name in sorted(names, key=lambda name: name != namesake):
-            tries.append((lines[name], "", partial(reader.stereo, left.file, left.stream, name)))
+        streams = [item.name for item in reader.streams(left.file) if item.count and not item.problem]
+        is_there = namesake != left.stream and namesake in streams
+        line = left.line.replace(left.stream, namesake) if is_there else None
+        tries = [("", partial(reader.stereo, left.file, left.stream, namesake))] if is_there else []
     problem = ""
-    for images, calibration, read in tries:
+    for calibration, read in tries:
         try:
             lenses = read()
         except NeecoError as error:
-            if not calibration and images == line:
-                problem = " ".join(str(error).removeprefix(f"{left.file}: ").split())
+            problem = "" if calibration else " ".join(str(error).removeprefix(f"{left.file}: ").split())
             continue
         if lenses is not None:
-            keys = f"{images}, calibration: {calibration}" if calibration else images
+            keys = f"{line}, calibration: {calibration}" if calibration else line
             apart = float(np.linalg.norm(lenses[2][:3, 3]))
             states = f"{calibration or left.name} states both lenses, {apart:.2f} mm apart"
-            return images, f"stereo: {{{keys}}}   # {states}", ""
+            return line, f"stereo: {{{keys}}}   # {states}", ""
     return line, "", problem
 
 
