@@ -109,7 +109,7 @@ def test_a_calibration_of_another_scope_than_the_bags_own_is_doubted(tmp_path: P
         with BagWriter(tmp_path, "other.bag") as bag:
             for side, baseline in (("left", 0.0), ("right", 0.008)):
                 lens = (focal, focal, *INTRINSICS[2:])
-                bag.camera_info(f"/scope/{side}/camera_info", 0.0, (WIDTH, HEIGHT), lens, baseline=baseline)
+                bag.camera_info(f"/stereo/{side}/camera_info", 0.0, (WIDTH, HEIGHT), lens, baseline=baseline)
         stated = re.sub(r"^(stereo: \{.*\})\}", r"\1, calibration: other.bag}", text, flags=re.MULTILINE)
         (tmp_path / "recording.yaml").write_text(stated)
         recording = read_recording(tmp_path / "recording.yaml")

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers import format_of, lerobot, lerobot_files, read_table
+from neeco.ingest.readers import format_of, lerobot_files, read_table
 from neeco.ingest.readers.columns import CAMERA as CAMERA_FRAME
 from neeco.ingest.readers.columns import PoseColumns, Units
 from neeco.ingest.readers.lerobot_files import LeRobotLimits
@@ -94,25 +94,13 @@ def test_an_episode_has_its_own_images_at_the_times_of_its_states(plain, number)
     assert all(abs(int(pixels[2, 2, 0]) - 20 - 15 * number) <= 3 for _, pixels in shown)  # the episode's grey
 
 
-@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
-def test_images_in_parquet_are_read_as_they_are(tmp_path, version):
-    path = data_set(tmp_path, version=version, embedded=True)
-    video = format_of(path).open_images(path, f"episode 1/{CAMERA}")
-    assert (video.size, len(video.times)) == ((64, 48), LENGTHS[1])
-    shown = list(video.read([29, 3]))
-    assert [(index, left_edge(pixels), int(pixels[2, 2, 0])) for index, pixels in shown] == [(3, 3, 35), (29, 29, 35)]
-
-
-def test_images_larger_than_memory_should_hold_and_columns_without_images_are_refused(tmp_path, monkeypatch):
+def test_images_that_stand_in_the_table_are_refused(tmp_path):
     path = data_set(tmp_path, version="v2.1", embedded=True)
-    file = path / "data/chunk-000/episode_000001.parquet"
-    table = pyarrow.parquet.read_table(file)
-    names = pyarrow.array(["a.png"] * len(table))
-    pyarrow.parquet.write_table(table.set_column(table.column_names.index(CAMERA), CAMERA, names), file)
-    assert "row 0 of episode 1: has no image in it" in refusal(path, f"episode 1/{CAMERA}", images=True)
-    monkeypatch.setattr(lerobot, "LIMITS", LeRobotLimits(pixels=64 * 48 - 1))
     said = refusal(path, f"episode 0/{CAMERA}", images=True)
-    assert "row 0 of episode 0: has 64x48 pixels; make it smaller" in said
+    assert f"episode 0/{CAMERA}: stands in the table, image by image, which is not read; write the data set" in said
+    with pytest.raises(NeecoError, match=r"holds no images that can be read: .*stands in the table"):
+        write_template(path)
+    assert len(read(path, f"episode 0/{STATE}").rows) == LENGTHS[0]
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,7 @@ def test_inits_lines_on_a_still_scope_and_its_second_camera_are_right_once_they_
     assert recording.camera == "still"
     assert recording.file == world.folder / "left.mp4"
     assert recording.stereo.file == world.folder / "right.mp4"
-    assert recording.stereo.calibration.file == world.folder / "stereo.yaml"
+    assert recording.stereo.calibration == world.folder / "stereo.yaml"
 
 
 def test_init_of_images_alone(world):

@@ -404,15 +404,6 @@ def test_the_right_cameras_camera_info_gives_its_pose_to_the_left_one(tmp_path, 
     np.testing.assert_allclose(seen, of_left @ point - [5.5, 0, 0], atol=1e-9)
 
 
-def test_another_recordings_bag_gives_its_only_pair_of_cameras(tmp_path: Path) -> None:
-    path = write_stereo(tmp_path)
-    of_these = known(path).stereo(path, "/stereo/left/image_raw", "/stereo/right/image_raw")
-    of_others = known(path).stereo(path, "/endoscope/l/image_raw", "/endoscope/r/image_raw")
-    assert of_these is not None
-    assert of_others is not None
-    np.testing.assert_array_equal(of_these[2], of_others[2])
-
-
 def test_cameras_calibrated_one_by_one_are_no_stereo_scope(tmp_path: Path) -> None:
     path = write_stereo(tmp_path, baseline=0.0)
     said = refusal(lambda: known(path).stereo(path, "/stereo/left/image_raw", "/stereo/right/image_raw"))

@@ -130,9 +130,9 @@ def read_cells(path: Path) -> Cells:
         raise NeecoError(f"{path}: most lines are much shorter than the longest one; expected the rows of one table")
     commas = sign in ";\t"  # of decimals
     cells = np.full((len(rows), width), "", object)
-    for line, row in zip(cells, rows, strict=True):
+    for filled, row in zip(cells, rows, strict=True):
         stripped = (cell.strip(' \t"') for cell in row)
-        line[: len(row)] = [
+        filled[: len(row)] = [
             cell.replace(",", ".") if commas and _DECIMAL_COMMA.fullmatch(cell) else cell for cell in stripped
         ]
     return Cells(cells, np.array([number for number, _ in texts]), counts, comment)

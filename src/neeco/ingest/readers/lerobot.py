@@ -8,26 +8,23 @@ a quaternion or the frame that poses are stated in; where the columns' names do 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from io import BytesIO
-from itertools import chain
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
-from neeco.capture.images import FORMATS
-from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, one_line
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.frame_names import NamedFrame, camera_order, meaning_in, of_dvrk, unsaid, without_frame
-from neeco.ingest.readers.lerobot_files import FIXED, LIMITS, DataSet, Episode, Feature, batches, read_data_set
+from neeco.ingest.readers.lerobot_files import FIXED, LIMITS, DataSet, Episode, Feature, read_data_set
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
 TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
+STORED = "stands in the table, image by image, which is not read; write the data set with videos"
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*/\s*(\S+)\s*", re.IGNORECASE)
 
 
@@ -46,7 +43,7 @@ class LeRobot(RecordingFormat):
         """Return those of the first episode that was downloaded; all others have the same."""
         data = self._data_set(path)
         episode, images, tables = data.first_present(), list[Stream](), list[Stream]()
-        absent = data.absent(episode)
+        absent = data.absent(episode) | {key: STORED for key, each in data.features.items() if each.dtype == "image"}
         for key, feature in data.features.items():
             kind, title = _kind(feature), f"{feature.dtype} of {'x'.join(map(str, feature.shape))}"
             stream = Stream(f"episode {episode.number}/{key}", kind, title, episode.length, data.fps)
@@ -77,12 +74,7 @@ class LeRobot(RecordingFormat):
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         data = self._data_set(path)
         episode, key = self._chosen(data, stream, Kind.IMAGES)
-        times, order, places, notes = _times(data, episode)
-        if data.features[key].dtype == "image":
-            rows = tuple(order.tolist())
-            stored = _Stored(episode.data, (0, 0), notes, times, key=key, episode=episode.number, rows=rows)
-            height, width = next(stored.read([0]))[1].shape[:2]
-            return replace(stored, size=(width, height))
+        times, _, places, notes = _times(data, episode)
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
         film, part = episode.films[key]
@@ -124,7 +116,12 @@ class LeRobot(RecordingFormat):
         match = _NAME.fullmatch(stream or "")
         number = int(match[1]) if match else min(data.records)
         wanted = f"episode {number}/{match[2]}" if match else stream
-        streams = [Stream(f"episode {number}/{key}", _kind(each), each.dtype, 0) for key, each in data.features.items()]
+        streams = [
+            Stream(
+                f"episode {number}/{key}", _kind(each), each.dtype, 0, problem=STORED if each.dtype == "image" else None
+            )
+            for key, each in data.features.items()
+        ]
         if stream is None and len(data.records) > 1:
             examples = ", ".join(candidate.name for candidate in streams if candidate.kind in kinds)[:300]
             what = f"missing, and there are {data.range_words}; name one, as in {examples}"
@@ -153,42 +150,6 @@ def _bodies(feature: Feature, stream: Stream) -> list[Stream]:
             )
         )  # fmt: skip
     return streams or [plain]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Stored(VideoSource):
-    """Images that stand in the Parquet file, as PNG or JPEG. rows: of the episode, in its file, of each image; size:
-    (0, 0) until the first was read."""
-
-    key: str
-    episode: int
-    rows: tuple[int, ...]
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        wanted = {self.rows[int(index)]: int(index) for index in indices}
-        parts = batches(self.path, ["episode_index", self.key], self.episode, LIMITS.images_at_once)
-        for row, cell in enumerate(chain.from_iterable(part.column(self.key).to_pylist() for part in parts)):
-            if row in wanted:
-                yield wanted.pop(row), self._decoded(row, cell.get("bytes") if isinstance(cell, dict) else cell)
-            if not wanted:
-                return
-        raise NeecoError(f"{self.path}: {self.key}: holds fewer images than states; download the data set again")
-
-    def _decoded(self, row: int, cell: object) -> np.ndarray:
-        where = f"{self.path}: {self.key}: row {row} of episode {self.episode}"
-        if not isinstance(cell, bytes):
-            raise NeecoError(
-                f"{where}: has no image in it; write the data set with its images, or name another feature"
-            )
-        with one_line(where, "cannot be decoded", "download the episode again"):
-            image = Image.open(BytesIO(cell), formats=FORMATS)
-            if image.size[0] * image.size[1] > LIMITS.pixels:
-                raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
-            pixels = np.array(image.convert("RGB"))
-        if self.size not in ((0, 0), pixels.shape[1::-1]):
-            height, width = pixels.shape[:2]
-            raise NeecoError(f"{where}: is {width}x{height}, the first {self.size[0]}x{self.size[1]}; repair it")
-        return pixels
 
 
 def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:

@@ -34,9 +34,6 @@ class LeRobotLimits:
 
     numbers: int = 4096  # limit on the numbers of one feature in a row; more are an image or a point cloud
     group_bytes: int = 1 << 30  # limit on the unpacked bytes of the columns read of a row group
-    buffer_bytes: int = 1 << 20  # bytes of a column read at a time
-    pixels: int = 90_000_000  # limit on the pixels of an image, as for files of images
-    images_at_once: int = 16  # images decoded at once, where Parquet holds them
     film_images: int = 10**7  # limit on the images of a video; larger timestamps are a clock's
 
 
@@ -244,47 +241,37 @@ def parquet_names(path: Path) -> list[str]:
 def read_columns(path: Path, widths: Mapping[str, int], episode: int | None = None) -> dict[str, np.ndarray]:
     """Return columns of numbers, or of lists of them, as float64 [R, C], NaN of what is null, only of the rows of an
     episode where one is given. widths: how many numbers a row of each has. Raises NeecoError."""
-    parts = [part for part in batches(path, list(widths), episode) if len(part)]
-    table = {}
-    for name, width in widths.items():
-        values = [np.zeros((0, width))]
-        for part in parts:
-            try:
-                numbers = np.array(part.column(name).to_pylist())
-                numbers = numbers.astype(np.str_ if numbers.dtype.kind in "SU" else np.float64).reshape(len(part), -1)
-            except (ValueError, TypeError):  # rows of several lengths, or no numbers
-                numbers = np.array([[""]])
-            if numbers.dtype.kind == "U":
-                kind = part.column(name).type
-                raise NeecoError(f"{path}: {name}: holds {kind}, no numbers, as many in each row; name another")
-            if numbers.shape[1] != width:
-                problem = f"has {numbers.shape[1]} numbers a row, not {width}"
-                raise NeecoError(f"{path}: {name}: {problem}; download the data set again")
-            values.append(numbers)
-        table[name] = np.concatenate(values)
-    return table
-
-
-def batches(path: Path, columns: Sequence[str], episode: int | None, rows: int = 2**16) -> Iterator[Any]:
-    """Yield columns as pyarrow's record batches of at most so many rows. Raises NeecoError."""
     import pyarrow.dataset
 
     file = _fragment(path)
-    if absent := [name for name in columns if name not in file.physical_schema.names]:
+    if absent := [name for name in widths if name not in file.physical_schema.names]:
         listed = printable(", ".join(file.physical_schema.names), 300).strip("'")
         raise NeecoError(f"{path}: has no column {printable(absent[0])}; its columns are {listed}")
     wanted = None if episode is None else pyarrow.dataset.field("episode_index") == episode
     with one_line(path, *_DAMAGE):
         part = file if wanted is None else file.subset(filter=wanted)  # by the statistics of its row groups
-        leaves = tuple(f"{name}." for name in columns)
+        leaves = tuple(f"{name}." for name in widths)
         for group in part.row_groups:
             data = file.metadata.row_group(group.id).to_dict()["columns"]
             read = [chunk for chunk in data if f"{chunk['path_in_schema']}.".startswith(leaves)]
             if sum(chunk["total_uncompressed_size"] for chunk in read) > LIMITS.group_bytes:
                 raise NeecoError(f"{path}: unpacks to over {LIMITS.group_bytes >> 20} MiB; write smaller row groups")
-        yield from part.to_batches(
-            columns=list(columns), filter=wanted, batch_size=rows, batch_readahead=0, use_threads=False
-        )
+        table = part.to_table(columns=list(widths), filter=wanted, use_threads=False)
+    columns = {}
+    for name, width in widths.items():
+        try:
+            numbers = np.array(table.column(name).to_pylist() or np.zeros((0, width)))
+            numbers = numbers.astype(np.str_ if numbers.dtype.kind in "SU" else np.float64)
+        except (ValueError, TypeError):  # rows of several lengths, or no numbers
+            numbers = np.array("")
+        if numbers.dtype.kind == "U":
+            kind = table.column(name).type
+            raise NeecoError(f"{path}: {name}: holds {kind}, no numbers, as many in each row; name another")
+        columns[name] = numbers.reshape(len(table), math.prod(numbers.shape[1:]))
+        if columns[name].shape[1] != width:
+            problem = f"has {columns[name].shape[1]} numbers a row, not {width}"
+            raise NeecoError(f"{path}: {name}: {problem}; download the data set again")
+    return columns
 
 
 def _fragment(path: Path) -> Any:
@@ -293,10 +280,7 @@ def _fragment(path: Path) -> Any:
 
     require_content(path)
     with one_line(path, *_DAMAGE):
-        # a buffer: else all of a column is taken into memory, and images can stand in it
-        options = pyarrow.dataset.ParquetFragmentScanOptions(use_buffered_stream=True, buffer_size=LIMITS.buffer_bytes)
-        kind = pyarrow.dataset.ParquetFileFormat(default_fragment_scan_options=options)
-        fragment = kind.make_fragment(str(path), pyarrow.fs.LocalFileSystem())
+        fragment = pyarrow.dataset.ParquetFileFormat().make_fragment(str(path), pyarrow.fs.LocalFileSystem())
         fragment.physical_schema  # noqa: B018  # which reads the file's own description
         return fragment
 

@@ -94,13 +94,13 @@ class RosBag(RecordingFormat):
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         survey = self._survey(path)
         chosen = stream if stream else self.choose(path, None, Kind.IMAGES).name
-        camera = _camera(survey, _info_topic(survey, chosen, of_right=False), chosen)
+        camera = _camera(survey, _info_topic(chosen), chosen)
         return None if camera is None else camera.lens()
 
     def stereo(self, path: Path, left: str | None, right: str | None) -> tuple[Lens, Lens, np.ndarray] | None:
         survey, cameras = self._survey(path), []
-        for stream, of_right in ((left, False), (right, True)):
-            topic = _info_topic(survey, stream, of_right)
+        for stream in (left, right):
+            topic = _info_topic(stream)
             camera = _camera(survey, topic, stream or "")
             if camera is None:
                 what = f"{topic}: is not calibrated" if topic in survey.lenses else f"holds no {topic or 'camera_info'}"
@@ -176,15 +176,9 @@ def _meaning(survey: Survey, name: str) -> NamedFrame:
     return meaning_of(next(iter(frames)), _image_frames(survey), dvrk=of_dvrk(name))
 
 
-def _info_topic(survey: Survey, stream: str | None, of_right: bool) -> str | None:
-    """Return the topic of the camera_info of a stream of images, which is in their namespace; of another bag's stream,
-    whose topic is not in this one, that of its only right camera (with a baseline) or left one."""
-    plain = (stream or "").removesuffix("/compressed")
-    topic = f"{plain.rpartition('/')[0]}/camera_info" if stream else None
-    if topic in survey.lenses or stream in survey.images:
-        return topic
-    sided = [name for name, (_, numbers) in survey.lenses.items() if bool(numbers["P"][3]) == of_right]
-    return sided[0] if len(sided) == 1 else topic
+def _info_topic(stream: str | None) -> str | None:
+    """Return the topic of the camera_info of a stream of images, which is in their namespace."""
+    return f"{stream.removesuffix('/compressed').rpartition('/')[0]}/camera_info" if stream else None
 
 
 def _camera(survey: Survey, topic: str | None, stream: str) -> RosCamera | None:

@@ -232,21 +232,12 @@ class CameraFrames:
         return None if self.video is None else self.video.stream
 
 
-@dataclass(frozen=True)
-class CalibrationFile:
-    """A calibration of two cameras, or a recording that holds one. stream: whose camera is the right one."""
-
-    shorthand: ClassVar[str] = "file"
-    file: File
-    stream: Name | None = None
-
-
 @dataclass(frozen=True, kw_only=True)
 class StereoPartner(CameraFrames):
     """The right camera of a stereo scope: its frames, and what states its pose to the left one (None: the file of the
     frames does)."""
 
-    calibration: CalibrationFile | None = None
+    calibration: File | None = None
 
 
 def _intrinsics(node: Node) -> Path | tuple[float, ...]:
@@ -337,13 +328,12 @@ class Recording(RecordingKeys):
         """Return the lenses of the two cameras, right_from_left [4, 4] mm, and the file that states them. Raises
         NeecoError."""
         assert self.stereo is not None
-        stated = self.stereo.calibration
-        file = stated.file if stated is not None else self.stereo.file
+        file = self.stereo.calibration or self.stereo.file
         assert file is not None
         reader = _streams_of(file)
         if reader is None:
             return *read_stereo(file), file
-        calibration = reader.stereo(file, self.stream, (stated and stated.stream) or self.stereo.stream)
+        calibration = reader.stereo(file, self.stream, self.stereo.stream)
         if calibration is None:
             raise NeecoError(f"{file}: {reader.format}: states no stereo calibration; give one as stereo.calibration")
         return *calibration, file
