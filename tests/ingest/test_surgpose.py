@@ -13,6 +13,7 @@ from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
+from neeco.ingest.timing.reading import read_episodes
 from tests.ingest.test_stereofile import LEFT, RIGHT, ini
 
 COUNT = 30
@@ -90,8 +91,9 @@ def test_a_template_of_the_folder_is_complete(world, trajectory):
 
 def test_a_video_of_another_length_is_refused(world, trajectory):
     world.video("000003/regular/left_video.mp4", 12, lambda i: round(i * 1000 / 30))
+    recording = read_recording(world.text(write_template(trajectory), "recording.yaml"))
     with pytest.raises(NeecoError, match=r"left_video.mp4: has 12 images for 30 states at 30 a second; they do not"):
-        format_of(trajectory).open_images(trajectory, "regular/left_video.mp4")
+        read_episodes([recording])
 
 
 @pytest.mark.parametrize(

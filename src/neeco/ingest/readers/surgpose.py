@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from neeco.base.files import FastYamlLoader, parse_yaml, read_text, visible_entr
 from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.stereo import read_stereo
-from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_lengths, read_once
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, read_once
 from neeco.ingest.readers.rosbag import DVRK_HINT
 from neeco.ingest.readers.rows import SETTINGS as ROWS
 from neeco.ingest.readers.video import open_video
@@ -72,14 +71,13 @@ class SurgPose(RecordingFormat):
             header = ("t_s", *JOINT_NAMES[: values.shape[1]])
         rows = np.column_stack([frames / FRAMES_PER_SECOND, values])
         stated_in = f"{chosen.name}_base" if chosen.kind == Kind.POSES else None
-        return Table(path, header, rows, frames, stream=chosen.name, record="frame", stated_in=stated_in)
+        return Table(
+            path, header, rows, frames, stream=chosen.name, record="frame", stated_in=stated_in,
+            image_hz=FRAMES_PER_SECOND,
+        )  # fmt: skip
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
-        name = self.choose(path, stream, Kind.IMAGES).name
-        file, video = path / name, open_video(path / name)
-        states = max(int(frames[-1]) + 1 for frames, _ in _read(path)[0].values())
-        notes = compare_lengths(file, video, states, FRAMES_PER_SECOND)
-        return replace(video, notes=(*video.notes, *notes))
+        return open_video(path / self.choose(path, stream, Kind.IMAGES).name)
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         name = self.choose(path, stream, Kind.IMAGES).name
@@ -95,7 +93,7 @@ class SurgPose(RecordingFormat):
 
 def _videos(path: Path) -> list[str]:
     """Videos, the left one in usual light first."""
-    found = [file.relative_to(path).as_posix() for file in sorted(path.glob("**/*_video.mp4"))]
+    found = [file.relative_to(path).as_posix() for file in visible_entries(path, "**/*_video.mp4")]
     return sorted(found, key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
 
 

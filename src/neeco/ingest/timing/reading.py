@@ -198,11 +198,12 @@ def _length_notes(recording: Recording, video: VideoSource, logs: Sequence[PoseL
     notes: list[str] = []
     times = video.times
     for log in logs:
-        if log.clock != VIDEO_CLOCK or log.path == recording.file:
+        if log.clock != VIDEO_CLOCK:
             continue
         if log.image_hz is not None:
             rows = round(float(log.times[-1]) * log.image_hz) + 1
             notes += compare_lengths(video.path, video, rows, log.image_hz)
+        if log.image_hz is not None or log.path == recording.file:
             continue
         beyond = max(0.0, log.times[-1] - times[-1]) + max(0.0, times[0] - log.times[0])
         if beyond > MAX_UNLIKE * (times[-1] - times[0]):
