@@ -77,11 +77,8 @@ class RosBag(RecordingFormat):
         if len(poses.frames) > 1:
             listed = ", ".join(sorted(poses.frames)[:4])
             raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
-        stated_in, table = (
-            next(iter(poses.frames), None) or None,
-            survey.table(chosen, poses, POSE_HEADER, poses.table()),
-        )
-        return replace(table, stated_in=stated_in, meaning=_meaning(survey, chosen))
+        table = survey.table(chosen, poses, POSE_HEADER, poses.table())
+        return replace(table, stated_in=next(iter(poses.frames), None) or None, meaning=_meaning(survey, chosen))
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         from neeco.ingest.readers._bagfile import open_topic
