@@ -117,17 +117,19 @@ class _Series:
         share = np.where(span > 0, (times - self.times[left]) / np.where(span > 0, span, 1), 0.0)
         if not len(times):
             return np.zeros((0, self.values.shape[1]))
-        result = np.asarray(self.values[left] + share[:, None] * (self.values[right] - self.values[left]))
+        start = self.values[left]  # of which differences are fitted: what never changes stays to the last digit
+        result = np.asarray(start + share[:, None] * (self.values[right] - start))
         if width == 0:
             outer = np.stack([left - 1, left, right, right + 1], axis=-1)  # [N, 4]
             rows = np.flatnonzero((left < right) & (outer[:, 0] >= self.first[left]) & (outer[:, 3] < self.last[left]))
             if len(rows):
                 weights = _lagrange(self.times[outer[rows]], times[rows])[..., None]
-                result[rows] = (self.values[outer[rows]] * weights).sum(1)
+                result[rows] = start[rows] + ((self.values[outer[rows]] - start[rows, None]) * weights).sum(1)
         else:
             noise = _noise(self.values)
             for rows, index, used, offsets in self._windows(times, width, leave_out):
-                result[rows] = _local_polynomial(offsets, used, self.values[index], noise)
+                around = self.values[index] - start[rows, None]
+                result[rows] = start[rows] + _local_polynomial(offsets, used, around, noise)
         return result
 
     def best_width(self) -> float:
