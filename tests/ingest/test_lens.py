@@ -156,6 +156,7 @@ def test_nine_numbers_are_a_camera_matrix(world, name, text):
     ("name", "text", "message"),
     [
         ("a.yaml", "x: [1, 2", "line 1: not valid YAML"),
+        ("a.yaml", "%YAML:1.0\n---\nCamera.fx: 1\nCamera.fx: 300\n", "Camera.fx"),
         ("a.yaml", "<?xml version='1.0'?>", "is XML"),
         ("a.yaml", "video: a.mp4\nintrinsics: [300, 300, 160, 120]", "camera_matrix: missing"),
         ("a.xml", "<opencv_storage><camera_matrix></opencv_storage>", "is XML that OpenCV cannot read"),

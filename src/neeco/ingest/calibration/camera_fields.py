@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import yaml
 
 from neeco.base.errors import NeecoError
-from neeco.base.files import YamlLoader, parse_yaml, read_json, read_text
+from neeco.base.files import parse_yaml, read_json, read_text
 from neeco.capture.documents import as_float, printable
 
 EXPECTED = "camera_matrix and distortion_coefficients, as OpenCV writes them"
@@ -54,22 +53,11 @@ class CameraNumbers:
     keys: Mapping[str, Any]
 
 
-class _Loader(YamlLoader):
-    """YAML with OpenCV's matrices."""
-
-
-for _tag in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(
-        f"tag:yaml.org,2002:{_tag}",
-        lambda loader, node: loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None,
-    )
-
-
 def read_calibration(path: Path) -> Any:
     """Return the document of a calibration file: JSON, YAML, or OpenCV's own dialects of YAML and XML.
 
-    YAML is read by PyYAML, which unlike cv2.FileStorage reads ROS's files and plain lists, and names a bad line; by
-    cv2.FileStorage what only OpenCV takes for YAML, as `data:[1, 2]` and `%PATH`. Raises NeecoError.
+    OpenCV's own (`%YAML:1.0`, XML) are read by cv2.FileStorage, others by PyYAML, which reads ROS's files and plain
+    lists, and names a bad line. Raises NeecoError.
     """
     if path.suffix.lower() == ".json":
         document = read_json(path)
@@ -83,19 +71,14 @@ def read_calibration(path: Path) -> Any:
         if parsed is None:
             raise NeecoError(f"{path}: is XML that OpenCV cannot read; save the calibration again")
         return parsed
+    if isinstance(document := _by_opencv(text), dict):
+        return document
     # `%YAML:1.0` is OpenCV's own spelling, which YAML itself does not allow
     lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
     begun = next((number for number, line in enumerate(lines) if re.match(r"\s*[^\s#-]", line)), 0)
     if "---" in lines[begun:]:  # as `rostopic echo` ends each message
         lines = lines[: lines.index("---", begun)]
-    try:
-        document = parse_yaml(path, "\n".join(lines), "save the calibration again", _Loader)
-    except NeecoError:
-        document = _by_opencv(text)
-        if document is None:
-            raise
-    if not isinstance(document, dict) and isinstance(again := _by_opencv(text), dict):
-        return again
+    document = parse_yaml(path, "\n".join(lines), "save the calibration again")
     return document if isinstance(document, dict) else _matrix_alone(text) or document
 
 
@@ -168,13 +151,16 @@ def _by_opencv(text: str) -> Any:
         return None
     try:
         return _value(storage.root()) if storage.isOpened() else None
+    except ValueError:  # a key stands there twice
+        return None
     finally:
         storage.release()
 
 
 def _value(node: Any) -> Any:
     if node.isMap():
-        return {name: _value(node.getNode(name)) for name in node.keys()}  # noqa: SIM118 - no mapping
+        names = node.keys()
+        return {name: _value(node.getNode(name)) for name, _ in zip(names, set(names), strict=True)}
     if node.isSeq():
         return [_value(node.at(index)) for index in range(node.size())]
     if node.isString():
