@@ -55,10 +55,13 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
         return checked_lens("intrinsics", [*source], (), None)
     require_file(source, "a calibration as YAML, XML or JSON")
     document = read_calibration(source)
-    of_nerfstudio = not isinstance(document, dict) or "fl_x" in document or not cameras_in(source, document)
-    if source.suffix.lower() == ".json" and of_nerfstudio:
+    cameras = () if isinstance(document, dict) and "fl_x" in document else cameras_in(source, document)
+    if source.suffix.lower() == ".json" and not cameras:
         return _nerfstudio(source, document)
-    return opencv_lens(source, document)
+    if not cameras:
+        what = "camera_matrix: missing" if isinstance(document, dict) else "no keys"
+        raise NeecoError(f"{source}: {what}; expected {EXPECTED}")
+    return lens_of(source, cameras[0])
 
 
 def _nerfstudio(path: Path, document: Any) -> Lens:
@@ -76,16 +79,6 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
         return replace(lens, distortion=opencv_distortion(stated.model, stated.coefficients, lens.intrinsics, size))
     except NeecoError as error:
         raise NeecoError(f"{path}: distortion: {error}") from None
-
-
-def opencv_lens(where: Path | str, document: Any) -> Lens:
-    """Return the lens of a calibration's camera, or of the left one of two; `where` begins messages. Raises
-    NeecoError."""
-    cameras = cameras_in(where, document)
-    if not cameras:
-        is_mapping = isinstance(document, dict)
-        raise NeecoError(f"{where}: {'camera_matrix: missing' if is_mapping else 'no keys'}; expected {EXPECTED}")
-    return lens_of(where, cameras[0])
 
 
 def lens_of(where: Path | str, camera: CameraNumbers) -> Lens:
