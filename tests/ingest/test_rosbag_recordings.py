@@ -95,7 +95,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
-@pytest.mark.parametrize(("kind", "names"), zip(KINDS, (NEW, OLD, NEW), strict=True))
+@pytest.mark.parametrize(("kind", "names"), list(zip(KINDS, (NEW, OLD, NEW), strict=True)))
 def test_a_dvrks_bag_becomes_a_recording_by_one_command(tmp_path, kind, names, capsys):
     with BagWriter(tmp_path, kind) as bag:
         write_dvrk(bag, names)
