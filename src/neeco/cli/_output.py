@@ -53,54 +53,37 @@ def whole_lines(*, stderr: bool = False) -> Console:
 
 
 def fitted(table: ResultTable, width: int) -> list[Table]:
-    """Split a table into as many pieces as a terminal of `width` characters needs; each has the key columns.
-
-    The best of a column and reference rows are bold; a failed row is marked in every piece.
-    """
+    """Split a table into as many pieces as a terminal of `width` characters needs; each has the key columns, and of a
+    failed row its first cell. The best of a column and reference rows are bold."""
     headings, keys = [*table.keys, *(column.title for column in table.columns)], len(table.keys)
     rows = []
     for row in table.rows:
         cells = [Text(str(cell), "bold" if cell.best or row.reference else "") for cell in row.cells]
-        cells_or_reason = cells if row.failed is None else [Text("failed", "red")]
-        rows.append([*(Text(key, "bold" if row.reference else "") for key in row.keys), *cells_or_reason])
-    return _pieces(table.title, headings, rows, keys, width)
-
-
-def _pieces(title: str, headings: Sequence[str], rows: Sequence[Sequence[Text]], keys: int, width: int) -> list[Table]:
-    """`fitted` of texts. A row of one cell behind its keys says the same in every piece."""
-    full = [[*row[:keys], *[row[keys]] * (len(headings) - keys)] if len(row) == keys + 1 else row for row in rows]
+        failed = [Text("failed", "red")] * len(table.columns)
+        rows.append(
+            [*(Text(key, "bold" if row.reference else "") for key in row.keys), *(failed if row.failed else cells)]
+        )
     widths = [
-        max([*map(len, heading.split()), *(len(row[index]) for row in full)], default=0)
-        for index, heading in enumerate(headings)
+        max([*map(len, heading.split()), *(len(row[at]) for row in rows)], default=0)
+        for at, heading in enumerate(headings)
     ]
-    left = width - 1 - sum(BORDER + widths[index] for index in range(keys))
-    groups: list[list[int]] = [[]]
-    for index in range(keys, len(headings)):
-        if groups[-1] and sum(BORDER + widths[i] for i in (*groups[-1], index)) > left:
-            groups.append([])
-        groups[-1].append(index)
-    return [
-        _piece(title if group is groups[0] else f"{title}, continued", headings, rows, keys, group, widths)
-        for group in groups
-    ]
-
-
-def _piece(
-    title: str,
-    headings: Sequence[str],
-    rows: Sequence[Sequence[Text]],
-    keys: int,
-    group: list[int],
-    widths: Sequence[int],
-) -> Table:
-    """The columns of `group` behind the key columns, each as wide as its longest word."""
-    whole = Text(title, "italic", no_wrap=True, overflow="ignore")
-    table = Table(*(Column(headings[i], no_wrap=True) for i in range(keys)), title=whole, title_justify="left")
-    for index in group:
-        table.add_column(headings[index], justify="right", width=widths[index])
-    for row in rows:
-        table.add_row(*row[:keys], *(row[keys:] if len(row) == keys + 1 else [row[i] for i in group]))
-    return table
+    pieces: list[list[int]] = []
+    for at in range(keys, len(headings)):
+        taken = [*range(keys), *(pieces[-1] if pieces else ()), at]
+        if not pieces or sum(BORDER + widths[index] for index in taken) >= width:
+            pieces.append([])
+        pieces[-1].append(at)
+    tables = []
+    for piece in pieces or [[]]:
+        title = f"{table.title}, continued" if tables else table.title
+        made = Table(title=Text(title, "italic", no_wrap=True, overflow="ignore"), title_justify="left")
+        for at in (*range(keys), *piece):
+            numbers = {"justify": "right", "width": widths[at]} if at >= keys else {"no_wrap": True}
+            made.add_column(headings[at], **numbers)
+        for row, cells in zip(table.rows, rows, strict=True):
+            made.add_row(*cells[:keys], *(cells[at] for at in (piece[:1] if row.failed else piece)))
+        tables.append(made)
+    return tables
 
 
 def print_outcome(
@@ -167,44 +150,45 @@ def ready_for_json(path: Path | None) -> Iterator[None]:
 DEFAULT = " Default: "  # begins the last sentence of an option's text, where its default is no value
 
 
-@cache
-def state_defaults(kind: Any) -> None:
-    """Make the help of a dataclass of arguments state what holds where an option without a value of its own is left
-    out: the text behind DEFAULT, in place of None."""
-    texts = field_texts(kind)
-    for field in dataclasses.fields(kind):
-        hint = typing.get_type_hints(kind, include_extras=True)[field.name]
-        bare = typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
-        markers = getattr(hint, "__metadata__", ())
-        if dataclasses.is_dataclass(bare):
-            state_defaults(bare)  # type: ignore[arg-type]
-            continue
-        if tyro.conf.Positional in markers and not any(getattr(marker, "metavar", None) for marker in markers):
-            name = f"[{field.name} ...]" if typing.get_origin(bare) is tuple else field.name
-            kind.__annotations__[field.name] = hint = Annotated[hint, tyro.conf.arg(metavar=name.upper())]
-        required = field.default is dataclasses.MISSING and typing.get_origin(bare) is tuple
-        empty = required or field.default in (None, ())
-        if empty and field.name in texts and tyro.conf.UseAppendAction not in markers:
-            text, _, default = texts[field.name].removesuffix(".").partition(DEFAULT)
-            end = f"(default: {default})" if default else "(required)" if required else "(optional)"
-            metavar = [] if tyro.conf.Positional in markers else [tyro.conf.arg(metavar=value_words(hint))]
-            changed = hint
-            for argument in (*metavar, tyro.conf.arg(help=text, help_behavior_hint=end)):
-                changed = Annotated[changed, argument]
-            kind.__annotations__[field.name] = changed
-
-
-def option_names(kind: Any) -> list[str]:
-    """Return the options of a dataclass of arguments, such as `--output`; nested ones add theirs."""
-    names = []
+def _options(kind: Any) -> Iterator[tuple[Any, dataclasses.Field[Any], Any, tuple[Any, ...]]]:
+    """Yield the options of a dataclass of arguments: owner, field, type and markers; nested ones add theirs."""
     hints = typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
         bare = typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
-        markers = getattr(hint, "__metadata__", ())
         if dataclasses.is_dataclass(bare):
-            names += option_names(bare)
-        elif tyro.conf.Positional not in markers:
+            yield from _options(bare)
+        else:
+            yield kind, field, bare, getattr(hint, "__metadata__", ())
+
+
+@cache
+def state_defaults(kind: Any) -> None:
+    """Make the help of a dataclass of arguments state what holds where an option without a value of its own is left
+    out: the text behind DEFAULT, in place of None."""
+    for owner, field, bare, markers in list(_options(kind)):
+        added = []
+        repeated, texts = typing.get_origin(bare) is tuple, field_texts(owner)
+        if tyro.conf.Positional in markers and not any(getattr(marker, "metavar", None) for marker in markers):
+            name = f"[{field.name} ...]" if repeated else field.name
+            added.append(tyro.conf.arg(metavar=name.upper()))
+        required = field.default is dataclasses.MISSING and repeated
+        empty = required or field.default in (None, ())
+        if empty and field.name in texts and tyro.conf.UseAppendAction not in markers:
+            text, _, default = texts[field.name].removesuffix(".").partition(DEFAULT)
+            end = f"(default: {default})" if default else "(required)" if required else "(optional)"
+            added += [] if tyro.conf.Positional in markers else [tyro.conf.arg(metavar=value_words(bare))]
+            added.append(tyro.conf.arg(help=text, help_behavior_hint=end))
+        for marker in (*markers, *added) if added else ():
+            bare = Annotated[bare, marker]
+            owner.__annotations__[field.name] = bare
+
+
+def option_names(kind: Any) -> list[str]:
+    """Return the options of a dataclass of arguments, such as `--output`."""
+    names = []
+    for _, field, _, markers in _options(kind):
+        if tyro.conf.Positional not in markers:
             name = next(filter(None, (getattr(marker, "name", None) for marker in markers)), field.name)
             names.append(f"--{'no-' if field.default is True else ''}{name.replace('_', '-')}")
     return names

@@ -14,7 +14,7 @@ from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts
 from neeco.report.charts import Series, legend, line_chart
 from neeco.report.page import REPORT_FILE, Figure, Images, Section, jpeg, split_counts, write_page
-from neeco.studies.downstream.experiment import DownstreamPlan, read_predictions
+from neeco.studies.downstream.experiment import DownstreamPlan, held_out_samples, read_predictions
 from neeco.studies.downstream.results import (
     MAIN,
     TITLES,
@@ -76,7 +76,7 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
     ]
     sections.append(Section(title="How it was made", facts=_facts(experiment, capture, computer)))
     return write_page(
-        plan.settings.output / REPORT_FILE,
+        plan.request.output / REPORT_FILE,
         "study.html",
         title=f"{capture.root.name}: what synthetic images are worth",
         name=capture.root.name,
@@ -116,8 +116,8 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
     key = "iou" if model["predicts"] == "masks" else "box_iou"
     predictions, scores = [], []
     for condition, real in arms:
-        wanted = (model["name"], condition, real, plan.settings.kept_fold)
-        predictions.append(read_predictions(plan.settings.job_folder(*wanted), test))
+        wanted = (model["name"], condition, real, plan.request.kept_fold)
+        predictions.append(read_predictions(plan.request.job_folder(*wanted), test))
         jobs = [job for job in experiment["jobs"] if tuple(job[name] for name in JOB_KEYS) == wanted]
         frames = jobs[0]["splits"].get(test, {}).get("per_frame", ()) if jobs else ()
         scores.append({frame["frame"]: frame[key] for frame in frames if frame[key] is not None})
@@ -125,7 +125,7 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
     ranked = sorted(
         (name for name in gains if all(name in each for each in predictions)), key=lambda name: -gains[name]
     )
-    samples = {sample.name: sample for sample in plan.settings.samples(plan.capture, test)}
+    samples = {sample.name: sample for sample in held_out_samples(plan.request, plan.capture, test)}
     sections = []
     for name in dict.fromkeys([*ranked[:2], *ranked[-2:]]):
         example = samples[name].load()

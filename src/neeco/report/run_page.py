@@ -24,6 +24,7 @@ from neeco.labels.drawing import draw
 from neeco.report.charts import CHARTS, Series, line_chart, short
 from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
 from neeco.scene import DrawableScene
+from neeco.studies.tables import UNKNOWN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +45,12 @@ class Score(NamedTuple):
 
     key: str
     heading: str
-    form: str
-    meaning: str
+    form: str = "{:.3f}"
+    meaning: str = ""
 
     def written(self, numbers: Mapping[str, Any]) -> str:
         """Its value among the numbers, as the table shows it."""
-        return "–" if numbers.get(self.key) is None else self.form.format(numbers[self.key])
+        return UNKNOWN if numbers.get(self.key) is None else self.form.format(numbers[self.key])
 
 
 IMAGE_SCORES = (
@@ -72,6 +73,7 @@ LABEL_SCORES = (
     Score("shaft_recall", "recall, shafts", "{:.3f}", "How much of the true shafts is labelled instrument."),
     Score("shadow_labelled", "shadow labelled", "{:.1%}", "How much of the instruments' shadow on tissue is labelled."),
 )  # fmt: skip
+SCORES = (*IMAGE_SCORES, *LABEL_SCORES)
 KINDS = {
     "given": "As given: rendered at the poses the capture states, tracker errors included",
     "aligned": "Aligned: instrument and camera pose fitted to each recorded image first, the scene unchanged",

@@ -15,6 +15,7 @@ from scipy.ndimage import find_objects
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes, read_json, read_json_lines, require_inside, require_like
+from neeco.base.settings import name_and_value
 from neeco.capture.checks.truth import PARTS_FILE
 from neeco.capture.images import image_files, image_size, read_image_bytes, read_labels
 from neeco.capture.model import Capture, Frame
@@ -195,6 +196,18 @@ class ImageSet:
     name: str
     path: Path
     count: int | None = None
+
+    @classmethod
+    def of(cls, word: str) -> ImageSet:
+        """Return that of NAME=DATASET or NAME=DATASET:COUNT; a folder whose name ends so is the folder. Raises
+        NeecoError."""
+        name, place = name_and_value("--sets", word, "kinematic=dataset")
+        folder, colon, count = place.rpartition(":")
+        if not colon or not count.isdecimal() or Path(place).exists():
+            return cls(name, Path(place))
+        if int(count) < 1:
+            raise NeecoError(f"--sets {word}: the number of images must be at least 1 (got {count})")
+        return cls(name, Path(folder), int(count))
 
     def file(self, *names: str) -> Path:
         """A file or folder of it. Raises NeecoError where a link leads out of it."""
