@@ -181,14 +181,12 @@ def _dispatch(words: list[str]) -> int:
         _print_error(f"{problem}; {hint}`neeco --help` lists all")
         raise SystemExit(USAGE)
     run, arguments = _verb(words)
-    from neeco.cli._output import number_values, usage_error
+    from neeco.cli._output import usage_error
 
     box = io.StringIO()  # tyro frames what is wrong
     try:
         with contextlib.redirect_stderr(box):
-            parsed = tyro.cli(
-                arguments, prog=f"neeco {words[0]}", args=words[1:], config=config, registry=number_values()
-            )
+            parsed = tyro.cli(arguments, prog=f"neeco {words[0]}", args=words[1:], config=config)
     except SystemExit as end:
         if end.code:
             _print_error(usage_error(box.getvalue(), words, arguments))

@@ -7,7 +7,6 @@ import itertools
 import json
 import os
 import re
-import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -20,11 +19,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from neeco.base.errors import NeecoError, nearest
 from neeco.base.files import finite, new_folder, require_replaceable, write_json
-from neeco.base.settings import WORDS, described, field_texts, value_words
+from neeco.base.settings import described, field_texts, value_words
 
 if TYPE_CHECKING:
     from neeco.studies.tables import ResultTable
@@ -73,12 +71,12 @@ def fitted(table: ResultTable, width: int) -> list[Table]:
         if not pieces or sum(BORDER + widths[index] for index in taken) >= width:
             pieces.append([])
         pieces[-1].append(at)
-    tables = []
+    tables: list[Table] = []
     for piece in pieces or [[]]:
         title = f"{table.title}, continued" if tables else table.title
         made = Table(title=Text(title, "italic", no_wrap=True, overflow="ignore"), title_justify="left")
         for at in (*range(keys), *piece):
-            numbers = {"justify": "right", "width": widths[at]} if at >= keys else {"no_wrap": True}
+            numbers: dict[str, Any] = {"justify": "right", "width": widths[at]} if at >= keys else {"no_wrap": True}
             made.add_column(headings[at], **numbers)
         for row, cells in zip(table.rows, rows, strict=True):
             made.add_row(*cells[:keys], *(cells[at] for at in (piece[:1] if row.failed else piece)))
@@ -209,46 +207,17 @@ def usage_error(box: str, words: Sequence[str], kind: Any) -> str:
     line = " ".join(f"{row}:" if re.match(" {4}[^ ]", row) else row for row in first)  # names of what is missing
     line = re.sub(r"[. ]*\(required\)", ";", " ".join(line.split())).rstrip(".;").removeprefix("Error parsing ")
     line = re.sub("^Missing from [^:]+:", f"{words[0]}: missing", line)
+    line = re.sub(
+        r"no type matching \{None\}\|\{?([^{}]*)\}? could be instantiated from \[(.*)\]", r"expected \1, got \2", line
+    )
+    line = line.replace("invalid literal for int() with base 10:", "expected INT, got")
+    line = line.replace("could not convert string to float:", "expected FLOAT, got")
     line = line.replace("Unrecognized options:", f"{words[0]}: no such option or argument:")
-    if value := re.search(r"Missing value for argument '--([\w-]+)'", line):
-        text = field_texts(kind).get(value[1].replace("-", "_"), "").partition(DEFAULT)[0]
-        line = f"--{value[1]}: needs a value: {text}".rstrip(" .:")
+    if value := re.search(r"Missing value for argument '--([\w-]+)'|^--([\w-]+): expected", line):
+        option = value[1] or value[2]
+        text = field_texts(kind).get(option.replace("-", "_"), "").partition(DEFAULT)[0].rstrip(".")
+        line = f"{line if value[2] else f'--{option}: needs a value'}: {text}".rstrip(" :")
     return f"{line}; see `neeco {words[0]} --help`"
-
-
-def number_values() -> ConstructorRegistry:
-    """Return tyro's rules for options that are numbers, or None where they are left out: one sentence on a word that is
-    none."""
-    registry = ConstructorRegistry()
-
-    @registry.primitive_rule
-    def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-        arms = typing.get_args(info.type) if isinstance(info.type, types.UnionType) else (info.type,)
-        kind, *others = [arm for arm in arms if arm is not type(None)] or arms
-        items = typing.get_args(kind) if typing.get_origin(kind) is tuple else (kind,)
-        if others or not items or not {*items} <= {int, float}:
-            return None
-
-        def read(words: list[str]) -> Any:
-            if type(None) in arms and {*words} == {"None"}:
-                return None
-            values = []
-            for item, word in zip(items, words, strict=True):
-                try:
-                    values.append(item(word))
-                except ValueError:
-                    raise ValueError(f"{word!r} is not {WORDS[item]}") from None
-            return values[0] if kind in items else tuple(values)
-
-        return PrimitiveConstructorSpec(
-            nargs=len(items),
-            metavar=value_words(kind),
-            instance_from_str=read,
-            is_instance=lambda value: True,
-            str_from_instance=lambda value: list(map(str, value if isinstance(value, tuple) else [value])),
-        )
-
-    return registry
 
 
 def print_settings(title: str, kind: type[Any], note: str) -> None:

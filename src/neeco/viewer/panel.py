@@ -15,7 +15,7 @@ import numpy as np
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.synthesis.states import JointRange, Shaft
 from neeco.viewer.controls import Controls, InstrumentControls, slider_ranges
-from neeco.viewer.runs import LoadedRun, Timeline
+from neeco.viewer.runs import FrameScore, LoadedRun, Timeline
 from neeco.viewer.views import IMAGE, RunPicture, views_of
 
 if TYPE_CHECKING:
@@ -276,7 +276,7 @@ def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: flo
     return gui.add_slider(f"{joint} ({unit})", lower, upper, step, min(max(0.0, lower), upper))
 
 
-def status_html(rendered: RunPicture, seconds: float, note: str) -> str:
+def status_html(rendered: RunPicture, seconds: float, note: str, score: FrameScore | None = None) -> str:
     """HTML of the status: what is shown, how well, how fast. seconds: of the rendering; note: what else is to be
     known."""
     loaded, scene = rendered.loaded, rendered.loaded.scene
@@ -289,9 +289,9 @@ def status_html(rendered: RunPicture, seconds: float, note: str) -> str:
         " · ".join([_text(scene.method), count, *training]),
         f"frame {place}" + ("" if rendered.exact else ", steered or between frames"),
     ]
-    if rendered.score is not None:
-        overlap = "" if rendered.score.iou is None else f" · IoU {rendered.score.iou:.3f}"
-        lines.append(f"PSNR {rendered.score.psnr:.2f} dB{overlap}")
+    if score is not None:
+        overlap = "" if score.iou is None else f" · IoU {score.iou:.3f}"
+        lines.append(f"PSNR {score.psnr:.2f} dB{overlap}")
     if loaded.recorded.still:
         lines.append("still scope: views far from the recorded one show what no frame saw")
     if rendered.trouble:

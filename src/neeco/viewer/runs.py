@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,7 +22,7 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
 from neeco.geometry.camera import Camera
-from neeco.labels.drawing import draw
+from neeco.labels.drawing import draw, to_numpy
 from neeco.scene import DrawableScene, Recorded, load_scene
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.synthesis.samplers import shafts_of
@@ -74,17 +74,25 @@ class LoadedRun:
     @cached_property
     def distance(self) -> float:
         """Median distance of the recorded cameras from the centre of the scene, along what they look at, in mm."""
-        centre = getattr(self.scene, "center", torch.zeros(3)).detach().cpu().double()
-        poses = [camera.world_from_camera.detach().cpu().double() for camera in self.recorded.cameras]
-        depths = [float((centre - pose[:3, 3]) @ pose[:3, 2]) for pose in poses]
-        ahead = [depth for depth in depths if depth > 0]
-        return float(np.median(ahead)) if ahead else VIEW.assumed_mm
+        centre = getattr(self.scene, "center", torch.zeros(3)).detach().cpu().double().numpy()
+        return median_distance((camera, [centre]) for camera in self.recorded.cameras)
 
     @property
     def signature(self) -> tuple[Any, ...]:
         """Everything that sliders depend on: where it changes, they are created again."""
         joints = tuple((item.name, tuple(item.joints.items())) for item in self.scene.instruments)
         return joints, self.recorded.names, tuple(self.scene.label_names), bool(self.frames)
+
+
+def median_distance(looked_at: Iterable[tuple[Camera, Sequence[np.ndarray]]]) -> float:
+    """Median distance in mm of places [3] from the cameras that look at them, along what these look at, of those ahead;
+    `assumed_mm` where none is."""
+    depths = []
+    for camera, places in looked_at:
+        pose = to_numpy(camera.world_from_camera)
+        depths += [float((place - pose[:3, 3]) @ pose[:3, 2]) for place in places]
+    ahead = [depth for depth in depths if depth > 0]
+    return float(np.median(ahead)) if ahead else VIEW.assumed_mm
 
 
 class ViewedRun:
@@ -262,7 +270,8 @@ class Timeline:
 def coarse_psnr(loaded: LoadedRun, index: int) -> float:
     """PSNR in dB of one frame, rendered and recorded at no more than `timeline_width` px. Raises NeecoError."""
     frame = loaded.frames[index]
-    camera = narrowed(frame.camera, VIEW.timeline_width if loaded.scene.has_gaussians else VIEW.field_width)
+    width = VIEW.timeline_width if loaded.scene.has_gaussians else VIEW.field_width
+    camera = frame.camera.scaled(min(1.0, width / frame.camera.width))
     size = camera.width, camera.height
     image = cv2.resize(frame.load_image().numpy(), size, interpolation=cv2.INTER_AREA)
     mask = frame.load_mask()
@@ -270,8 +279,3 @@ def coarse_psnr(loaded: LoadedRun, index: int) -> float:
         mask = torch.from_numpy(cv2.resize(mask.numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
     rendered = loaded.scene.render(frame.state, camera).color.clamp(0, 1).cpu()
     return psnr(rendered, torch.from_numpy(image), mask)
-
-
-def narrowed(camera: Camera, width: int) -> Camera:
-    """Return the same view in an image at most `width` px wide."""
-    return camera if camera.width <= width else camera.scaled(width / camera.width)

@@ -19,7 +19,7 @@ from neeco.raster.types import Rendering
 from neeco.scene import DrawableScene
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.viewer.controls import Controls, controlled_state
-from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRun, score_frame
+from neeco.viewer.runs import LoadedRun, ViewedRun
 from neeco.viewer.viser_scene import stands_at
 
 IMAGE, OVERLAY, PARTS = "image", "labels over image", "parts"
@@ -53,7 +53,6 @@ class RunPicture:
     seen_as_recorded: bool = False  # so is the camera
     note: str = ""
     trouble: str = ""  # what of the run could not be read
-    score: FrameScore | None = None
 
 
 def views_of(scene: DrawableScene, has_images: bool) -> tuple[str, ...]:
@@ -134,14 +133,6 @@ def render_run(run: ViewedRun, controls: Controls, camera: Camera, view: str) ->
         note=note or rendered.note,
         trouble=run.trouble or loaded.trouble,
     )
-
-
-def scored(rendered: RunPicture) -> RunPicture:
-    """Add the score where the frame is rendered as recorded and its capture is at hand. Raises NeecoError."""
-    if not rendered.seen_as_recorded or not rendered.loaded.frames:
-        return rendered
-    with rendered.loaded.scene.torch_threads():
-        return replace(rendered, score=score_frame(rendered.loaded, int(rendered.frame)))
 
 
 def _rendering(scene: DrawableScene, state: State, camera: Camera, view: str, labels: Tensor | None) -> Rendering:

@@ -111,6 +111,9 @@ def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamRequest) -> None
     assert result["models"][0]["input"] == [48, 40]
     assert len(result["findings"]) == 3 * 2
     assert any("fewer than three folds" in note for note in result["notes"])
+    with (spec.output / "downstream.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    assert [float(line["iou"]) for line in lines] == [row["iou"] for row in result["summary"]]
 
 
 def test_a_jobs_scores_are_of_what_it_answered(spec: DownstreamRequest, recorded: Path) -> None:
@@ -215,14 +218,6 @@ def test_recordings_without_truth_or_with_other_parts_are_refused(spec: Downstre
 # going on and growing
 
 
-def test_what_is_finished_is_not_done_again(spec: DownstreamRequest) -> None:
-    first = trained(spec)
-    before = job_files(spec.output)
-    assert trained(spec) == first
-    assert job_files(spec.output) == before
-    assert trained(replace(spec, splits=("unseen",)))["tests"] == ["unseen"]
-
-
 def test_more_folds_sets_conditions_models_and_frames_are_added(spec: DownstreamRequest, tmp_path: Path) -> None:
     small = replace(spec, conditions=("real", "kin"), num_real=("0", "6"), folds=1)
     trained(small)
@@ -271,7 +266,7 @@ def test_interrupted_it_goes_on_to_the_same_numbers(stopped, spec, tmp_path, mon
         assert without_times(result[key]) == without_times(expected[key])
 
 
-@pytest.mark.parametrize("failing", [0, 2, "all"])
+@pytest.mark.parametrize("failing", [2, "all"])
 def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     fit, fits = Pixels.fit, [-1]
 
@@ -480,15 +475,8 @@ def test_a_wrong_file_in_a_set_fails_its_jobs_alone(spec: DownstreamRequest, dra
 # files
 
 
-def test_tables_hold_the_numbers(spec: DownstreamRequest) -> None:
-    result = trained(spec)
-    with (spec.output / "downstream.csv").open(newline="") as stream:
-        lines = list(csv.DictReader(stream))
-    assert [float(line["iou"]) for line in lines] == [row["iou"] for row in result["summary"]]
-
-
 def test_two_workers_give_the_same_numbers(spec: DownstreamRequest, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.undo()
-    small = replace(replace(spec, models=("unet",), conditions=("kin", "real"), num_real=("0", "6"), folds=1), steps=3)
+    small = replace(spec, models=("unet",), conditions=("kin",), num_real=("0",), steps=2, size=32)
     here, there = (trained(replace(small, output=tmp_path / str(workers), workers=workers)) for workers in (1, 2))
     assert without_times(here["jobs"]) == without_times(there["jobs"])
