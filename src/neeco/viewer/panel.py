@@ -196,18 +196,23 @@ class InstrumentPanel:
             spans = self._ranges.items()
             self._joints = {joint: _joint_slider(gui, joint, span, self._per_unit[joint]) for joint, span in spans}
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
-            end, most, angle = "About the shaft's end.", PANEL.slide_mm, PANEL.yaw_deg
-            self.slide = gui.add_slider("along shaft (mm)", -most, most, 0.5, 0.0, hint=f"Along {about}.")
-            self.roll = gui.add_slider("roll (°)", -180.0, 180.0, 1.0, 0.0, hint=f"About {about}.")
-            self.yaw = gui.add_slider("yaw (°)", -angle, angle, 0.5, 0.0, hint=end)
-            self.pitch = gui.add_slider("pitch (°)", -angle, angle, 0.5, 0.0, hint=end)
+            end, angle = "About the shaft's end.", PANEL.yaw_deg
+            self._moves = [  # slide in mm; roll, yaw and pitch in degrees
+                gui.add_slider(label, -most, most, step, 0.0, hint=hint)
+                for label, most, step, hint in (
+                    ("along shaft (mm)", PANEL.slide_mm, 0.5, f"Along {about}."),
+                    ("roll (°)", 180.0, 1.0, f"About {about}."),
+                    ("yaw (°)", angle, 0.5, end),
+                    ("pitch (°)", angle, 0.5, end),
+                )
+            ]
             hint = "Arrows and rings move and turn the instrument; sliders add to that."
             self.gizmo = gui.add_checkbox("drag it in the scene", False, hint=hint)
             self.back = gui.add_button("back to the recording")
         for slider in self._joints.values():
             slider.on_update(_by_user(self._joint_moved))
-        for control in (self.slide, self.roll, self.yaw, self.pitch):
-            control.on_update(_by_user(changed))
+        for slider in self._moves:
+            slider.on_update(_by_user(changed))
         self.gizmo.on_update(_by_user(self._gizmo_toggled))
         self.back.on_click(lambda _: self.reset())
 
@@ -219,14 +224,8 @@ class InstrumentPanel:
                 span = self._ranges[joint]
                 # a degree and back may lie a hair outside the limits
                 joints[joint] = min(max(slider.value / self._per_unit[joint], span.lower), span.upper)
-        return InstrumentControls(
-            joints,
-            float(self.slide.value),
-            math.radians(self.roll.value),
-            math.radians(self.yaw.value),
-            math.radians(self.pitch.value),
-            pose if self.gizmo.value else None,
-        )
+        slide, *turns = (float(slider.value) for slider in self._moves)
+        return InstrumentControls(joints, slide, *map(math.radians, turns), pose=pose if self.gizmo.value else None)
 
     def follow(self, state: InstrumentState) -> None:
         """Show the recorded readings, unless the user has set others."""
@@ -239,7 +238,7 @@ class InstrumentPanel:
 
     def straighten(self) -> None:
         """Reset slide and turns to zero: the instrument's present pose becomes their starting point."""
-        for slider in (self.slide, self.roll, self.yaw, self.pitch):
+        for slider in self._moves:
             slider.value = 0.0
 
     def reset(self) -> None:

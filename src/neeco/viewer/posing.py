@@ -145,10 +145,9 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
         except (NeecoError, ValueError, RecursionError) as error:
             status, body = HTTPStatus.BAD_REQUEST, str(error).encode(errors="replace")
         response = connection.respond(status, "")
+        del response.headers["Content-Length"], response.headers["Content-Type"]
+        response.headers.update({"Content-Length": str(len(body)), "Content-Type": kind})
         response.body = body
-        for name, value in (("Content-Length", str(len(body))), ("Content-Type", kind)):
-            del response.headers[name]
-            response.headers[name] = value
         return response
 
     def _question(self, message: Any, questions: Mapping[str, dict[str, Any]]) -> tuple[str, str, dict[str, Any]]:
@@ -235,7 +234,7 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
             pixels = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
             width = PICTURES.thumbnail_width if question["small"] else PICTURES.width
             order, kind = cv2.COLOR_RGB2BGR, "jpeg"
-        left, right, top, bottom = self._window(posing)
+        left, right, top, bottom = _window(posing)
         scale = (right - left) / width
         along = left + (np.arange(width) + 0.5) * scale
         across = top + (np.arange(round((bottom - top) / scale)) + 0.5) * scale
@@ -260,12 +259,6 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
             raise NeecoError("ghost: the run's scene does not tell instruments from tissue; train method kinematic")
         color = (drawing.image.numpy() * 255).round().astype(np.uint8)
         return np.dstack([color, (drawing.parts.numpy() > 0).astype(np.uint8) * 255])
-
-    def _window(self, posing: SolvedPosing) -> tuple[float, float, float, float]:
-        """Left, right (mm along the shaft), top and bottom (across) of a picture."""
-        length = posing.shafts.working_length_mm
-        aside = PICTURES.aside * length
-        return -PICTURES.before * length, PICTURES.beyond * length, -aside, aside
 
     def _overview(self, instrument: str) -> dict[str, Any]:
         posing = self._posing(instrument, 0)
@@ -296,7 +289,7 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
             ],
             "done": len(answered),
             "sure": {name: [round(value, 1) for value in pair] for name, pair in posing.deviations().items()},
-            "window": self._window(posing),
+            "window": _window(posing),
             "length": posing.shafts.working_length_mm,
             "radius": posing.shafts.diameter_mm / 2,
             "joints": {
@@ -312,6 +305,12 @@ def page() -> bytes:
     folder = files("neeco.viewer") / "posing_page"
     html, style, script = (folder.joinpath(f"page.{kind}").read_text("utf-8") for kind in ("html", "css", "js"))
     return html.replace("{{ style }}", style).replace("{{ script }}", script).encode()
+
+
+def _window(posing: SolvedPosing) -> list[float]:
+    """Left, right (mm along the shaft), top and bottom (across) of a picture."""
+    shares = (-PICTURES.before, PICTURES.beyond, -PICTURES.aside, PICTURES.aside)
+    return [share * posing.shafts.working_length_mm for share in shares]
 
 
 def _require_state(posing: SolvedPosing, roll_deg: float, joints_deg: Mapping[str, float]) -> None:

@@ -27,9 +27,7 @@ from neeco.scene import DrawableScene, Recorded, load_scene
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.synthesis.samplers import shafts_of
 from neeco.synthesis.states import Shaft
-from neeco.training.run import checkpoint_path, read_checkpoint, read_config
-
-SCENE_FILE = "scene.safetensors"
+from neeco.training.run import SCENE_FILE, checkpoint_path, read_checkpoint, read_config
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,9 +173,14 @@ class ViewedRun:
             iteration = int(header["iteration"])
         if self.device is not None:
             scene = scene.to(self.device)
-        capture, trouble = _read_capture_of(config)
-        if capture is not None:
-            capture = scene.recorded.completed(capture, scene.instruments)
+        capture, trouble, root = None, "", Path(config["capture"])
+        try:
+            if root.is_dir():
+                capture = scene.recorded.completed(read_capture(root, config["transforms"]), scene.instruments)
+            else:
+                trouble = f"capture: {root} no longer exists: no recorded images to compare with"
+        except NeecoError as error:
+            trouble = str(error)
         if not scene.recorded.states and capture is None:
             raise NeecoError(f"{self.path}: the scene holds no frames, and its capture is missing; train again")
         frames = () if capture is None else capture.frames
@@ -196,17 +199,6 @@ class ViewedRun:
             iteration=iteration,
             trouble=trouble,
         )
-
-
-def _read_capture_of(config: dict[str, Any]) -> tuple[Capture | None, str]:
-    """The capture that a run was trained on, or why it cannot be read."""
-    root = Path(config["capture"])
-    if not root.is_dir():
-        return None, f"capture: {root} no longer exists: no recorded images to compare with"
-    try:
-        return read_capture(root, config["transforms"]), ""
-    except NeecoError as error:
-        return None, str(error)
 
 
 @dataclass(frozen=True)
