@@ -16,7 +16,7 @@ from neeco.capture.model import Instrument, InstrumentState
 from neeco.synthesis.states import JointRange, Shaft
 from neeco.viewer.controls import Controls, InstrumentControls, slider_ranges
 from neeco.viewer.runs import FrameScore, LoadedRun, Timeline
-from neeco.viewer.views import IMAGE, RunPicture, views_of
+from neeco.viewer.views import IMAGE, Picture, views_of
 
 if TYPE_CHECKING:
     import viser
@@ -275,29 +275,34 @@ def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: flo
     return gui.add_slider(f"{joint} ({unit})", lower, upper, step, min(max(0.0, lower), upper))
 
 
-def status_html(rendered: RunPicture, seconds: float, note: str, score: FrameScore | None = None) -> str:
-    """HTML of the status: what is shown, how well, how fast. seconds: of the rendering; note: what else is to be
+def status_html(
+    loaded: LoadedRun,
+    controls: Controls,
+    picture: Picture,
+    seconds: float,
+    notes: Sequence[str] = (),
+    score: FrameScore | None = None,
+) -> str:
+    """HTML of the status: what is shown, how well, how fast. seconds: of the rendering; notes: what else is to be
     known."""
-    loaded, scene = rendered.loaded, rendered.loaded.scene
-    frame = min(max(round(rendered.frame), 0), len(loaded.recorded.names) - 1)
+    scene, recorded = loaded.scene, loaded.recorded
+    frame = min(max(round(controls.frame), 0), len(recorded.names) - 1)
     count = "no Gaussians" if scene.num_gaussians is None else f"{scene.num_gaussians:,} Gaussians"
     training = [] if loaded.iteration is None else [f"iteration {loaded.iteration:,}, still training"]
-    place = f"{rendered.frame:g} ({_text(loaded.recorded.names[frame])}, {_text(loaded.recorded.splits[frame])})"
+    place = f"{controls.frame:g} ({_text(recorded.names[frame])}, {_text(recorded.splits[frame])})"
     lines = [
         f"<b>{_text(loaded.name)}</b>",
         " · ".join([_text(scene.method), count, *training]),
-        f"frame {place}" + ("" if rendered.exact else ", steered or between frames"),
+        f"frame {place}" + (", steered or between frames" if controls.recorded_frame is None else ""),
     ]
     if score is not None:
         overlap = "" if score.iou is None else f" · IoU {score.iou:.3f}"
         lines.append(f"PSNR {score.psnr:.2f} dB{overlap}")
-    if loaded.recorded.still:
+    if recorded.still:
         lines.append("still scope: views far from the recorded one show what no frame saw")
-    if rendered.trouble:
-        lines.append(_text(rendered.trouble, 3 * PANEL.line))
-    height, width = rendered.picture.depth.shape
+    height, width = picture.depth.shape
     lines.append(f"{seconds * 1e3:.0f} ms at {width} × {height}")
-    return _block([*lines, _text(note, 3 * PANEL.line)] if note else lines)
+    return _block([*lines, *(_text(note, 3 * PANEL.line) for note in notes if note)])
 
 
 def message_html(text: str) -> str:

@@ -22,7 +22,7 @@ from neeco.viewer.controls import Controls, controlled_state, interpolated_state
 from neeco.viewer.panel import Panel, message_html, status_html
 from neeco.viewer.runs import LoadedRun, ViewedRun, score_frame
 from neeco.viewer.saving import SavedStates
-from neeco.viewer.views import Picture, RunPicture, render_run
+from neeco.viewer.views import Picture, render_run
 from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, pose_of, stands_at
 
 if TYPE_CHECKING:
@@ -229,15 +229,15 @@ class ClientSession:
         height = self._resolution.height(sharp, window.image_height, aspect_of(window))
         camera = browser_camera(window, self._run.unit, height)
         try:
-            rendered = render_run(self._run, controls, camera, self._panel.view.value)
+            picture, as_recorded = render_run(current, controls, camera, self._panel.view.value)
         except NeecoError as error:
             self._panel.status.content = message_html(str(error))
             return
         seconds = time.perf_counter() - began
-        self._resolution.record(seconds, rendered.picture.depth.size)
+        self._resolution.record(seconds, picture.depth.size)
         if self._connected():
-            self._send(rendered.picture, sharp)
-            self._show_status(rendered, seconds, sharp)
+            self._send(picture, sharp)
+            self._show_status(controls, picture, as_recorded, seconds, sharp)
 
     def tick(self, now: float) -> float | None:
         """Let the recording play on, and show what is newly known of its frames. now: of time.perf_counter(); returns
@@ -358,16 +358,18 @@ class ClientSession:
         self._client.scene.set_background_image(picture.pixels, format="jpeg", jpeg_quality=quality, depth=depth)
         self._client.flush()
 
-    def _show_status(self, rendered: RunPicture, seconds: float, sharp: bool) -> None:
-        now = time.perf_counter()
+    def _show_status(
+        self, controls: Controls, picture: Picture, as_recorded: bool, seconds: float, sharp: bool
+    ) -> None:
+        now, loaded = time.perf_counter(), self._loaded
         if not sharp and now - self.status_at < VIEWER.status_every_s:
             return
         self.status_at = now
-        notes, score = [rendered.note] if rendered.note else [], None
-        if sharp and rendered.seen_as_recorded and rendered.loaded.frames:  # else things move on before it is read
+        notes, score = [self._run.trouble or loaded.trouble, picture.note], None
+        if sharp and as_recorded and loaded.frames:  # else things move on before it is read
             try:
-                with rendered.loaded.scene.torch_threads():
-                    score = score_frame(rendered.loaded, int(rendered.frame))
+                with loaded.scene.torch_threads():
+                    score = score_frame(loaded, int(controls.frame))
             except NeecoError as error:
                 notes.append(str(error))
-        self._panel.status.content = status_html(rendered, seconds, "; ".join(notes), score)
+        self._panel.status.content = status_html(loaded, controls, picture, seconds, notes, score)
