@@ -74,37 +74,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # SIGTERM ends as Ctrl-C does: tidily
         terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        try:
-            return _status(words)
-        finally:
-            sys.stdout.flush()
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            status = _dispatch(words)
+        sys.stdout.flush()
+        return status
     except (BrokenPipeError, SystemExit) as error:
         # rich turns a broken pipe into SystemExit
         if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
             raise
         return PIPE_CLOSED
-    except OSError as error:  # a full disk
-        with contextlib.suppress(OSError):
-            _print_error(f"output: {error.strerror or error}; check that path and the disk")
-        return 1
-    finally:
-        _discard_unwritable()
-        if before is None:
-            os.environ.pop(FOLLOW_LINKS, None)
-        else:
-            os.environ[FOLLOW_LINKS] = before
-        if terminate is not None:
-            signal.signal(signal.SIGTERM, terminate)
-
-
-def _status(words: list[str]) -> int:
-    """Exit status of a command line; a failure that the user can correct is one line on stderr."""
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _warn
-            return _dispatch(words)
-    except BrokenPipeError:
-        raise
     except KeyboardInterrupt as interrupt:
         message = " ".join(map(str, interrupt.args)) or "run the same command again"
         print(f"\nneeco: interrupted: {visible(message)}", file=sys.stderr)
@@ -120,6 +99,14 @@ def _status(words: list[str]) -> int:
         else:
             raise
         return 1
+    finally:
+        _discard_unwritable()
+        if before is None:
+            os.environ.pop(FOLLOW_LINKS, None)
+        else:
+            os.environ[FOLLOW_LINKS] = before
+        if terminate is not None:
+            signal.signal(signal.SIGTERM, terminate)
 
 
 def _with_target(words: list[str]) -> list[str]:

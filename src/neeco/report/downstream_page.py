@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ from neeco.studies.downstream.results import (
     Prediction,
     failed_jobs,
     is_synthetic,
-    models_and_tests,
     rows_of,
     summary_text,
     table_of,
@@ -58,13 +58,14 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
     ]
     text = f"{'; '.join(budget)}; {counted(experiment['folds'], 'fold')}. {EXPLANATION}"
     sections = [Section(title="Results", text=text, files=files)]
-    for model, test in models_and_tests(experiment):
+    pairs = list(product(experiment["models"], experiment["tests"]))
+    for model, test in pairs:
         table, rows = table_of(experiment, model, test), rows_of(experiment, model, test)
         names = list(dict.fromkeys(row["condition"] for row in rows))
         chart = score_chart(model, test, rows)
         figures = [Figure(chart, legend(names, names))] if chart else []
         sections.append(Section(title=table.title, split=test, level=3, results=table, figures=figures))
-    if examples := [section for pair in models_and_tests(experiment) for section in _examples(plan, experiment, *pair)]:
+    if examples := [section for pair in pairs for section in _examples(plan, experiment, *pair)]:
         text = (
             "Frames where a condition with synthetic images gains most over its reference, and where it gains least or "
             "loses, of the first fold; the truth in yellow, under each prediction its IoU."

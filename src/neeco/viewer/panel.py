@@ -225,7 +225,8 @@ class InstrumentPanel:
                 # a degree and back may lie a hair outside the limits
                 joints[joint] = min(max(slider.value / self._per_unit[joint], span.lower), span.upper)
         slide, *turns = (float(slider.value) for slider in self._moves)
-        return InstrumentControls(joints, slide, *map(math.radians, turns), pose=pose if self.gizmo.value else None)
+        roll, yaw, pitch = map(math.radians, turns)
+        return InstrumentControls(joints, slide, roll, yaw, pitch, pose if self.gizmo.value else None)
 
     def follow(self, state: InstrumentState) -> None:
         """Show the recorded readings, unless the user has set others."""

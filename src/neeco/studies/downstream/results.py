@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -151,11 +152,6 @@ class Arm(NamedTuple):
     condition: str
     real: int
 
-    @property
-    def words(self) -> list[str]:
-        """The words of its condition."""
-        return self.condition.split("+")
-
 
 class Estimate(NamedTuple):
     """A mean over folds with the ends of its interval, which are None where there is one value only."""
@@ -246,6 +242,11 @@ def block_weights(frames: int) -> np.ndarray:
     return covered[:, :frames] + covered[:, frames : 2 * frames]
 
 
+def words_of(condition: str) -> set[str]:
+    """The words of a condition, in whatever order they stand."""
+    return set(condition.split("+"))
+
+
 def title_of(condition: str, real: int) -> str:
     """`kinematic+real, 20 labelled`."""
     return f"{condition}, {real} labelled" if real else condition
@@ -295,7 +296,7 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
 
 def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
     """The arm that `arm` is compared with on a test, in whatever order their conditions' words stand."""
-    words, baselines = set(arm.words), [set(name.split("+")) for name in BASELINES]
+    words, baselines = words_of(arm.condition), [words_of(name) for name in BASELINES]
     others = [other for other in scores.jobs if other.model == arm.model and other != arm]
     wanted, real = baselines, arm.real
     if PERMUTED in words:
@@ -303,11 +304,13 @@ def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
     elif words in baselines:
         wanted = baselines[: baselines.index(words)]
     elif REAL not in words:
-        real = max((other.real for other in others if set(other.words) in baselines), default=0)
+        real = max((other.real for other in others if words_of(other.condition) in baselines), default=0)
     rivals = [
         (mean, other)
         for other in others
-        if set(other.words) in wanted and other.real == real and (mean := scores.mean(other, test, metric)) is not None
+        if words_of(other.condition) in wanted
+        and other.real == real
+        and (mean := scores.mean(other, test, metric)) is not None
     ]
     return max(rivals)[1] if rivals else None
 
@@ -325,23 +328,18 @@ def rows_of(experiment: Document, model: Document, test: str) -> list[Document]:
     return sorted(rows, key=lambda row: row["real"])
 
 
-def models_and_tests(experiment: Document) -> list[tuple[Document, str]]:
-    """Every model with every test."""
-    return [(model, test) for model in experiment["models"] for test in experiment["tests"]]
-
-
 def is_synthetic(row: Document, experiment: Document) -> bool:
     """Return whether a row's condition has a set with its own labels."""
-    words = row["condition"].split("+")
+    words = words_of(row["condition"])
     return PERMUTED not in words and any(entry["name"] in words for entry in experiment["sets"])
 
 
 def findings(experiment: Document) -> list[str]:
     """Return the findings: a sentence for every model, test and condition with synthetic images that is compared."""
     sentences = []
-    for model, test in models_and_tests(experiment):
+    for model, test in product(experiment["models"], experiment["tests"]):
         for row in rows_of(experiment, model, test):
-            if "against" in row and (is_synthetic(row, experiment) or PERMUTED in row["condition"].split("+")):
+            if "against" in row and (is_synthetic(row, experiment) or PERMUTED in words_of(row["condition"])):
                 score = f"{_title(MAIN[model['predicts']])} {row[MAIN[model['predicts']]]:.3f}"
                 against = f"{title_of(row['against'], row['against_real'])} ({_difference(row)})"
                 arm = f"{model['name']}, {test}: {title_of(row['condition'], row['real'])}"
@@ -385,7 +383,7 @@ def _title(metric: str) -> str:
 
 def tables_of(experiment: Document) -> list[ResultTable]:
     """The table of every model and test."""
-    return [table_of(experiment, model, test) for model, test in models_and_tests(experiment)]
+    return [table_of(experiment, *pair) for pair in product(experiment["models"], experiment["tests"])]
 
 
 def summary_text(experiment: Document) -> str:
