@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -41,33 +41,33 @@ Reporter = Callable[[int, str, float, str], None]  # `JobProgress` of the job at
 Finisher = Callable[[int, Result], None]  # gets the result of the job at an index
 
 
-class Job(Protocol):
-    """One job of a study. It stores what it finished in its folder, and finds it there when it is run again.
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One job of a study. It stores what it finished in its folder, and finds it there when it is run again."""
 
-    capture: the capture's folder; folder: the one that it writes; device: a word for `device_of`; title: its name in
-    messages.
-    """
+    capture: Path
+    folder: Path  # that it writes
+    device: str = "auto"  # a word for `device_of`, opened where the job runs
 
     @property
-    def capture(self) -> Path: ...
-    @property
-    def folder(self) -> Path: ...
-    @property
-    def device(self) -> str: ...
-    @property
-    def title(self) -> str: ...
+    def title(self) -> str:
+        """Its name in messages."""
+        raise NotImplementedError
 
     def identity(self) -> dict[str, Any]:
         """Return what distinguishes it from the other jobs; part of its result, whether it finishes or fails."""
+        raise NotImplementedError
 
     def check(self) -> None:
         """Raises NeecoError when it cannot be run, or its folder holds the work of another job."""
+        raise NotImplementedError
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
         """Do it, and return identity, "splits" (scores by split), "iterations" and whatever else it measures.
 
         capture: its own, where it is read and checked already. Raises NeecoError.
         """
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)

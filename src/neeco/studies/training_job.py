@@ -26,7 +26,7 @@ from neeco.raster.devices import device_of
 from neeco.scene import DrawableScene
 from neeco.scene.method_registry import method_class
 from neeco.scene.training_session import Session
-from neeco.studies.study import REMEDY, JobProgress, Result
+from neeco.studies.study import REMEDY, Job, JobProgress, Result
 from neeco.training.config import TrainConfig
 from neeco.training.run import open_run, read_config, require_same_capture, stored_config
 from neeco.training.train import ProgressRow, train
@@ -59,7 +59,7 @@ FIELD_CURVE = CurveSettings(shares=(0.2, 0.6, 1.0), frames=2)  # a field takes s
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingJob:
+class TrainingJob(Job):
     """One run to train and score. `config`: with its seed and its length, in iterations or in minutes on `clock`, which
     is the time that passes ("wall") or CPU time of all threads of the process ("processor").
 
@@ -67,13 +67,10 @@ class TrainingJob:
     """
 
     name: str
-    capture: Path
-    folder: Path
     config: TrainConfig
     clock: Literal["wall", "processor"] = "wall"
     splits: tuple[str, ...] | None = None
     lpips_weights: Path | None = None
-    device: str = "auto"  # a word for `device_of`, opened where the job runs
 
     @property
     def title(self) -> str:

@@ -63,7 +63,7 @@ from neeco.studies.downstream.training_data import (
     parse_condition,
     pasted_samples,
 )
-from neeco.studies.study import REMEDY, JobEvent, JobProgress, check_output, check_workers, machine, run_jobs
+from neeco.studies.study import REMEDY, Job, JobEvent, JobProgress, check_output, check_workers, machine, run_jobs
 
 SCHEMA = "neeco-downstream/3"
 FILE, TABLE = "downstream.json", "downstream.csv"
@@ -102,27 +102,15 @@ def held_out_samples(request: DownstreamRequest, capture: Capture, test: str) ->
     return recorded_samples(capture, test, request.classes)
 
 
-@dataclass(frozen=True)
-class DownstreamJob:
-    """One training, a `neeco.studies.study.Job`. real: how many recorded frames are labelled."""
+@dataclass(frozen=True, kw_only=True)
+class DownstreamJob(Job):
+    """One training. real: how many recorded frames are labelled."""
 
     request: DownstreamRequest
     model: str
     condition: Condition
     real: int  # 0 where the condition has none
     fold: int
-
-    @property
-    def capture(self) -> Path:
-        return self.request.capture
-
-    @property
-    def folder(self) -> Path:
-        return self.request.job_folder(self.model, self.condition.name, self.real, self.fold)
-
-    @property
-    def device(self) -> str:
-        return self.request.device
 
     @property
     def title(self) -> str:
@@ -343,7 +331,16 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
         wanted = request.num_real or ("0", *usual, "all")
         counts = sorted({labelled_count(word, labelled) for word in wanted})
     jobs = tuple(
-        DownstreamJob(request, model, condition, real, fold)
+        DownstreamJob(
+            capture=request.capture,
+            folder=request.job_folder(model, condition.name, real, fold),
+            device=request.device,
+            request=request,
+            model=model,
+            condition=condition,
+            real=real,
+            fold=fold,
+        )
         for fold in range(request.folds)  # the first fold of everything comes first: results halfway are of all
         for model in request.models
         for condition in conditions
