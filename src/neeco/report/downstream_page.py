@@ -45,11 +45,8 @@ Row = Mapping[str, Any]
 
 
 def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Path:
-    """Write `report.html` into the study's folder, and return its path.
-
-    experiment: what `run_downstream` returned; predictions are read from that folder. Raises NeecoError when a picture
-    cannot be read or the page not be written.
-    """
+    """Write `report.html` into the study's folder, and return its path. experiment: what `run_downstream` returned.
+    Raises NeecoError when a picture cannot be read or the page not be written."""
     capture, computer = plan.capture, machine_words(experiment["machine"], "torch_threads")
     files = {"downstream.csv": summary_text(experiment)}
     budget = [

@@ -64,6 +64,9 @@ class DownstreamRequest:
     """Which transforms file of the capture to read."""
     device: Device = "auto"
     kept_fold: ClassVar[int] = 0  # whose weights and predictions are kept
+    default_counts: ClassVar[tuple[int, ...]] = (5, 10, 20, 50)  # of labelled frames trained on, besides all
+    write_every_s: ClassVar[float] = 30.0  # least s between two writings of the results so far, which are large
+    parts_steps: ClassVar[float] = 2.5  # ratio of the steps for parts to the steps for one class
 
     @cached_property
     def image_sets(self) -> tuple[ImageSet, ...]:

@@ -1,11 +1,9 @@
 """`downstream`: models trained on recorded and on synthetic images within one budget, tested on recorded frames.
-
-A study is checked first (`plan_downstream`), then its trainings run (`run_downstream`), each a `DownstreamJob` with its
-data, its tests and its stored result.
-"""
+`plan_downstream` checks a study, `run_downstream` runs its trainings, each a `DownstreamJob`."""
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -72,21 +70,9 @@ JOB_FILE = "job.json"
 PREFIX = "frame_"  # of the names of frames in files of predictions
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExperimentSettings:
-    """Defaults and intervals of a study."""
-
-    default_counts: tuple[int, ...] = (5, 10, 20, 50)  # numbers of labelled frames trained on by default, besides all
-    write_every_s: float = 30.0  # least s between two writings of the results so far, which are large
-    parts_steps: float = 2.5  # ratio of the steps for parts to the steps for one class: more of them do not help
-
-
-EXPERIMENT = ExperimentSettings()
-
-
 def steps_of(request: DownstreamRequest, kind: type[TorchModel]) -> int:
     """Return the number of steps of a model."""
-    return request.steps or round(kind.steps * (EXPERIMENT.parts_steps if request.classes == "parts" else 1))
+    return request.steps or round(kind.steps * (request.parts_steps if request.classes == "parts" else 1))
 
 
 def input_of(request: DownstreamRequest, kind: type[TorchModel], frame: tuple[int, int]) -> tuple[int, int]:
@@ -126,29 +112,26 @@ class DownstreamJob(Job):
     def identity(self) -> dict[str, Any]:
         """Return what a folder must agree with to be this job's. Its keys are those of job.json."""
         request, kind = self.request, model_class(self.model)
+        backgrounds = request.backgrounds if PASTE in self.condition else None
         return {
             "model": self.model,
             "condition": self.condition.name,
             "real": self.real,
             "fold": self.fold,
             "capture": str(request.capture.absolute()),
-            "labels": absolute(request.labels),
+            "labels": request.labels and str(request.labels.absolute()),
             "transforms": request.transforms,
             "sets": [data.described() for data in self.sets],
-            "backgrounds": absolute(request.backgrounds) if PASTE in self.condition else None,
+            "backgrounds": backgrounds and str(backgrounds.absolute()),
             "classes": request.classes,
             "steps": steps_of(request, kind),
             "size": request.size or kind.image_size,
             "batch": request.batch or kind.batch,
         }
 
-    def check(self) -> None:
-        """Raises NeecoError when the folder holds another job's result, or a test of another capture by this name."""
-        self.stored()
-
-    def stored(self) -> dict[str, Any] | None:
-        """Return the result of an earlier start, None where there is none of all tests. Raises NeecoError as `check`
-        does."""
+    def check(self) -> dict[str, Any] | None:
+        """Return the result of an earlier start; None where there is none of all tests. Raises NeecoError when the
+        folder holds another job's result, or a test of another capture by this name."""
         file = self.folder / JOB_FILE
         if not file.exists():
             return None
@@ -162,7 +145,7 @@ class DownstreamJob(Job):
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
         """Train, test, write `folder`/job.json last, and return what it holds; at once when it is there already."""
-        if (earlier := self.stored()) is not None:
+        if (earlier := self.check()) is not None:
             return earlier
         report = progress or (lambda stage, share, text: None)
         report("training", 0.0, "")
@@ -248,11 +231,9 @@ def write_predictions(job: Path, test: str, names: Sequence[str], predictions: S
         for name, prediction in zip(names, predictions, strict=True)
     }
 
-    def write(file: Path) -> None:
-        with open(file, "wb") as stream:
-            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-
-    write_atomically(job / "predictions" / f"{test}.npz", write)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    write_atomically(job / "predictions" / f"{test}.npz", lambda file: file.write_bytes(stream.getvalue()))
 
 
 def read_predictions(job: Path, test: str) -> dict[str, Prediction]:
@@ -274,11 +255,6 @@ def _read(path: Path, transforms: str) -> Capture:
     return read_capture(path, transforms)
 
 
-def absolute(path: Path | None) -> str | None:
-    """A path for a file; None stays None."""
-    return None if path is None else str(path.absolute())
-
-
 @dataclass(frozen=True, kw_only=True)
 class DownstreamPlan:
     """A checked request, ready to run."""
@@ -294,8 +270,7 @@ class DownstreamPlan:
 def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
     """Check all that can be known before the work. Raises NeecoError for what cannot be trained or tested."""
     for option in ("folds", "steps", "size", "batch"):
-        value = getattr(request, option)
-        if value is not None and value < 1:
+        if (value := getattr(request, option)) is not None and value < 1:
             raise NeecoError(f"--{option} must be at least 1 (got {value})")
     check_workers(request.workers, device_of(request.device, drawing=False), share_gpus=True)
     if not request.models:
@@ -327,7 +302,7 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
         labelled_count(word, 10**9)
     if any(REAL in condition for condition in conditions) and set(request.num_real or "all") != {"0"}:
         labelled = len(recorded_samples(capture, "train", request.classes, request.labels))
-        usual = (str(count) for count in EXPERIMENT.default_counts if count < labelled)
+        usual = (str(count) for count in request.default_counts if count < labelled)
         wanted = request.num_real or ("0", *usual, "all")
         counts = sorted({labelled_count(word, labelled) for word in wanted})
     jobs = tuple(
@@ -390,22 +365,18 @@ def _check_models(request: DownstreamRequest, capture: Capture, frame: tuple[int
 
 
 def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | None = None) -> dict[str, Any]:
-    """Train and test every model in every condition on every fold; writes downstream.csv and downstream.json, and
-    returns what the latter holds.
-
-    Started again after an interruption it continues where it stopped; started again with more models, sets, conditions,
-    labelled frames or folds, it adds them. A failed job is reported in its place.
-    """
+    """Train and test every model in every condition on every fold, but what an earlier start finished; writes
+    downstream.csv and downstream.json, and returns what the latter holds. A failed job is reported in its place."""
     file, jobs = plan.request.output / FILE, plan.jobs
     with own_folder(plan.request.output):
-        finished = {index: stored for index, job in enumerate(jobs) if (stored := job.stored()) is not None}
+        finished = {index: stored for index, job in enumerate(jobs) if (stored := job.check()) is not None}
         captures = {plan.request.capture: plan.capture}
         written, recorded = 0.0, list[Mapping[str, Any]]()
 
         def record(results: Sequence[Mapping[str, Any]]) -> None:
             nonlocal written
             recorded[:] = results
-            if time.monotonic() > written + EXPERIMENT.write_every_s:
+            if time.monotonic() > written + plan.request.write_every_s:
                 write_json(file, document(plan, recorded))
                 written = time.monotonic()
 
@@ -436,7 +407,7 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
         "complete": False,
         "capture": str(request.capture.absolute()),
         "machine": machine(device_of(request.device, drawing=False), request.workers),
-        "labels": absolute(request.labels),
+        "labels": request.labels and str(request.labels.absolute()),
         "classes": list(class_names(plan.capture, request.classes)),
         "tests": request.all_tests,
         "captures": {name: str(path.absolute()) for name, path in request.tests.items()},  # of tests

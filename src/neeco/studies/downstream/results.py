@@ -1,8 +1,5 @@
-"""Results of a downstream study: scores of predictions, their intervals over folds and frames, findings and tables.
-
-Masks are scored per frame, boxes over a split (by pycocotools). A study's results are one document, that of
-downstream.json, of plain values: "jobs" as they wrote them, "summary" and "findings" from here.
-"""
+"""Results of a downstream study, the document of downstream.json: scores of predictions (masks per frame, boxes over a
+split), their intervals over folds and frames, findings and tables."""
 
 from __future__ import annotations
 
@@ -181,11 +178,6 @@ class Scores:
         scores = {fold: job["splits"].get(test, {}).get(metric) for fold, job in self.jobs.get(arm, {}).items()}
         return {fold: score for fold, score in sorted(scores.items()) if score is not None}
 
-    def mean(self, arm: Arm, test: str, metric: str) -> float | None:
-        """Return the mean over folds, without its interval; None where no fold has the score."""
-        values = self.by_fold(arm, test, metric)
-        return float(np.mean(list(values.values()))) if values else None
-
     def estimate(self, arm: Arm, test: str, metric: str, against: Arm | None = None) -> Estimate | None:
         """Return the mean of an arm's score over folds, or of its difference to another's over the folds that both
         finished; None where there is no such fold."""
@@ -242,6 +234,11 @@ def block_weights(frames: int) -> np.ndarray:
     return covered[:, :frames] + covered[:, frames : 2 * frames]
 
 
+def mean_or_none(values: Mapping[int, float]) -> float | None:
+    """Return the mean over folds; None where no fold has the score."""
+    return float(np.mean(list(values.values()))) if values else None
+
+
 def words_of(condition: str) -> set[str]:
     """The words of a condition, in whatever order they stand."""
     return set(condition.split("+"))
@@ -270,12 +267,8 @@ def metrics_of(jobs: Sequence[Document], predicts: str) -> list[str]:
 
 def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequence[str]) -> list[dict[str, Any]]:
     """A row per arm and test: means of scores over `folds`, the 95 % interval of the main one as "low" and "high", and
-    its "difference" to the arm "against" over the folds that both finished, with an interval and a "verdict".
-
-    models: what each predicts, by name. A condition is compared with the better of labelled frames alone and strongly
-    augmented, at as many labelled frames (sets alone: at the most); strong augmentation with none; permuted labels with
-    the right ones.
-    """
+    its "difference" to the arm "against" over the folds that both finished, with an interval and a "verdict". models:
+    what each predicts, by name."""
     rows, scores = [], Scores(jobs)
     for arm in dict.fromkeys(Arm(job["model"], job["condition"], job["real"]) for job in jobs):
         main = MAIN[models[arm.model]]
@@ -283,7 +276,7 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
         for test in tests:
             score = scores.estimate(arm, test, main) or Estimate(0, math.nan, None, None)
             row: dict[str, Any] = {**arm._asdict(), "test": test, "folds": score.folds}
-            row |= {metric: scores.mean(arm, test, metric) for metric in metrics}
+            row |= {metric: mean_or_none(scores.by_fold(arm, test, metric)) for metric in metrics}
             row |= {"low": score.low, "high": score.high}
             reference = _reference(arm, test, scores, main)
             if reference is not None and (gain := scores.estimate(arm, test, main, reference)) is not None:
@@ -295,7 +288,8 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
 
 
 def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
-    """The arm that `arm` is compared with on a test, in whatever order their conditions' words stand."""
+    """The arm that `arm` is compared with on a test: the better of labelled frames alone and strongly augmented, at as
+    many labelled frames (sets alone: at the most); strong augmentation with none; permuted labels with the right."""
     words, baselines = words_of(arm.condition), [words_of(name) for name in BASELINES]
     others = [other for other in scores.jobs if other.model == arm.model and other != arm]
     wanted, real = baselines, arm.real
@@ -310,7 +304,7 @@ def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
         for other in others
         if words_of(other.condition) in wanted
         and other.real == real
-        and (mean := scores.mean(other, test, metric)) is not None
+        and (mean := mean_or_none(scores.by_fold(other, test, metric))) is not None
     ]
     return max(rivals)[1] if rivals else None
 

@@ -239,12 +239,8 @@ class ImageSet:
 def recorded_samples(
     capture: Capture, split: str | None, classes: ClassNames, labels: Path | None = None
 ) -> tuple[RecordedSample, ...]:
-    """The labelled frames of a split (None: of all): by the capture's truth, or by a folder of masks named as the
-    frames.
-
-    Frames without a label are left out. Raises NeecoError where there is none at all, or where parts are requested and
-    the labels have none.
-    """
+    """The labelled frames of a split (None: of all), by the capture's truth or a folder of masks named as the frames.
+    Raises NeecoError where there is none at all, or where parts are requested and the labels have none."""
     masks = None if labels is None else open_masks(labels, option=f"{labels / PARTS_FILE}:")
     chosen = capture.frames if split is None else capture.split(split)
     if masks is None and any(truth_file(capture.root, frame.name) for frame in chosen):
@@ -270,12 +266,9 @@ def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:
 
 
 def synthetic_samples(data: ImageSet, classes: Sequence[str], size: tuple[int, int]) -> tuple[SyntheticSample, ...]:
-    """The images of a data set in their order, each with its labels; the first `count` of them.
-
-    The dataset.json of `neeco synthesize` says what ids mean; without it, masks/ separate instrument and tissue. Of a
-    set that `neeco annotate` wrote only the frames of split train are used: models are tested on the others. size:
-    (width, height) that all must have. Raises NeecoError.
-    """
+    """The images of a data set in their order, each with its labels; the first `count` of them. Of a set that `neeco
+    annotate` wrote only the frames of split train are used. size: (width, height) that all must have. Raises
+    NeecoError."""
     folder, info = data.file(IMAGE_FOLDER), data.info()
     images = image_files(folder) if folder.is_dir() else ()
     if info is not None and "annotates" in info["settings"]:
