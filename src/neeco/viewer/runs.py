@@ -140,16 +140,6 @@ class ViewedRun:
 
         threading.Thread(target=look, name="neeco-watcher", daemon=True).start()
 
-    def advance_timeline(self) -> bool:
-        """Score one more frame; False: all are."""
-        timeline = self.timeline
-        if timeline.done:
-            return False
-        # of a frame whose image cannot be read the status says so to whoever goes there
-        with timeline.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
-            timeline.advance()
-        return True
-
     def _current_stamp(self) -> tuple[str, int, int, int]:
         """File, its inode, time and size."""
         read_config(self.path)
@@ -238,10 +228,15 @@ class Timeline:
         """Whether every frame is scored."""
         return self.count == len(self.psnr)
 
-    def advance(self) -> None:
-        """Score one more frame; one that cannot be read raises NeecoError and stays unknown."""
+    def advance(self) -> bool:
+        """Score one more frame; False: all are. One that cannot be read stays unknown: the status says so to whoever
+        goes there."""
+        if self.done:
+            return False
         self.count += 1
-        self.psnr[self.count - 1] = coarse_psnr(self.loaded, self.count - 1)
+        with self.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
+            self.psnr[self.count - 1] = coarse_psnr(self.loaded, self.count - 1)
+        return True
 
     @property
     def known(self) -> np.ndarray:
