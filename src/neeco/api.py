@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from neeco.base.errors import NeecoError, naming_arguments
-from neeco.base.plausible import Fault, focal_fault
+from neeco.base.plausible import focal_fault
 from neeco.capture import Camera, Capture, Problem, State, check_capture, read_capture
 from neeco.capture.model import Instrument
 from neeco.evaluation.evaluate import evaluate_run
@@ -117,8 +117,11 @@ class Scene:
             run.scene.draw(state, camera.resized(1280, 1024))     # the same, larger
         """
         state.check(self._limited)
-        if (fault := _view_fault(camera)) is not None:
-            raise NeecoError(f"camera: {fault[0]}; {fault[1]}")
+        poses = [pose for pose in (camera.world_from_camera, camera.world_from_lamps) if pose is not None]
+        faults = [rigid_fault(pose.detach().cpu().double().numpy()) for pose in poses]
+        for fault in (*faults, focal_fault(camera.fx, camera.fy, camera.width, camera.height)):
+            if fault is not None:
+                raise NeecoError(f"camera: {fault[0]}; {fault[1]}")
         with self.learned.torch_threads():
             return draw_labelled(self.learned, state, camera, labels)
 
@@ -180,15 +183,6 @@ class Run:
         report = progress or _silent
         with self.scene.learned.torch_threads():
             return evaluate_run(self.trained, self.capture, splits, align=align, networks=networks, progress=report)
-
-
-def _view_fault(camera: Camera) -> Fault | None:
-    """Return what is wrong with a camera, and what to do; None for a valid one."""
-    for pose in (camera.world_from_camera, camera.world_from_lamps):
-        fault = None if pose is None else rigid_fault(pose.detach().cpu().double().numpy())
-        if fault is not None:
-            return fault
-    return focal_fault(camera.fx, camera.fy, camera.width, camera.height)
 
 
 @naming_arguments()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import shutil
 import time
 from pathlib import Path
@@ -325,18 +324,6 @@ def test_the_verb_prints_and_returns_a_status(folder, capsys):
     errors = [problem for problem in report["problems"] if problem["severity"] == "error"]
     assert errors[0]["field"] == "frames[5].instruments[0].joints.jaw_angle"
     assert report["summary"]["splits"] == {"train": 7, "test": 1}
-
-
-def test_the_verb_says_what_labels_few_frames_give(folder, capsys):
-    check_verb.run(check_verb.Arguments(folder.root))
-    told = capsys.readouterr().out
-    assert re.search(r"labels to expect: with exact states, \d+ training frames gave IoU 0\.\d\d on seen", told)
-    for frame in range(1, 8):
-        folder.edit(_frame(frame, "split", "test"))
-    assert check_verb.run(check_verb.Arguments(folder.root)) == 1
-    assert "labels to expect" not in capsys.readouterr().out
-    check_verb.run(check_verb.Arguments(SAMPLE))  # 72 training frames
-    assert "labels to expect" not in capsys.readouterr().out
 
 
 def test_frames_that_are_all_left_out_are_an_error(folder):

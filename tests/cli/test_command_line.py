@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -116,15 +115,6 @@ def test_completion_knows_the_options_of_every_verb(capsys: pytest.CaptureFixtur
         assert option in script
 
 
-def test_overview_answers_at_once() -> None:
-    fastest = float("inf")
-    for _ in range(3):
-        start = time.perf_counter()
-        neeco("--help")
-        fastest = min(fastest, time.perf_counter() - start)
-    assert fastest < 3.0  # under a second on an idle machine; tests share theirs
-
-
 def test_version_is_the_package_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out == f"neeco {__version__}\n"
@@ -156,12 +146,18 @@ MEANT = r"neeco: error: {}: no such option of .*; did you mean {}\?"
             ["synthesize", "run", "--output", "set", "--count", "4", "--vews", "orbit"],
             MEANT.format("--vews", "--views"),
         ),
-        (["train", "x", "--output", "y", "--minutes", "abc"], "'abc' is not a number.*neeco train --help"),
+        (
+            ["train", "x", "--output", "y", "--minutes", "abc"],
+            "--minutes: expected FLOAT, got 'abc': Stop in time.*; see `neeco train --help`",
+        ),
         (
             ["synthesize", "x", "--output", "y", "--count", "1.5"],
-            "'1.5' is not a whole number.*neeco synthesize --help",
+            "--count: expected INT, got '1.5'.*; see `neeco synthesize --help`",
         ),
-        (["ingest", "--intrinsics", "1", "2", "a", "3"], "'a' is not a number.*neeco ingest --help"),
+        (
+            ["ingest", "--intrinsics", "1", "2", "a", "3"],
+            "--intrinsics: expected FLOAT FLOAT FLOAT FLOAT, got '1', '2', 'a', '3'",
+        ),
         (["train", "x", "--output", "y", "--bogus"], "neeco train --help"),
     ],
 )

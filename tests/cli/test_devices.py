@@ -106,20 +106,6 @@ def test_the_jobs_of_a_comparison_are_given_the_word(made, monkeypatch: pytest.M
     assert "device" not in taken[0].identity()
 
 
-def test_a_job_opens_its_device_where_it_runs(made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = noted_words(monkeypatch)
-    config = training_config("3dgs", {"iterations": 3})
-    job = training_job.TrainingJob(
-        name="3dgs",
-        capture=Path(made["train"]),
-        folder=tmp_path / "job",
-        config=config,
-        device="cpu",
-    )
-    job.run()
-    assert asked == ["cpu"]
-
-
 def noted_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The words of `--device` that are opened from now on."""
     words: list[str] = []

@@ -7,12 +7,13 @@ import io
 from rich.console import Console
 
 from neeco.capture.checks.truth import USUAL_NAMES
-from neeco.cli.evaluate import COLUMNS, evaluation_table
+from neeco.cli.evaluate import evaluation_table
 from neeco.evaluation.mask_metrics import part_scores
+from neeco.report.run_page import SCORES
 
 
 def test_no_number_is_cut_at_eighty_columns() -> None:
-    numbers = {key: 0.125 for _, key, _ in COLUMNS} | {"num_gaussians": 123456, "frames": 45, "psnr": 31.42}
+    numbers = {score.key: 0.125 for score in SCORES} | {"num_gaussians": 123456, "frames": 45, "psnr": 31.42}
     numbers["part_iou"] = dict.fromkeys(part_scores(USUAL_NAMES))
     evaluation = {kind: {"test": numbers, "unseen": numbers} for kind in ("given", "aligned")}
     out = io.StringIO()

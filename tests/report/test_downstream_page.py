@@ -10,7 +10,8 @@ from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.report.charts import Series, line_chart
 from neeco.report.downstream_page import picture, score_chart, write_downstream_report
-from neeco.studies.downstream.experiment import DownstreamPlan, DownstreamSettings, write_predictions
+from neeco.studies.downstream import DownstreamRequest
+from neeco.studies.downstream.experiment import DownstreamPlan, held_out_samples, write_predictions
 from neeco.studies.downstream.results import Detections, box_iou, findings, rows_of, summarise
 from neeco.studies.downstream.samples import Example
 
@@ -26,8 +27,8 @@ def plan(world, tmp_path):
 
 
 def plan_of(capture) -> DownstreamPlan:
-    settings = DownstreamSettings(capture=capture.root, output=capture.root.parent / "out", splits=SPLITS)
-    return DownstreamPlan(settings=settings, capture=capture, jobs=(), images={}, labelled=20, frame_size=(48, 40))
+    request = DownstreamRequest(capture=capture.root, output=capture.root.parent / "out", splits=SPLITS)
+    return DownstreamPlan(request=request, capture=capture, jobs=(), images={}, labelled=20, frame_size=(48, 40))
 
 
 def job_of(plan, model, condition, real, fold):
@@ -35,7 +36,7 @@ def job_of(plan, model, condition, real, fold):
     value = 0.5 + GAIN.get(condition, 0.1) + 0.001 * real + 0.004 * fold
     job = {"model": model, "condition": condition, "real": real, "fold": fold, "splits": {}}
     for split in SPLITS:
-        samples, moved = plan.settings.samples(plan.capture, split), round(20 * (1 - value))
+        samples, moved = held_out_samples(plan.request, plan.capture, split), round(20 * (1 - value))
         found, rows = [], []
         for k, sample in enumerate(samples):
             example = sample.load()
@@ -47,7 +48,7 @@ def job_of(plan, model, condition, real, fold):
                 found.append(np.roll(example.classes, moved, 1))
                 rows.append({"frame": sample.name, "iou": value + 0.01 * k * len(condition)})
         if fold == 0:
-            folder = plan.settings.job_folder(model, condition, real, fold)
+            folder = plan.request.job_folder(model, condition, real, fold)
             write_predictions(folder, split, [sample.name for sample in samples], found)
         key = "ap" if PREDICTS[model] == "boxes" else "iou"
         job["splits"][split] = {"frames": len(samples), key: value, "per_frame": rows}
@@ -129,7 +130,7 @@ def test_failed_trainings_and_lost_predictions_are_left_out_and_told(plan, exper
         else job
         for job in experiment["jobs"]
     ]
-    for file in plan.settings.output.glob("jobs/dfine-*/predictions/*.npz"):
+    for file in plan.request.output.glob("jobs/dfine-*/predictions/*.npz"):
         file.unlink()
     text, images = page_of(plan, experiment_of(plan, lost))
     assert "What failed" in text

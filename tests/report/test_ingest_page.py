@@ -294,16 +294,6 @@ def test_what_check_finds_is_in_the_verdict():
         assert "images contradict the poses; correct them" in verdict.headline
 
 
-def test_sentences_begin_with_a_capital_unless_with_a_files_name():
-    sentences = ("first", "it fits the poses 0.6 s earlier: which clock?", "psm1 moves by 0.3 mm only")
-    found = tuple(Contradiction(sentence, True) for sentence in sentences)
-    problem = Problem("warning", "transforms.json", "frames", "few frames", "record more", True)
-    _, *others = assess_ingest(made(SAMPLE, contradictions=found), read_capture(SAMPLE), [problem]).lines()
-    shown = {line.removeprefix("  - ") for line in others}
-    assert {"It fits the poses 0.6 s earlier: which clock?", "Psm1 moves by 0.3 mm only."} <= shown
-    assert "transforms.json: frames: few frames; record more." in shown
-
-
 def test_the_terminal_gets_a_doubtful_verdict_in_capitals_and_the_first_doubts():
     found = tuple(Contradiction(f"reason {number}", True) for number in range(LIMITS.max_shown + 3))
     verdict = assess_ingest(made(SAMPLE, contradictions=found), read_capture(SAMPLE))

@@ -24,10 +24,9 @@ from worker_tasks import seen_gpu
 from neeco.base import workers
 from neeco.base.errors import NeecoError
 from neeco.base.settings import with_fields
-from neeco.capture import read_capture
 from neeco.scene.training_session import UNLIMITED
 from neeco.studies import study
-from neeco.studies.study import check_workers, run_jobs, threads_per_worker
+from neeco.studies.study import check_workers, run_jobs
 from neeco.studies.training_job import Curve, phase_1_psnr, psnr_at
 from neeco.training import train as train_module
 from neeco.training.run import checkpoint_path, write_config
@@ -181,15 +180,6 @@ def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch
     assert [row["iteration"] for row in curve_of(cut)] == [row["iteration"] for row in curve_of(whole)]
 
 
-def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
-    from neeco.training.run import load_run
-
-    job = make_job("kinematic")  # the bar has no joint to find a wrist by
-    result = job.run()
-    assert float(load_run(job.folder).scene.deformation.articulations[0].wrist_start) == float("-inf")
-    assert result["splits"]["test"]["psnr"] > 5
-
-
 def test_drawing_the_curve_changes_no_bit_of_the_scene(trained_job, tmp_path) -> None:
     job = trained_job
     plain = train_module.train(job.capture, tmp_path / "plain", job.config)
@@ -341,11 +331,6 @@ def test_gpus_are_asked_for_where_jobs_compute_on_them(device, address, asked, m
     assert given == asked
 
 
-def test_workers_share_the_cores(monkeypatch) -> None:
-    monkeypatch.setattr(study, "usable_cores", lambda: 8)
-    assert [threads_per_worker(workers) for workers in (1, 2, 3, 16)] == [8, 4, 2, 1]
-
-
 def test_workers_give_the_same_numbers(make_job, tmp_path) -> None:
     here = [make_job(seed=seed, folder=tmp_path / "here" / str(seed)) for seed in (0, 1)]
     there = [make_job(seed=seed, folder=tmp_path / "there" / str(seed)) for seed in (0, 1)]
@@ -423,14 +408,6 @@ def kill_when(file: Path, processes: Callable[[], list[int]], killed: list[int])
             os.kill(number, signal.SIGKILL)
             killed.append(number)
         time.sleep(0.05)
-
-
-def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:
-    made = read_capture(capture)
-    gaussians, field = (Curve(capture / "curve.jsonl", made, ("train",), field=kind) for kind in (False, True))
-    assert len(field.frames["train"]) < len(gaussians.frames["train"])
-    assert len(field.shares) < len(gaussians.shares)
-    assert field.shares[-1] == gaussians.shares[-1] == 1  # both end with the finished scene
 
 
 def test_the_late_part_of_phase_1_counts(tmp_path: Path) -> None:

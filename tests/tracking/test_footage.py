@@ -108,22 +108,6 @@ def test_footage_over_another_tissue_in_another_world_is_tracked(tracked_run, ot
     assert run.scene.recorded.names == tuple(frame.name for frame in run.capture().frames)
 
 
-@pytest.mark.parametrize("what", ["no instrument", "black"])
-def test_footage_without_the_instrument_is_trusted_nowhere(tracked_run, other_footage, other_tissue, tmp_path, what):
-    wall = TissueRenderer(other_wall()).render(CAMERA, None)
-    frames = []
-    for frame in other_footage.frames[:2]:
-        path = tmp_path / f"{frame.name}.png"
-        write_image(path, wall if what == "no instrument" else torch.zeros_like(wall))
-        frames.append(replace(frame, image_path=path))
-    footage = replace(other_footage, frames=tuple(frames))
-    tracked = track_footage(tracked_run, footage, tmp_path / "out", tissue=other_tissue)
-    assert tracked.written == 0
-    assert max(rec["trust"]["value"] for rec in tracked.records) < 0.5
-    with pytest.raises(NeecoError, match=r"no frame has a trust of"):
-        tracked.require_trusted()
-
-
 def test_tissue_that_a_run_does_not_learn_by_itself_is_refused(tracked_run: RecordedRun) -> None:
     scene = make_scene()
     scene.deformation.motion = lambda canonical: None

@@ -13,9 +13,10 @@ from viewer_world import grasper_scene, write_recorded_images, write_run
 
 from neeco.base.errors import NeecoError
 from neeco.viewer.access import Access, is_loopback
+from neeco.viewer.controls import Controls
 from neeco.viewer.panel import message_html, status_html
 from neeco.viewer.runs import ViewedRun
-from neeco.viewer.views import Picture, RunPicture
+from neeco.viewer.views import Picture
 
 pytest.importorskip("viser")
 from websockets.datastructures import Headers
@@ -118,8 +119,7 @@ def test_names_of_a_run_stay_text(tmp_path: Path) -> None:
     scene = grasper_scene(frame_name="<b>{:06d}")
     run = write_run(scene, tmp_path / "<script>run", write_recorded_images(scene, tmp_path / "capture"))
     picture = Picture(np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6)))
-    part = RunPicture(loaded=ViewedRun(run).loaded, picture=picture, frame=2.0, exact=True, trouble=HOSTILE)
-    html = status_html(part, 0.1, HOSTILE)
+    html = status_html(ViewedRun(run).loaded, Controls(2.0), picture, 0.1, [HOSTILE, HOSTILE])
     assert "<script" not in html
     assert "<img" not in html
     assert "<b>0" not in html

@@ -110,8 +110,6 @@ def is_served(viewer: ViewerServer) -> bool:
     [
         b"/../../../../../../etc/passwd",
         b"/..%2f..%2f..%2f..%2f..%2fetc/passwd",
-        b"/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
-        b"/..\\..\\..\\..\\etc\\passwd",
         b"//etc/passwd",
         b"//[",
         b"/%00",
@@ -144,10 +142,7 @@ def test_a_request_with_a_body_or_without_an_end_is_a_line_in_the_log_and_no_tro
     "message",
     [
         "text",
-        b"",
-        b"\xc1",
         b"\x91" * 100_000,  # lists in lists
-        msgspec.msgpack.encode([1, 2]),
         msgspec.msgpack.encode({"no": "type"}),
         msgspec.msgpack.encode({"type": "NoSuchMessage"}),
         msgspec.msgpack.encode({"type": "ViewerCameraMessage", "wxyz": 1}),
@@ -207,7 +202,7 @@ def test_the_buttons_of_a_page_save_states_and_images(made_run: Path, serve: Ser
 
 
 NAN = float("nan")
-PLACES = [(label, value) for value in (NAN, float("inf"), -1e300, 1e9) for label in ("frame", "along shaft (mm)")]
+PLACES = [(label, value) for value in (NAN, 1e9) for label in ("frame", "along shaft (mm)")]
 CAMERAS: list[dict[str, Any]] = [
     {"position": [NAN] * 3},
     {"position": [1e300, -1e300, 1e300]},

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from scene_worlds import GRASPER, make_nerf, make_scene, pose_of
 from scipy.spatial.transform import Rotation
 from viewer_world import LIMITS, grasper_scene
@@ -53,12 +52,6 @@ def test_half_way_between_two_frames_everything_is_half_way() -> None:
     assert Rotation.from_matrix(pose[:3, :3]).as_rotvec() == pytest.approx([0, 0, 0.5])
     assert state.instruments[NAME].joints["jaw_angle"] == pytest.approx(0.4)
     assert state.time == pytest.approx(1.5)
-
-
-@pytest.mark.parametrize(("frame", "same"), [(-3.0, 0), (7.0, 1)])
-def test_outside_the_recording_are_its_ends(frame: float, same: int) -> None:
-    states = two_states()
-    assert interpolated_state(states, frame) is states[same]
 
 
 def test_sliding_goes_along_the_shaft_and_turns_nothing() -> None:
@@ -125,19 +118,6 @@ def test_steered_poses_are_rigid() -> None:
 )
 def test_only_an_unsteered_frame_is_recorded(controls: Controls, frame: int | None) -> None:
     assert controls.recorded_frame == frame
-
-
-@pytest.mark.parametrize("method", ["kinematic", "nps", "3dgs", "deformable-3dgs", "4dgs"])
-def test_every_method_is_steered_to_a_state_it_can_draw(method: str) -> None:
-    scene = make_scene(method)
-    shafts = shafts_of(scene)
-    controls = Controls(
-        2.5, {item.name: InstrumentControls({"jaw_angle": 0.5}, 2.0, 0.1, 0.2, 0.3) for item in scene.instruments}
-    )
-    state = controlled_state(scene.recorded.states, shafts, controls)
-    with torch.no_grad():
-        assert torch.isfinite(scene.render(state, scene.recorded.cameras[0]).color).all()
-    assert set(shafts) == {item.name for item in scene.instruments}
 
 
 def test_a_field_is_steered_by_time_alone() -> None:

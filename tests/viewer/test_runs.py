@@ -106,13 +106,6 @@ def test_a_run_without_scene_or_checkpoint_is_refused_in_one_line(run: Path) -> 
     assert "\n" not in str(refused.value)
 
 
-def test_no_run_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(NeecoError, match="no such run folder"):
-        ViewedRun(tmp_path / "none")
-    with pytest.raises(NeecoError, match="not a run folder"):
-        ViewedRun(tmp_path)
-
-
 def test_while_it_is_trained_the_checkpoint_is_shown_and_then_the_scene(made_run: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     train(made_run.parent / "capture", run, TrainConfig(method="3dgs", iterations=6, max_tissue_gaussians=200))

@@ -57,13 +57,6 @@ def test_kept_states_come_back_from_the_sampler_as_they_were(saved: SavedStates,
         assert (camera.width, camera.fx) == (WIDTH, 60.0)
 
 
-def test_what_was_kept_before_stays(saved: SavedStates, loaded: LoadedRun, tmp_path: Path) -> None:
-    saved.add(loaded, some_state(loaded), VIEW)
-    before = saved.states_path.read_text()
-    assert SavedStates(tmp_path / "run").add(loaded, some_state(loaded, roll=1.0), VIEW) == 2
-    assert saved.states_path.read_text().startswith(before)
-
-
 def test_states_of_another_scene_are_not_written_over(saved: SavedStates, loaded: LoadedRun) -> None:
     saved.folder.mkdir()
     text = json.dumps({"instruments": [{"name": "other", "pose": np.eye(4).tolist(), "joints": {}}]}) + "\n"
@@ -87,11 +80,6 @@ def test_a_saved_image_is_one_that_synthesize_would_write(saved: SavedStates, lo
     assert np.abs(image - drawn.image.numpy()).max() <= 0.51 / 255
     mask = np.asarray(Image.open(samples / "masks" / path.name)) > 0
     assert (mask == (drawn.parts.numpy() > 0)).mean() > 0.99
-
-
-def test_images_are_numbered_on(saved: SavedStates, loaded: LoadedRun) -> None:
-    names = [saved.save_image(loaded, some_state(loaded, roll=roll), VIEW).name for roll in (0.0, 0.5)]
-    assert names == ["000000.png", "000001.png"]
 
 
 def test_a_saved_image_is_as_large_as_was_asked(saved: SavedStates, loaded: LoadedRun) -> None:

@@ -71,11 +71,6 @@ def test_it_listens_on_loopback_only(made_run: Path, serve: Serve) -> None:
         other.bind(("127.0.0.2", port))
 
 
-def test_a_taken_port_gives_the_next_one(made_run: Path, serve: Serve) -> None:
-    first = port_of(serve(made_run))
-    assert port_of(serve(made_run, port=first)) > first
-
-
 def test_a_browser_that_asks_for_a_tunnel_gets_none(made_run, serve, monkeypatch):
     asked: list[object] = []
     monkeypatch.setattr("viser._viser.ViserTunnel", lambda *given: asked.append(given))
@@ -85,20 +80,6 @@ def test_a_browser_that_asks_for_a_tunnel_gets_none(made_run, serve, monkeypatch
         wishing.send(_packed(wish))
         time.sleep(0.5)
     assert asked == []
-
-
-def test_plain_viser_would_give_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that the test above can fail."""
-    asked: list[object] = []
-    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *given: asked.append(given))
-    server = viser.ViserServer(host="127.0.0.1", port=18080, verbose=False)
-    try:
-        with connect(f"ws://127.0.0.1:{server.get_port()}/", subprotocols=[PROTOCOL]) as wishing:
-            wishing.send(_packed(messages.ShareUrlRequest()))
-            time.sleep(0.5)
-    finally:
-        server.stop()
-    assert len(asked) == 1
 
 
 def _packed(message: object) -> bytes:

@@ -12,7 +12,7 @@ from scene_worlds import make_nerf, make_scene
 from viewer_world import HEIGHT, WIDTH, camera, grasper_scene
 
 from neeco.labels.drawing import draw
-from neeco.viewer.runs import Timeline, ViewedRun, coarse_psnr, narrowed, score_frame
+from neeco.viewer.runs import Timeline, ViewedRun, coarse_psnr, score_frame
 from neeco.viewer.views import (
     DEPTH,
     DIFFERENCE,
@@ -24,7 +24,6 @@ from neeco.viewer.views import (
     VIEWS,
     Picture,
     difference,
-    dimmed,
     picture,
     views_of,
 )
@@ -39,10 +38,6 @@ def scene():
 
 def shown(scene, view: str, frame: int = 0) -> Picture:
     return picture(scene, scene.recorded.states[frame], camera(), view)
-
-
-def plain(color: tuple[int, int, int], width: int = 8, note: str = "") -> Picture:
-    return Picture(np.full((6, width, 3), color, np.uint8), np.full((6, width), float(color[0])), note)
 
 
 def test_the_image_is_the_drawing(scene) -> None:
@@ -142,10 +137,6 @@ def test_a_field_shows_image_and_depth() -> None:
         assert picture(scene, scene.recorded.states[0], scene.recorded.cameras[0], view).pixels.shape == (6, 8, 3)
 
 
-def test_what_cannot_be_compared_is_darker() -> None:
-    assert dimmed(plain((100, 200, 0))).pixels[0, 0].tolist() == [35, 70, 0]
-
-
 def test_a_frame_that_the_scene_draws_itself_scores_best(made_run: Path) -> None:
     loaded = ViewedRun(made_run).loaded
     score = score_frame(loaded, 3)
@@ -163,10 +154,3 @@ def test_the_timeline_finds_the_worst_frame(made_run: Path) -> None:
     assert timeline.known.tolist() == list(range(9))
     assert timeline.worst()[0] == 4
     assert timeline.psnr[4] < 40 < np.delete(timeline.psnr, 4).min()
-
-
-def test_a_narrower_image_is_of_the_same_view() -> None:
-    small = narrowed(camera(), 32)
-    assert (small.width, small.height) == (32, 24)
-    assert (small.fx / small.width, small.cx / small.width) == (camera().fx / WIDTH, 0.5)
-    assert narrowed(small, 500) is small

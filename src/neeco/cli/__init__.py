@@ -74,37 +74,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # SIGTERM ends as Ctrl-C does: tidily
         terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        try:
-            return _status(words)
-        finally:
-            sys.stdout.flush()
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            status = _dispatch(words)
+        sys.stdout.flush()
+        return status
     except (BrokenPipeError, SystemExit) as error:
         # rich turns a broken pipe into SystemExit
         if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
             raise
         return PIPE_CLOSED
-    except OSError as error:  # a full disk
-        with contextlib.suppress(OSError):
-            _print_error(f"output: {error.strerror or error}; check that path and the disk")
-        return 1
-    finally:
-        _discard_unwritable()
-        if before is None:
-            os.environ.pop(FOLLOW_LINKS, None)
-        else:
-            os.environ[FOLLOW_LINKS] = before
-        if terminate is not None:
-            signal.signal(signal.SIGTERM, terminate)
-
-
-def _status(words: list[str]) -> int:
-    """Exit status of a command line; a failure that the user can correct is one line on stderr."""
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _warn
-            return _dispatch(words)
-    except BrokenPipeError:
-        raise
     except KeyboardInterrupt as interrupt:
         message = " ".join(map(str, interrupt.args)) or "run the same command again"
         print(f"\nneeco: interrupted: {visible(message)}", file=sys.stderr)
@@ -120,6 +99,14 @@ def _status(words: list[str]) -> int:
         else:
             raise
         return 1
+    finally:
+        _discard_unwritable()
+        if before is None:
+            os.environ.pop(FOLLOW_LINKS, None)
+        else:
+            os.environ[FOLLOW_LINKS] = before
+        if terminate is not None:
+            signal.signal(signal.SIGTERM, terminate)
 
 
 def _with_target(words: list[str]) -> list[str]:
@@ -181,14 +168,12 @@ def _dispatch(words: list[str]) -> int:
         _print_error(f"{problem}; {hint}`neeco --help` lists all")
         raise SystemExit(USAGE)
     run, arguments = _verb(words)
-    from neeco.cli._output import number_values, usage_error
+    from neeco.cli._output import usage_error
 
     box = io.StringIO()  # tyro frames what is wrong
     try:
         with contextlib.redirect_stderr(box):
-            parsed = tyro.cli(
-                arguments, prog=f"neeco {words[0]}", args=words[1:], config=config, registry=number_values()
-            )
+            parsed = tyro.cli(arguments, prog=f"neeco {words[0]}", args=words[1:], config=config)
     except SystemExit as end:
         if end.code:
             _print_error(usage_error(box.getvalue(), words, arguments))

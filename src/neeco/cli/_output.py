@@ -7,7 +7,6 @@ import itertools
 import json
 import os
 import re
-import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -20,11 +19,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from neeco.base.errors import NeecoError, nearest
 from neeco.base.files import finite, new_folder, require_replaceable, write_json
-from neeco.base.settings import WORDS, described, field_texts, value_words
+from neeco.base.settings import described, field_texts, value_words
 
 if TYPE_CHECKING:
     from neeco.studies.tables import ResultTable
@@ -53,54 +51,37 @@ def whole_lines(*, stderr: bool = False) -> Console:
 
 
 def fitted(table: ResultTable, width: int) -> list[Table]:
-    """Split a table into as many pieces as a terminal of `width` characters needs; each has the key columns.
-
-    The best of a column and reference rows are bold; a failed row is marked in every piece.
-    """
+    """Split a table into as many pieces as a terminal of `width` characters needs; each has the key columns, and of a
+    failed row its first cell. The best of a column and reference rows are bold."""
     headings, keys = [*table.keys, *(column.title for column in table.columns)], len(table.keys)
     rows = []
     for row in table.rows:
         cells = [Text(str(cell), "bold" if cell.best or row.reference else "") for cell in row.cells]
-        cells_or_reason = cells if row.failed is None else [Text("failed", "red")]
-        rows.append([*(Text(key, "bold" if row.reference else "") for key in row.keys), *cells_or_reason])
-    return _pieces(table.title, headings, rows, keys, width)
-
-
-def _pieces(title: str, headings: Sequence[str], rows: Sequence[Sequence[Text]], keys: int, width: int) -> list[Table]:
-    """`fitted` of texts. A row of one cell behind its keys says the same in every piece."""
-    full = [[*row[:keys], *[row[keys]] * (len(headings) - keys)] if len(row) == keys + 1 else row for row in rows]
+        failed = [Text("failed", "red")] * len(table.columns)
+        rows.append(
+            [*(Text(key, "bold" if row.reference else "") for key in row.keys), *(failed if row.failed else cells)]
+        )
     widths = [
-        max([*map(len, heading.split()), *(len(row[index]) for row in full)], default=0)
-        for index, heading in enumerate(headings)
+        max([*map(len, heading.split()), *(len(row[at]) for row in rows)], default=0)
+        for at, heading in enumerate(headings)
     ]
-    left = width - 1 - sum(BORDER + widths[index] for index in range(keys))
-    groups: list[list[int]] = [[]]
-    for index in range(keys, len(headings)):
-        if groups[-1] and sum(BORDER + widths[i] for i in (*groups[-1], index)) > left:
-            groups.append([])
-        groups[-1].append(index)
-    return [
-        _piece(title if group is groups[0] else f"{title}, continued", headings, rows, keys, group, widths)
-        for group in groups
-    ]
-
-
-def _piece(
-    title: str,
-    headings: Sequence[str],
-    rows: Sequence[Sequence[Text]],
-    keys: int,
-    group: list[int],
-    widths: Sequence[int],
-) -> Table:
-    """The columns of `group` behind the key columns, each as wide as its longest word."""
-    whole = Text(title, "italic", no_wrap=True, overflow="ignore")
-    table = Table(*(Column(headings[i], no_wrap=True) for i in range(keys)), title=whole, title_justify="left")
-    for index in group:
-        table.add_column(headings[index], justify="right", width=widths[index])
-    for row in rows:
-        table.add_row(*row[:keys], *(row[keys:] if len(row) == keys + 1 else [row[i] for i in group]))
-    return table
+    pieces: list[list[int]] = []
+    for at in range(keys, len(headings)):
+        taken = [*range(keys), *(pieces[-1] if pieces else ()), at]
+        if not pieces or sum(BORDER + widths[index] for index in taken) >= width:
+            pieces.append([])
+        pieces[-1].append(at)
+    tables: list[Table] = []
+    for piece in pieces or [[]]:
+        title = f"{table.title}, continued" if tables else table.title
+        made = Table(title=Text(title, "italic", no_wrap=True, overflow="ignore"), title_justify="left")
+        for at in (*range(keys), *piece):
+            numbers: dict[str, Any] = {"justify": "right", "width": widths[at]} if at >= keys else {"no_wrap": True}
+            made.add_column(headings[at], **numbers)
+        for row, cells in zip(table.rows, rows, strict=True):
+            made.add_row(*cells[:keys], *(cells[at] for at in (piece[:1] if row.failed else piece)))
+        tables.append(made)
+    return tables
 
 
 def print_outcome(
@@ -167,44 +148,45 @@ def ready_for_json(path: Path | None) -> Iterator[None]:
 DEFAULT = " Default: "  # begins the last sentence of an option's text, where its default is no value
 
 
-@cache
-def state_defaults(kind: Any) -> None:
-    """Make the help of a dataclass of arguments state what holds where an option without a value of its own is left
-    out: the text behind DEFAULT, in place of None."""
-    texts = field_texts(kind)
-    for field in dataclasses.fields(kind):
-        hint = typing.get_type_hints(kind, include_extras=True)[field.name]
-        bare = typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
-        markers = getattr(hint, "__metadata__", ())
-        if dataclasses.is_dataclass(bare):
-            state_defaults(bare)  # type: ignore[arg-type]
-            continue
-        if tyro.conf.Positional in markers and not any(getattr(marker, "metavar", None) for marker in markers):
-            name = f"[{field.name} ...]" if typing.get_origin(bare) is tuple else field.name
-            kind.__annotations__[field.name] = hint = Annotated[hint, tyro.conf.arg(metavar=name.upper())]
-        required = field.default is dataclasses.MISSING and typing.get_origin(bare) is tuple
-        empty = required or field.default in (None, ())
-        if empty and field.name in texts and tyro.conf.UseAppendAction not in markers:
-            text, _, default = texts[field.name].removesuffix(".").partition(DEFAULT)
-            end = f"(default: {default})" if default else "(required)" if required else "(optional)"
-            metavar = [] if tyro.conf.Positional in markers else [tyro.conf.arg(metavar=value_words(hint))]
-            changed = hint
-            for argument in (*metavar, tyro.conf.arg(help=text, help_behavior_hint=end)):
-                changed = Annotated[changed, argument]
-            kind.__annotations__[field.name] = changed
-
-
-def option_names(kind: Any) -> list[str]:
-    """Return the options of a dataclass of arguments, such as `--output`; nested ones add theirs."""
-    names = []
+def _options(kind: Any) -> Iterator[tuple[Any, dataclasses.Field[Any], Any, tuple[Any, ...]]]:
+    """Yield the options of a dataclass of arguments: owner, field, type and markers; nested ones add theirs."""
     hints = typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
         bare = typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
-        markers = getattr(hint, "__metadata__", ())
         if dataclasses.is_dataclass(bare):
-            names += option_names(bare)
-        elif tyro.conf.Positional not in markers:
+            yield from _options(bare)
+        else:
+            yield kind, field, bare, getattr(hint, "__metadata__", ())
+
+
+@cache
+def state_defaults(kind: Any) -> None:
+    """Make the help of a dataclass of arguments state what holds where an option without a value of its own is left
+    out: the text behind DEFAULT, in place of None."""
+    for owner, field, bare, markers in list(_options(kind)):
+        added = []
+        repeated, texts = typing.get_origin(bare) is tuple, field_texts(owner)
+        if tyro.conf.Positional in markers and not any(getattr(marker, "metavar", None) for marker in markers):
+            name = f"[{field.name} ...]" if repeated else field.name
+            added.append(tyro.conf.arg(metavar=name.upper()))
+        required = field.default is dataclasses.MISSING and repeated
+        empty = required or field.default in (None, ())
+        if empty and field.name in texts and tyro.conf.UseAppendAction not in markers:
+            text, _, default = texts[field.name].removesuffix(".").partition(DEFAULT)
+            end = f"(default: {default})" if default else "(required)" if required else "(optional)"
+            added += [] if tyro.conf.Positional in markers else [tyro.conf.arg(metavar=value_words(bare))]
+            added.append(tyro.conf.arg(help=text, help_behavior_hint=end))
+        for marker in (*markers, *added) if added else ():
+            bare = Annotated[bare, marker]
+            owner.__annotations__[field.name] = bare
+
+
+def option_names(kind: Any) -> list[str]:
+    """Return the options of a dataclass of arguments, such as `--output`."""
+    names = []
+    for _, field, _, markers in _options(kind):
+        if tyro.conf.Positional not in markers:
             name = next(filter(None, (getattr(marker, "name", None) for marker in markers)), field.name)
             names.append(f"--{'no-' if field.default is True else ''}{name.replace('_', '-')}")
     return names
@@ -225,46 +207,17 @@ def usage_error(box: str, words: Sequence[str], kind: Any) -> str:
     line = " ".join(f"{row}:" if re.match(" {4}[^ ]", row) else row for row in first)  # names of what is missing
     line = re.sub(r"[. ]*\(required\)", ";", " ".join(line.split())).rstrip(".;").removeprefix("Error parsing ")
     line = re.sub("^Missing from [^:]+:", f"{words[0]}: missing", line)
+    line = re.sub(
+        r"no type matching \{None\}\|\{?([^{}]*)\}? could be instantiated from \[(.*)\]", r"expected \1, got \2", line
+    )
+    line = line.replace("invalid literal for int() with base 10:", "expected INT, got")
+    line = line.replace("could not convert string to float:", "expected FLOAT, got")
     line = line.replace("Unrecognized options:", f"{words[0]}: no such option or argument:")
-    if value := re.search(r"Missing value for argument '--([\w-]+)'", line):
-        text = field_texts(kind).get(value[1].replace("-", "_"), "").partition(DEFAULT)[0]
-        line = f"--{value[1]}: needs a value: {text}".rstrip(" .:")
+    if value := re.search(r"Missing value for argument '--([\w-]+)'|^--([\w-]+): expected", line):
+        option = value[1] or value[2]
+        text = field_texts(kind).get(option.replace("-", "_"), "").partition(DEFAULT)[0].rstrip(".")
+        line = f"{line if value[2] else f'--{option}: needs a value'}: {text}".rstrip(" :")
     return f"{line}; see `neeco {words[0]} --help`"
-
-
-def number_values() -> ConstructorRegistry:
-    """Return tyro's rules for options that are numbers, or None where they are left out: one sentence on a word that is
-    none."""
-    registry = ConstructorRegistry()
-
-    @registry.primitive_rule
-    def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-        arms = typing.get_args(info.type) if isinstance(info.type, types.UnionType) else (info.type,)
-        kind, *others = [arm for arm in arms if arm is not type(None)] or arms
-        items = typing.get_args(kind) if typing.get_origin(kind) is tuple else (kind,)
-        if others or not items or not {*items} <= {int, float}:
-            return None
-
-        def read(words: list[str]) -> Any:
-            if type(None) in arms and {*words} == {"None"}:
-                return None
-            values = []
-            for item, word in zip(items, words, strict=True):
-                try:
-                    values.append(item(word))
-                except ValueError:
-                    raise ValueError(f"{word!r} is not {WORDS[item]}") from None
-            return values[0] if kind in items else tuple(values)
-
-        return PrimitiveConstructorSpec(
-            nargs=len(items),
-            metavar=value_words(kind),
-            instance_from_str=read,
-            is_instance=lambda value: True,
-            str_from_instance=lambda value: list(map(str, value if isinstance(value, tuple) else [value])),
-        )
-
-    return registry
 
 
 def print_settings(title: str, kind: type[Any], note: str) -> None:

@@ -12,8 +12,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
-from rich.text import Text
+from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from neeco.base.errors import NeecoError, visible
 from neeco.base.files import is_vacant
@@ -36,6 +35,7 @@ class ProgressSettings:
     wide: int = 100  # least width in characters of a terminal on which bars are long
     min_shown_s: float = 1.0  # least s of work that has a last line
     evaluation_share: float = 0.1  # share of a job's bar for evaluation; the rest is training
+    speed_s: float = 3600.0  # s over which the speed is taken that the time left follows from
 
 
 PROGRESS = ProgressSettings()
@@ -52,9 +52,9 @@ class Bars:
             BarColumn(bar_width=20 if console.width >= PROGRESS.wide else 5),
             TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(),
-            _TimeLeft(),
+            TimeRemainingColumn(),
         )
-        self.bar = Progress(*columns, console=console)
+        self.bar = Progress(*columns, console=console, speed_estimate_period=PROGRESS.speed_s)
         self.tasks: dict[str, TaskID] = {}
         self.stages: list[TaskID] = []
         self.began = time.monotonic()
@@ -87,7 +87,7 @@ class Bars:
             for before in self.stages:
                 self._complete(before)
             self.stages.append(task)
-        self._update(task, done, f"{done}/{total}" if total else "", total=total or None)
+        self.bar.update(task, completed=done, total=total or None, text=f"{done}/{total}" if total else "")
 
     def training(self, row: ProgressRow) -> None:
         """Progress of `train`."""
@@ -95,11 +95,9 @@ class Bars:
         if row.note:
             self._print(row.note, style="dim")
             return
-        if not self._found(task).completed:  # preparation counts, and the time before an interruption
-            self._found(task).start_time = self.bar.get_time() - row.seconds
         size = f", {row.num_gaussians} Gaussians" if row.num_gaussians else ""
         text = f"iteration {row.iteration}, PSNR {row.psnr:.1f} dB{size}"
-        self._update(task, row.progress, text, row.seconds_left)
+        self.bar.update(task, completed=row.progress, text=text)
 
     def end(self, title: str) -> None:
         """Complete the bar of `title`, if there is one."""
@@ -120,7 +118,7 @@ class Bars:
         share = news.share * (1 - PROGRESS.evaluation_share)
         if news.stage == "evaluating":
             share = 1 - PROGRESS.evaluation_share * (1 - news.share)
-        self._update(task, share, f"{news.stage} {news.text}".rstrip())
+        self.bar.update(task, completed=share, text=f"{news.stage} {news.text}".rstrip())
 
     def _task(self, title: str, total: float | None = 1.0) -> TaskID:
         if self.bar.console.is_terminal:
@@ -128,23 +126,11 @@ class Bars:
         elif not self.tasks:
             self.lines.start()
         if title not in self.tasks:
-            self.tasks[title] = self.bar.add_task(title, total=total, text="", ends=None)
+            self.tasks[title] = self.bar.add_task(title, total=total, text="")
         return self.tasks[title]
 
-    def _found(self, task: TaskID) -> Task:
-        return next(one for one in self.bar.tasks if one.id == task)
-
-    def _update(
-        self, task: TaskID, done: float, text: str, left: float | None = None, *, total: float | None = 1.0
-    ) -> None:
-        """Note progress, and when all is done: in `left` s, by default at the speed so far."""
-        if left is None and total and done:
-            left = (self._found(task).elapsed or 0.0) * (total / done - 1)
-        ends = None if left is None else self.bar.get_time() + left
-        self.bar.update(task, completed=done, total=total, text=text, ends=ends)
-
     def _complete(self, task: TaskID) -> None:
-        total = self._found(task).total or 1.0
+        total = next(one.total for one in self.bar.tasks if one.id == task) or 1.0
         self.bar.update(task, completed=total, total=total)
 
     def _print_lines(self) -> None:
@@ -156,29 +142,14 @@ class Bars:
         self.bar.console.print(visible(line), style=style, markup=False, highlight=False, soft_wrap=True)
 
 
-class _TimeLeft(ProgressColumn):
-    """Time that a task still takes, counted down between two reports of its progress."""
-
-    max_refresh = 0.5
-
-    def render(self, task: Task) -> Text:
-        left = _seconds_left(task)
-        return Text("" if left is None else f"{_duration(left)} left", style="progress.remaining")
-
-
-def _seconds_left(task: Task) -> float | None:
-    ends = task.fields["ends"]
-    return None if ends is None or task.finished else max(0.0, ends - task.get_time())
-
-
 def _line(task: Task) -> str:
     """State what is done, how far it is, and how long it still takes at the speed so far."""
     passed = task.finished_time or task.elapsed or 0.0
     words = [f"{task.percentage:.0f} %"] if task.total else []
     words += [task.fields["text"]] if task.fields["text"] else []
     words += [f"{_duration(passed)} passed"]
-    if (left := _seconds_left(task)) is not None:
-        words += [f"about {_duration(left)} left"]
+    if task.time_remaining:
+        words += [f"about {_duration(task.time_remaining)} left"]
     return f"{task.description}: {', '.join(words)}"
 
 

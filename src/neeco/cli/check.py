@@ -63,9 +63,6 @@ def _print(problems: list[Problem], errors: int, summary: CaptureSummary) -> Non
 def _summary_lines(summary: CaptureSummary) -> list[str]:
     frames = ", ".join(f"{count} {name!r}" for name, count in summary.splits.items()) or "none"
     lines = [f"frames: {frames}", f"sparse points: {summary.points}"]
-    expected = _expected_labels(summary.splits.get("train", 0)) if summary.travel_mm else None
-    if expected is not None:
-        lines.append(expected)
     if summary.still:
         lines.append(
             "scope: stands still; nothing shows the scene from elsewhere, so render views near the recorded ones"
@@ -78,24 +75,3 @@ def _summary_lines(summary: CaptureSummary) -> list[str]:
         ]
         lines.append(f"instrument {name!r}: " + ", ".join([f"moves {travel:.1f} mm", *joints]))
     return lines
-
-
-# Training frames -> label IoU on seen and on unseen states, measured on the capture that looks most like a recording
-LABEL_IOU = {10: (0.91, 0.82), 15: (0.94, 0.88), 60: (0.97, 0.93)}
-
-
-def _expected_labels(frames: int) -> str | None:
-    """Return one line on what labels so many training frames gave, and a larger number; None where no more are needed,
-    or they are too few to train on."""
-    from neeco.capture.checks.settings import SETTINGS
-
-    counts = sorted(LABEL_IOU)
-    if not SETTINGS.min_train_frames <= frames < counts[-1]:
-        return None
-    index = max(0, sum(count <= frames for count in counts) - 1)
-    gave = [
-        f"{count} training frames gave IoU {LABEL_IOU[count][0]:.2f} on seen and {LABEL_IOU[count][1]:.2f} on unseen "
-        "states"
-        for count in counts[index : index + 2]
-    ]
-    return f"labels to expect: with exact states, {', '.join(gave)}"

@@ -12,24 +12,6 @@ from rich.table import Column, Table
 from neeco.base.settings import Device
 from neeco.cli._output import JsonTarget, ready_for_json, whole_lines, write_numbers
 
-COLUMNS = (
-    ("PSNR", "psnr", "{:.2f}"),
-    ("SSIM", "ssim", "{:.3f}"),
-    ("LPIPS", "lpips", "{:.3f}"),
-    ("PSNR in instrument", "psnr_instrument", "{:.2f}"),
-    ("mask IoU", "mask_iou", "{:.3f}"),
-    ("mask precision", "mask_precision", "{:.3f}"),
-    ("mask recall", "mask_recall", "{:.3f}"),
-    ("estimated IoU", "estimated_iou", "{:.3f}"),
-    ("recall on shafts", "shaft_recall", "{:.3f}"),
-    ("shadow labelled", "shadow_labelled", "{:.1%}"),
-    ("PSNR of observed tissue", "psnr_covered", "{:.2f}"),
-    ("observed tissue", "covered_fraction", "{:.1%}"),
-    ("FPS", "fps", "{:.1f}"),
-    ("Gaussians", "num_gaussians", "{:,}"),
-    ("frames", "frames", "{}"),
-)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
@@ -81,16 +63,17 @@ def run(args: Evaluate) -> int:
 
 
 def evaluation_table(evaluation: dict[str, Any]) -> Table:
-    """Return the scores, one column per split and kind of pose, so that they fit a narrow terminal."""
+    """Return the scores of the report, one column per split and kind of pose, so that they fit a narrow terminal."""
+    from neeco.report.run_page import SCORES, Score
+
     scored = [(kind, split) for kind in ("given", "aligned") for split in evaluation.get(kind, {})]
     table = Table("poses", *(Column(f"{kind}\n{split}", justify="right") for kind, split in scored))
-    for title, key, form in COLUMNS:
-        values = [evaluation[kind][split][key] for kind, split in scored]
-        if all(value is None for value in values):  # a note says why
-            continue
-        table.add_row(title, *("-" if value is None else form.format(value) for value in values))
-    for part in dict.fromkeys(part for kind, split in scored for part in evaluation[kind][split]["part_iou"]):
-        values = [evaluation[kind][split]["part_iou"][part] for kind, split in scored]
-        if any(value is not None for value in values):
-            table.add_row(f"{part} IoU", *("-" if value is None else f"{value:.3f}" for value in values))
+    numbers = [evaluation[kind][split] for kind, split in scored]
+    parts = [
+        Score(part, f"{part} IoU") for part in dict.fromkeys(part for item in numbers for part in item["part_iou"])
+    ]
+    for scores, values in ((SCORES, numbers), (parts, [item["part_iou"] for item in numbers])):
+        for score in scores:
+            if any(item.get(score.key) is not None for item in values):  # else a note says why
+                table.add_row(score.heading, *map(score.written, values))
     return table

@@ -30,14 +30,21 @@ class Ingest(IngestRequest):
 
 def run(args: Ingest) -> int:
     """Ingest, convert, or write a template."""
+    from rich.table import Table
+
     from neeco.cli._output import ready_for_json, write_numbers
     from neeco.cli._progress import Bars
     from neeco.ingest.convert import convert_folder
+    from neeco.ingest.readers import recording_formats
     from neeco.ingest.sources import sources_of, write_draft
     from neeco.report.ingest_page import ingest_and_report
 
     if args.formats:
-        return _list_formats()
+        table = Table("format", "read of it", "extra")
+        for reader in recording_formats():
+            table.add_row(reader.format, reader.holds, reader.extra or "")
+        whole_lines().print(table)
+        return 0
     if args.init:
         print(*write_draft(args.source, print), sep="\n")
         return 0
@@ -64,15 +71,3 @@ def run(args: Ingest) -> int:
             if done.verdict != "doubtful":  # whose last line says not to train
                 print(f"next: neeco train {shlex.quote(str(output))} --output RUN")
     return 1 if args.strict and done.verdict == "doubtful" else 0
-
-
-def _list_formats() -> int:
-    from rich.table import Table
-
-    from neeco.ingest.readers import recording_formats
-
-    table = Table("format", "read of it", "extra")
-    for reader in recording_formats():
-        table.add_row(reader.format, reader.holds, reader.extra or "")
-    whole_lines().print(table)
-    return 0

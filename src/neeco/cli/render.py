@@ -58,7 +58,7 @@ def run(arguments: Arguments) -> int:
     if arguments.video is not None:
         require_ending("--video", arguments.video, ".mp4")
         require_pyav()
-    elif arguments.frames is not None:
+    if arguments.frames is not None and arguments.video is None:
         raise NeecoError("--frames: applies to --video only; leave it out")
     if arguments.frames is not None and not 2 <= arguments.frames <= MAX_IMAGES:
         raise NeecoError(f"--frames must be 2 to {MAX_IMAGES:,} (got {arguments.frames})")
@@ -72,12 +72,10 @@ def run(arguments: Arguments) -> int:
         with counting("render", len(views)) as advance:
             if arguments.video is not None:
                 write_video(trained.scene, views, arguments.video, advance, arguments.images)
-            else:
-                assert arguments.output is not None
-                rendered = render(trained.scene, views, arguments.output / folder, advance, arguments.images)
-    if arguments.video is not None:
-        print(f"{len(views)} images in {arguments.video}")
-        return 0
+                print(f"{len(views)} images in {arguments.video}")
+                return 0
+            assert arguments.output is not None
+            rendered = render(trained.scene, views, arguments.output / folder, advance, arguments.images)
     print(f"{rendered.images} images in {rendered.folder}")
     if not rendered.labelled:
         print(f"no part ids and masks: method {trained.scene.method!r} learns no labels")

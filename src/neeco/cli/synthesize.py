@@ -54,13 +54,17 @@ def run(arguments: Arguments) -> int:
 
     if arguments.push_to_hub is not None:
         check_hub(arguments.push_to_hub)
-    settings = arguments.settings
-    tissue, instruments = _runs(arguments)
+    if (arguments.run is None) == (arguments.tissue is None):
+        raise NeecoError("synthesize: give a RUN, or --tissue RUN with --instruments RUN ...; one of the two")
+    if (arguments.tissue is None) != (not arguments.instruments):
+        raise NeecoError("--instruments: needs --tissue RUN, and --tissue needs it; give both or neither")
+    settings, first = arguments.settings, arguments.run or arguments.tissue
+    assert first is not None
     with Bars() as bars, resumable(arguments.output):
         made = synthesize(
-            tissue,
+            first,
             arguments.output,
-            instruments=instruments,
+            instruments=arguments.instruments,
             formats=arguments.formats,
             resume=arguments.resume,
             workers=arguments.workers,
@@ -79,15 +83,3 @@ def run(arguments: Arguments) -> int:
     if arguments.push_to_hub is not None:
         print(f"uploaded to {push_to_hub(made.output, arguments.push_to_hub)}")
     return 0
-
-
-def _runs(arguments: Arguments) -> tuple[Path, tuple[Path, ...]]:
-    """The run to render, and those whose instruments are rendered over its tissue."""
-    if (arguments.run is None) == (arguments.tissue is None):
-        raise NeecoError("synthesize: give a RUN, or --tissue RUN with --instruments RUN ...; one of the two")
-    if (arguments.tissue is None) != (not arguments.instruments):
-        raise NeecoError("--instruments: needs --tissue RUN, and --tissue needs it; give both or neither")
-    if arguments.run is not None:
-        return arguments.run, ()
-    assert arguments.tissue is not None
-    return arguments.tissue, arguments.instruments

@@ -49,12 +49,22 @@ def run(arguments: Arguments) -> int:
     """Export, or serve until Ctrl-C."""
     from neeco.raster.devices import device_of
 
+    if arguments.annotate and arguments.export is not None:
+        raise NeecoError("--annotate, --export: give one of the two")
     if arguments.annotate:
-        return _annotate(arguments)
+        from neeco.viewer.posing import PosingServer
+
+        with PosingServer(arguments.source, arguments.host, arguments.port) as server:
+            return _serve(server.address, arguments)
     if arguments.export is not None:
+        from neeco.cli._output import require_ending
+        from neeco.viewer.export import export_page
+
         if arguments.size != RECORDED_SIZE:
             raise NeecoError("--size, --scale: an exported page renders at the size of its window; leave them out")
-        return _export(arguments, arguments.export)
+        require_ending("--export", arguments.export, ".html", ".htm")
+        print(export_page(arguments.source, arguments.export, arguments.sh, device_of(arguments.device)))
+        return 0
     arguments.size.check()
     if is_capture(arguments.source):
         from neeco.viewer.recording import RecordingServer
@@ -105,22 +115,3 @@ def _opened(address: str) -> Iterator[None]:
         page.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={address}">', encoding="utf-8")
         webbrowser.open(page.as_uri())
         yield
-
-
-def _annotate(arguments: Arguments) -> int:
-    from neeco.viewer.posing import PosingServer
-
-    if arguments.export is not None:
-        raise NeecoError("--annotate, --export: give one of the two")
-    with PosingServer(arguments.source, arguments.host, arguments.port) as server:
-        return _serve(server.address, arguments)
-
-
-def _export(arguments: Arguments, output: Path) -> int:
-    from neeco.cli._output import require_ending
-    from neeco.raster.devices import device_of
-    from neeco.viewer.export import export_page
-
-    require_ending("--export", output, ".html", ".htm")
-    print(export_page(arguments.source, output, arguments.sh, device_of(arguments.device)))
-    return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts
 from neeco.report.charts import Series, legend, line_chart
 from neeco.report.page import REPORT_FILE, Figure, Images, Section, jpeg, split_counts, write_page
-from neeco.studies.downstream.experiment import DownstreamPlan, read_predictions
+from neeco.studies.downstream.experiment import DownstreamPlan, held_out_samples, read_predictions
 from neeco.studies.downstream.results import (
     MAIN,
     TITLES,
@@ -22,7 +23,6 @@ from neeco.studies.downstream.results import (
     Prediction,
     failed_jobs,
     is_synthetic,
-    models_and_tests,
     rows_of,
     summary_text,
     table_of,
@@ -45,11 +45,8 @@ Row = Mapping[str, Any]
 
 
 def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Path:
-    """Write `report.html` into the study's folder, and return its path.
-
-    experiment: what `run_downstream` returned; predictions are read from that folder. Raises NeecoError when a picture
-    cannot be read or the page not be written.
-    """
+    """Write `report.html` into the study's folder, and return its path. experiment: what `run_downstream` returned.
+    Raises NeecoError when a picture cannot be read or the page not be written."""
     capture, computer = plan.capture, machine_words(experiment["machine"], "torch_threads")
     files = {"downstream.csv": summary_text(experiment)}
     budget = [
@@ -58,13 +55,14 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
     ]
     text = f"{'; '.join(budget)}; {counted(experiment['folds'], 'fold')}. {EXPLANATION}"
     sections = [Section(title="Results", text=text, files=files)]
-    for model, test in models_and_tests(experiment):
+    pairs = list(product(experiment["models"], experiment["tests"]))
+    for model, test in pairs:
         table, rows = table_of(experiment, model, test), rows_of(experiment, model, test)
         names = list(dict.fromkeys(row["condition"] for row in rows))
         chart = score_chart(model, test, rows)
         figures = [Figure(chart, legend(names, names))] if chart else []
         sections.append(Section(title=table.title, split=test, level=3, results=table, figures=figures))
-    if examples := [section for pair in models_and_tests(experiment) for section in _examples(plan, experiment, *pair)]:
+    if examples := [section for pair in pairs for section in _examples(plan, experiment, *pair)]:
         text = (
             "Frames where a condition with synthetic images gains most over its reference, and where it gains least or "
             "loses, of the first fold; the truth in yellow, under each prediction its IoU."
@@ -76,7 +74,7 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
     ]
     sections.append(Section(title="How it was made", facts=_facts(experiment, capture, computer)))
     return write_page(
-        plan.settings.output / REPORT_FILE,
+        plan.request.output / REPORT_FILE,
         "study.html",
         title=f"{capture.root.name}: what synthetic images are worth",
         name=capture.root.name,
@@ -116,8 +114,8 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
     key = "iou" if model["predicts"] == "masks" else "box_iou"
     predictions, scores = [], []
     for condition, real in arms:
-        wanted = (model["name"], condition, real, plan.settings.kept_fold)
-        predictions.append(read_predictions(plan.settings.job_folder(*wanted), test))
+        wanted = (model["name"], condition, real, plan.request.kept_fold)
+        predictions.append(read_predictions(plan.request.job_folder(*wanted), test))
         jobs = [job for job in experiment["jobs"] if tuple(job[name] for name in JOB_KEYS) == wanted]
         frames = jobs[0]["splits"].get(test, {}).get("per_frame", ()) if jobs else ()
         scores.append({frame["frame"]: frame[key] for frame in frames if frame[key] is not None})
@@ -125,7 +123,7 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
     ranked = sorted(
         (name for name in gains if all(name in each for each in predictions)), key=lambda name: -gains[name]
     )
-    samples = {sample.name: sample for sample in plan.settings.samples(plan.capture, test)}
+    samples = {sample.name: sample for sample in held_out_samples(plan.request, plan.capture, test)}
     sections = []
     for name in dict.fromkeys([*ranked[:2], *ranked[-2:]]):
         example = samples[name].load()

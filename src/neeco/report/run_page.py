@@ -24,6 +24,7 @@ from neeco.labels.drawing import draw
 from neeco.report.charts import CHARTS, Series, line_chart, short
 from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
 from neeco.scene import DrawableScene
+from neeco.studies.tables import UNKNOWN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +45,12 @@ class Score(NamedTuple):
 
     key: str
     heading: str
-    form: str
-    meaning: str
+    form: str = "{:.3f}"
+    meaning: str = ""
 
     def written(self, numbers: Mapping[str, Any]) -> str:
         """Its value among the numbers, as the table shows it."""
-        return "–" if numbers.get(self.key) is None else self.form.format(numbers[self.key])
+        return UNKNOWN if numbers.get(self.key) is None else self.form.format(numbers[self.key])
 
 
 IMAGE_SCORES = (
@@ -57,21 +58,22 @@ IMAGE_SCORES = (
     Score("ssim", "SSIM", "{:.3f}", "Structural similarity, 1 is equal (11x11 Gaussian window, as 3DGS scores it)."),
     Score("lpips", "LPIPS", "{:.3f}", "Perceptual distance by AlexNet features (Zhang et al. 2018); 0 is equal."),
     Score("lpips_vgg", "LPIPS VGG", "{:.3f}", "The same by VGG16 features."),
-    Score("psnr_instrument", "PSNR instr.", "{:.2f}", "PSNR over the pixels where the instrument truly is."),
-    Score("psnr_covered", "PSNR covered", "{:.2f}", "PSNR without the tissue that no training frame saw."),
-    Score("covered_fraction", "covered", "{:.1%}", "How much of the visible tissue at least one training frame saw."),
+    Score("psnr_instrument", "PSNR instrument", "{:.2f}", "PSNR over the pixels where the instrument truly is."),
+    Score("psnr_covered", "PSNR observed", "{:.2f}", "PSNR without the tissue that no training frame saw."),
+    Score("covered_fraction", "observed tissue", "{:.1%}", "Share of the visible tissue that some training frame saw."),
     Score("fps", "FPS", "{:.1f}", "Posed images rendered per second on the machine that evaluated."),
     Score("num_gaussians", "Gaussians", "{:,}", "Gaussians of the finished scene; finishing adds some, as of shafts."),
     Score("frames", "frames", "{}", "How many frames were scored."),
 )  # fmt: skip
 LABEL_SCORES = (
     Score("mask_iou", "mask IoU", "{:.3f}", "Label mask against true mask: shared area over joint area; 1 is perfect."),
-    Score("mask_precision", "precision", "{:.3f}", "How much of the label mask is truly instrument."),
-    Score("mask_recall", "recall", "{:.3f}", "How much of the true mask is labelled."),
+    Score("mask_precision", "mask precision", "{:.3f}", "How much of the label mask is truly instrument."),
+    Score("mask_recall", "mask recall", "{:.3f}", "How much of the true mask is labelled."),
     Score("estimated_iou", "estimated IoU", "{:.3f}", "The mask IoU, estimated from the images alone, without masks."),
-    Score("shaft_recall", "recall, shafts", "{:.3f}", "How much of the true shafts is labelled instrument."),
+    Score("shaft_recall", "recall on shafts", "{:.3f}", "How much of the true shafts is labelled instrument."),
     Score("shadow_labelled", "shadow labelled", "{:.1%}", "How much of the instruments' shadow on tissue is labelled."),
 )  # fmt: skip
+SCORES = (*IMAGE_SCORES, *LABEL_SCORES)
 KINDS = {
     "given": "As given: rendered at the poses the capture states, tracker errors included",
     "aligned": "Aligned: instrument and camera pose fitted to each recorded image first, the scene unchanged",

@@ -1,9 +1,5 @@
-"""The engine of every study (`sweep`, `downstream`): jobs that stand on their own and can be resumed; the machine.
-
-A study is a list of jobs (`Job`), each with a folder of its own, and one JSON file that is valid at every moment.
-`check_output` checks that the output folder is free, or holds the same study begun earlier; `run_jobs` runs all jobs,
-in this process or in workers. A job that fails does not stop the others: its result has an "error".
-"""
+"""The engine of every study (`sweep`, `downstream`): jobs (`Job`), each with a folder of its own, that stand on their
+own and can be resumed, in this process or in workers; the machine. A job that fails does not stop the others."""
 
 from __future__ import annotations
 
@@ -19,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -41,33 +37,33 @@ Reporter = Callable[[int, str, float, str], None]  # `JobProgress` of the job at
 Finisher = Callable[[int, Result], None]  # gets the result of the job at an index
 
 
-class Job(Protocol):
-    """One job of a study. It stores what it finished in its folder, and finds it there when it is run again.
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One job of a study. It stores what it finished in its folder, and finds it there when it is run again."""
 
-    capture: the capture's folder; folder: the one that it writes; device: a word for `device_of`; title: its name in
-    messages.
-    """
+    capture: Path
+    folder: Path  # that it writes
+    device: str = "auto"  # a word for `device_of`, opened where the job runs
 
     @property
-    def capture(self) -> Path: ...
-    @property
-    def folder(self) -> Path: ...
-    @property
-    def device(self) -> str: ...
-    @property
-    def title(self) -> str: ...
+    def title(self) -> str:
+        """Its name in messages."""
+        raise NotImplementedError
 
     def identity(self) -> dict[str, Any]:
         """Return what distinguishes it from the other jobs; part of its result, whether it finishes or fails."""
+        raise NotImplementedError
 
-    def check(self) -> None:
+    def check(self) -> Any:
         """Raises NeecoError when it cannot be run, or its folder holds the work of another job."""
+        raise NotImplementedError
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
         """Do it, and return identity, "splits" (scores by split), "iterations" and whatever else it measures.
 
         capture: its own, where it is read and checked already. Raises NeecoError.
         """
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,23 +101,19 @@ def run_jobs(
     """Run every job and return their results, in their order.
 
     workers 1: in this process, one after another; more, or where RAY_ADDRESS names a cluster: so many at once in
-    processes of their own (so that a script needs `if __name__ == "__main__"`), a job whose worker dies again from its
-    checkpoint. record: gets all results known after each job; finished: those of earlier starts, by the job's place.
-    captures: those of the jobs that are read already, by path, for this process; jobs read the others. light: small
-    jobs, which workers do one after another, sharing the GPUs. A failed job writes no job.json, so that the next start
-    tries again. Raises NeecoError before any work when a job's folder is another job's or the cluster does not answer,
-    and KeyboardInterrupt saying which job was stopped.
+    processes of their own, a job whose worker dies again from its checkpoint. record: gets all results known after each
+    job; finished: those of earlier starts, by the job's place. captures: those that are read already, by path. light:
+    small jobs, which workers do one after another, sharing the GPUs. Raises NeecoError before any work when a job's
+    folder is another job's or the cluster does not answer, and KeyboardInterrupt saying which job was stopped.
     """
     device = device_of(jobs[0].device if jobs else "cpu", drawing=False)
     check_workers(workers, device, light)
     results_so_far = dict(finished)
 
     def report(index: int, stage: str, share: float, text: str, result: Result | None = None) -> None:
+        what: dict[str, Any] = {"stage": stage, "share": share, "text": text, "result": result}
         if progress:
-            event = JobEvent(
-                index=index, total=len(jobs), job=jobs[index], stage=stage, share=share, text=text, result=result
-            )
-            progress(event)
+            progress(JobEvent(index=index, total=len(jobs), job=jobs[index], **what))
 
     def finish(index: int, result: Result) -> None:
         results_so_far[index] = result
@@ -193,9 +185,8 @@ def _run_in_workers(
 ) -> list[Result]:
     """`run_jobs` with `workers` jobs at once, each in a process of its own; light ones one after another in it.
 
-    With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
-    device is opened in its worker, who sees one GPU, that no other has. On a cluster, whose machines may have GPUs that
-    this one lacks, each worker is given a GPU unless the jobs ask for the CPU.
+    A job's device is opened in its worker, who sees one GPU, that no other has. On a cluster, whose machines may have
+    GPUs that this one lacks, each worker is given a GPU unless the jobs ask for the CPU.
     """
     folders = [job.folder.absolute().parent for job in jobs]
     how = Workers(

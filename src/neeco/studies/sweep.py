@@ -105,11 +105,8 @@ def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) 
 
 
 def run_sweep(plan: SweepPlan, progress: Callable[[JobEvent], None] | None = None) -> Rows:
-    """Train and score every configuration on every seed; return the rows of the tidy table.
-
-    Writes sweep.json and, after each job, results.csv. Given again after an interruption it goes on where it stopped;
-    with more configurations or seeds it adds them. A failed job has its reason in its rows.
-    """
+    """Train and score every configuration on every seed, but what an earlier start finished; return the rows of the
+    tidy table. Writes sweep.json and, after each job, results.csv. A failed job has its reason in its rows."""
     output = plan.request.output
     with own_folder(output):
         files = {index: job.folder / JOB_FILE for index, job in enumerate(plan.jobs)}

@@ -1,8 +1,4 @@
-"""Result tables of every study: CSV by pandas, and one kind of table for the terminal and pages.
-
-`csv_text` writes rows of numbers in full. `summary_table` makes a `ResultTable` of means and standard deviations,
-rounded, the best of each column marked.
-"""
+"""Result tables of every study: CSV of numbers in full, and rounded tables for the terminal and pages."""
 
 from __future__ import annotations
 
@@ -70,11 +66,8 @@ def summary_table(
     title: str, key: str, columns: Sequence[Column], rows: Sequence[tuple[str, Mapping[str, Any], str | None]]
 ) -> ResultTable:
     """Mean ± standard deviation by row (its key, its numbers by column as `study.spread` gives them, the reason for
-    their absence) and column. Columns that no row has a number for are left out.
-
-    The best mean of a column is judged as it is written, so that equal entries are all best; of one entry there is no
-    best.
-    """
+    their absence) and column. Columns that no row has a number for are left out; means that are best as they are
+    written are marked, where there are several."""
     used, best = [], {}
     for column in columns:
         means = [numbers[column.key]["mean"] for _, numbers, _ in rows if _has(numbers, column)]

@@ -26,7 +26,7 @@ from neeco.raster.devices import device_of
 from neeco.scene import DrawableScene
 from neeco.scene.method_registry import method_class
 from neeco.scene.training_session import Session
-from neeco.studies.study import REMEDY, JobProgress, Result
+from neeco.studies.study import REMEDY, Job, JobProgress, Result
 from neeco.training.config import TrainConfig
 from neeco.training.run import open_run, read_config, require_same_capture, stored_config
 from neeco.training.train import ProgressRow, train
@@ -59,7 +59,7 @@ FIELD_CURVE = CurveSettings(shares=(0.2, 0.6, 1.0), frames=2)  # a field takes s
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingJob:
+class TrainingJob(Job):
     """One run to train and score. `config`: with its seed and its length, in iterations or in minutes on `clock`, which
     is the time that passes ("wall") or CPU time of all threads of the process ("processor").
 
@@ -67,13 +67,10 @@ class TrainingJob:
     """
 
     name: str
-    capture: Path
-    folder: Path
     config: TrainConfig
     clock: Literal["wall", "processor"] = "wall"
     splits: tuple[str, ...] | None = None
     lpips_weights: Path | None = None
-    device: str = "auto"  # a word for `device_of`, opened where the job runs
 
     @property
     def title(self) -> str:
@@ -105,10 +102,8 @@ class TrainingJob:
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
         """Train, score, write `folder`/job.json last, and return what it holds; at once when it is there already.
 
-        A begun training goes on from its checkpoint, and ends in the scene that it would have without the interruption
-        (unless minutes end it). A finished one is only scored again when other splits or LPIPS networks are requested.
-        capture: the job's, where it is read and checked already. Raises NeecoError when `folder` is another job's, and
-        what `train` and `evaluate_run` raise.
+        A begun training goes on from its checkpoint. A finished one is only scored again when other splits or LPIPS
+        networks are requested. capture: the job's, where it is read and checked already. Raises NeecoError.
         """
         report = progress or (lambda stage, share, text: None)
         self.check()
@@ -181,10 +176,8 @@ def read_rows(file: Path, like: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def phase_1_psnr(folder: Path) -> float | None:
-    """Mean training PSNR (dB) over the rows of metrics.jsonl in the last quarter of phase 1, its last row at least.
-
-    A row averages 50 steps; None when phase 1, or the whole run, was shorter than that.
-    """
+    """Mean training PSNR (dB) over the rows of metrics.jsonl in the last quarter of phase 1, its last row at least;
+    None when phase 1, or the whole run, was shorter than a row (50 steps)."""
     rows = read_rows(folder / "metrics.jsonl", {"iteration": int, "phase": int, "psnr": float})
     rows = [row for row in rows if row["phase"] == 1]
     late = [row["psnr"] for row in rows if row["iteration"] > CURVE.late * rows[-1]["iteration"]]
@@ -198,11 +191,8 @@ def psnr_at(curve: Sequence[Mapping[str, Any]], split: str, share: float) -> flo
 
 
 class Curve:
-    """Held-out PSNR over a training: of a few frames of every split, read once, fewer where a `field` is rendered.
-
-    `after_step` watches the training and writes curve.jsonl. Seconds are those of the session, all starts together,
-    without those of rendering the frames.
-    """
+    """Held-out PSNR over a training, in curve.jsonl: of a few frames of every split, fewer where a `field` is rendered.
+    Seconds are those of the session, all starts together, without those of rendering the frames."""
 
     def __init__(self, file: Path, capture: Capture, splits: Sequence[str], *, field: bool = False) -> None:
         self.file = file

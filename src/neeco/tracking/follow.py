@@ -111,17 +111,15 @@ class Follower:
             self._view(frame, state), state, prior, levels=(0.125, 0.25, 0.5, 1.0), steps=(3, 3, 3, 4)
         )
         if fit is None:
-            time = self.frames[frame].state.time
-            return Step(frame=frame, how="lost", motion=self.motion.begin(state), found_at=time, searched_at=time)
+            return self._lost(frame, self.motion.begin(state), found_at=self.frames[frame].state.time)
         return self._begun(frame, "begun", fit)
 
     def find(self, frame: int) -> Step:
         """Return the first step of instruments whose state is not known."""
-        view, time = self._view(frame, None), self.frames[frame].state.time
+        view = self._view(frame, None)
         best = self.search.anywhere(view)
         if best is None:
-            motion = self.motion.begin(self.search.recorded_states(view.camera)[0])
-            return Step(frame=frame, how="lost", motion=motion, found_at=NEVER, searched_at=time)
+            return self._lost(frame, self.motion.begin(self.search.recorded_states(view.camera)[0]))
         return self._begun(frame, "found", best)
 
     def follow(self, before: Step, frame: int) -> Step:
@@ -160,18 +158,8 @@ class Follower:
             if best is not None and _refutes(best, fit):
                 fit, how, motion = best, "found", self.motion.begin(replace(best.state, time=time), best.information)
                 trust, _ = self.judge.judge(fit)
-        return Step(
-            frame=frame,
-            how=how,
-            motion=motion,
-            misfit=fit.misfit,
-            gain=fit.gain,
-            trust=replace(trust, determined=self.motion.probability_within(motion, TRUST.wrong_deg)),
-            recent=(*before.recent, fit.misfit)[-FOLLOW.n_recent :],
-            found_at=time,
-            searched_at=searched_at,
-            unsearched=unsearched,
-        )
+        recent = (*before.recent, fit.misfit)[-FOLLOW.n_recent :]
+        return self._step(frame, how, fit, motion, trust, recent=recent, searched_at=searched_at, unsearched=unsearched)
 
     def _searched(self, before: Step, frame: int, view: FrameView | None) -> Step:
         """Return the step after a search anywhere; lost where that fails, or the last one was a moment ago."""
@@ -180,8 +168,8 @@ class Follower:
             best, searched_at = self.search.anywhere(self._view(frame, None) if view is None else view), time
             if best is not None and (step := self._begun(frame, "found", best)).how != "lost":
                 return step
-        step = Step(frame=frame, how="lost", motion=before.motion, found_at=before.found_at, searched_at=searched_at)
-        return replace(step, recent=before.recent)
+        history: dict[str, Any] = {"found_at": before.found_at, "searched_at": searched_at, "recent": before.recent}
+        return self._lost(frame, before.motion, **history)
 
     def _begun(self, frame: int, how: How, fit: StateFit) -> Step:
         """Return the step of a state just found."""
@@ -189,18 +177,26 @@ class Follower:
         trust, _ = self.judge.judge(fit)
         motion = self.motion.begin(replace(fit.state, time=time), fit.information)
         if is_lost(trust):
-            return Step(frame=frame, how="lost", motion=motion, found_at=NEVER, searched_at=time)
-        return Step(
-            frame=frame,
-            how=how,
-            motion=motion,
-            misfit=fit.misfit,
-            gain=fit.gain,
-            trust=replace(trust, determined=self.motion.probability_within(motion, TRUST.wrong_deg)),
-            recent=(fit.misfit,),
-            found_at=time,
-            searched_at=time,
-        )
+            return self._lost(frame, motion)
+        return self._step(frame, how, fit, motion, trust, recent=(fit.misfit,), searched_at=time)
+
+    def _step(
+        self, frame: int, how: How, fit: StateFit, motion: MotionState, trust: TrackTrust, **history: Any
+    ) -> Step:
+        """Return the step of a frame in which the instruments are as fitted."""
+        trust = replace(trust, determined=self.motion.probability_within(motion, TRUST.wrong_deg))
+        fitted: dict[str, Any] = {
+            "misfit": fit.misfit,
+            "gain": fit.gain,
+            "trust": trust,
+            "found_at": self.frames[frame].state.time,
+        }
+        return Step(frame=frame, how=how, motion=motion, **fitted | history)
+
+    def _lost(self, frame: int, motion: MotionState, **history: Any) -> Step:
+        """Return the step of a frame in which nothing was found, which was searched unless `history` says otherwise."""
+        searched: dict[str, Any] = {"found_at": NEVER, "searched_at": self.frames[frame].state.time}
+        return Step(frame=frame, how="lost", motion=motion, **searched | history)
 
     def _usual_misfit(self, before: Step) -> float:
         """Return the misfit that a followed frame may have.

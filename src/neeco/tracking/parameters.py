@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neeco.base.errors import NeecoError
-from neeco.capture.model import Instrument, State
+from neeco.capture.model import State
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.scene import GaussianScene
 from neeco.states.crop_rendering import InstrumentRenderer, TissueRenderer
@@ -51,12 +51,31 @@ class TrackedParameters(StateParameters):
             raise NeecoError("track: the run remembers no recorded frame; train it again with this version")
         instruments = []
         for instrument, articulation in zip(scene.instruments, deformation.articulations, strict=True):
-            shaft = articulation.shaft()
+            shaft, names = articulation.shaft(), tuple(instrument.joints)
+            recorded = [state.instruments[instrument.name].joints for state in scene.recorded.states]
+            values = torch.tensor([[joints[name] for name in names] for joints in recorded], dtype=torch.float64)
+            values = values.reshape(len(recorded), len(names))
+            lowest, highest = values.amin(0), values.amax(0)
+            low, high = lowest - RANGE_BELOW * (highest - lowest), highest + RANGE_ABOVE * (highest - lowest)
+            for k, name in enumerate(names):
+                limits = instrument.joints[name]
+                if limits is not None:  # noise of what was recorded may pass them
+                    low[k], high[k] = max(float(low[k]), limits[0]), min(float(high[k]), limits[1])
             if articulation.jointed:
                 pivot = articulation.axes(shaft)[0][-1]
             else:
                 pivot = articulation.keypoints({})["shaft_near"]
-            instruments.append(_tracked(instrument, scene.recorded.states, pivot, shaft[1]))
+            instruments.append(
+                TrackedInstrument(
+                    name=instrument.name,
+                    joints=names,
+                    slides=tuple(instrument.slides(name) for name in names),
+                    pivot=pivot.detach().cpu().double(),
+                    axis=shaft[1].detach().cpu().double(),
+                    low=low,
+                    high=high,
+                )
+            )
         return cls(tuple(instruments))
 
     def along(self, instrument: int, millimetres: float = 0.0, roll: float = 0.0) -> Tensor:
@@ -83,25 +102,3 @@ def fitter_of(scene: GaussianScene) -> TrackingFitter:
     scene.visibility()  # by which states are trusted; of the whole scene, where training did not store it
     instruments = InstrumentRenderer(scene)
     return Fitter(instruments, parameters, TissueRenderer(scene, instruments))
-
-
-def _tracked(instrument: Instrument, states: Sequence[State], pivot: Tensor, axis: Tensor) -> TrackedInstrument:
-    names = tuple(instrument.joints)
-    values = torch.tensor(
-        [[state.instruments[instrument.name].joints[name] for name in names] for state in states], dtype=torch.float64
-    ).reshape(len(states), len(names))
-    low, high = values.amin(0), values.amax(0)
-    low, high = low - RANGE_BELOW * (high - low), high + RANGE_ABOVE * (high - low)
-    for k, name in enumerate(names):
-        limits = instrument.joints[name]
-        if limits is not None:  # noise of what was recorded may pass them
-            low[k], high[k] = max(float(low[k]), limits[0]), min(float(high[k]), limits[1])
-    return TrackedInstrument(
-        name=instrument.name,
-        joints=names,
-        slides=tuple(instrument.slides(name) for name in names),
-        pivot=pivot.detach().cpu().double(),
-        axis=axis.detach().cpu().double(),
-        low=low,
-        high=high,
-    )

@@ -70,9 +70,14 @@ def refine_run(
         with own_folder(output):
             write_json(output / BEGUN, info)
             recorded = fitted(scene, capture, on_progress)
-            merged = replace(capture, frames=(*recorded, *_named_apart(frames, output / STAGING)))
-            write_capture(merged, folder)
-            shutil.rmtree(output / STAGING)
+            staging, named = output / STAGING, []  # images under names that the run's own do not have
+            staging.mkdir(parents=True, exist_ok=True)
+            for k, frame in enumerate(frames):
+                path = staging / f"tracked_{k:05d}_{frame.name}{frame.image_path.suffix}"
+                shutil.copyfile(frame.image_path, path)
+                named.append(replace(frame, image_path=path))
+            write_capture(replace(capture, frames=(*recorded, *named)), folder)
+            shutil.rmtree(staging)
     # the latency of a tracker is gone from the states
     config = with_fields(
         stored_config(run.path, run.config), {"refine.latency": False, "transforms": "transforms.json"}
@@ -103,29 +108,18 @@ def without_twice(capture: Capture, tracked: Sequence[Frame]) -> tuple[Capture, 
     Training frames stay as recorded. Withheld frames that were tracked are trained on as tracked, and are no longer
     test frames. Raises NeecoError when an image cannot be read.
     """
-    images = {_digest(frame): frame for frame in capture.frames}
+
+    def digest_of(frame: Frame) -> bytes:
+        return hashlib.sha256(read_bytes(frame.image_path, "an image")).digest()
+
+    images = {digest_of(frame): frame for frame in capture.frames}
     new: dict[bytes, Frame] = {}
     for frame in tracked:
-        digest = _digest(frame)
+        digest = digest_of(frame)
         if digest not in images or images[digest].split != "train":
             new.setdefault(digest, frame)
     withheld = {images[digest].image_path for digest in new.keys() & images.keys()}
     return replace(capture, frames=tuple(f for f in capture.frames if f.image_path not in withheld)), list(new.values())
-
-
-def _digest(frame: Frame) -> bytes:
-    return hashlib.sha256(read_bytes(frame.image_path, "an image")).digest()
-
-
-def _named_apart(frames: Sequence[Frame], folder: Path) -> list[Frame]:
-    """Return the frames with their images copied under names that the run's own do not have."""
-    folder.mkdir(parents=True, exist_ok=True)
-    named = []
-    for k, frame in enumerate(frames):
-        path = folder / f"tracked_{k:05d}_{frame.name}{frame.image_path.suffix}"
-        shutil.copyfile(frame.image_path, path)
-        named.append(replace(frame, image_path=path))
-    return named
 
 
 def fitted(scene: GaussianScene, capture: Capture, on_progress: Callable[[int, int], None]) -> list[Frame]:

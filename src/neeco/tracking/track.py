@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -162,7 +162,12 @@ def track_footage(
         else:
             info = stored | {"min_trust": min_trust}  # of the same steps, other frames may be trusted
         registered = trained_on.registered or tissue is not None
-        trusted = replace(footage, frames=_with_trust(frames, info["frames"], min_trust), registered=registered)
+        chosen = tuple(
+            replace(frame, state=state_of(record))
+            for frame, record in zip(frames, info["frames"], strict=True)
+            if record["trust"]["value"] >= min_trust
+        )
+        trusted = replace(footage, frames=chosen, registered=registered)
         if trusted.frames:
             write_tracked(trusted, output, scene, trained_on)
         elif stored.get("complete"):
@@ -308,15 +313,6 @@ def state_of(record: dict[str, Any]) -> State:
         for name, entry in record["instruments"].items()
     }
     return State(instruments, record["time"])
-
-
-def _with_trust(frames: Sequence[Frame], records: Sequence[dict[str, Any]], min_trust: float) -> tuple[Frame, ...]:
-    """Return the frames of enough trust, with their states."""
-    return tuple(
-        replace(frame, state=state_of(record))
-        for frame, record in zip(frames, records, strict=True)
-        if record["trust"]["value"] >= min_trust
-    )
 
 
 def write_tracked(trusted: Capture, output: Path, scene: GaussianScene, trained_on: Capture) -> None:

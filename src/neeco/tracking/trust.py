@@ -30,7 +30,6 @@ from neeco.evaluation.trust import SETTINGS, TypicalErrors, estimate_trust, typi
 from neeco.geometry.camera import Camera
 from neeco.labels.labellers import CompositedLabels, composited_labels
 from neeco.raster import rasterize
-from neeco.scene import Recorded
 from neeco.states.crop_rendering import composite
 from neeco.states.fitter import StateFit, loose_prior
 from neeco.states.parameters import DEG
@@ -110,20 +109,15 @@ class LabelledView:
         return float(1 - (self.unobserved[label] / self.alpha[label].clamp_min(1e-6)).clamp(0, 1).mean())
 
 
-@dataclass(frozen=True)
 class LabelRenderer:
-    """Renders fits of instruments with their labels."""
+    """Renders fits of instruments with the scene's own labels."""
 
-    fitter: TrackingFitter
-    channels: Tensor  # [N, L] label channels of the instruments' Gaussians
-    threshold: float
-
-    @classmethod
-    def of(cls, fitter: TrackingFitter) -> LabelRenderer:
-        """Return the renderer with the scene's own labels. Raises NeecoError for a scene without."""
+    def __init__(self, fitter: TrackingFitter) -> None:
+        """Raises NeecoError for a scene without labels."""
         scene = fitter.instruments.scene
         labels = CompositedLabels(scene)
-        return cls(fitter, labels.channels[scene.canonical.counts[0] :].contiguous(), labels.threshold)
+        self.fitter, self.threshold = fitter, labels.threshold
+        self.channels = labels.channels[scene.canonical.counts[0] :].contiguous()  # [N, L] of the instruments
 
     @torch.no_grad()
     def render(self, fit: StateFit) -> LabelledView:
@@ -151,7 +145,7 @@ class Reference:
     def of(cls, fitter: TrackingFitter, frames: Sequence[Frame]) -> Reference:
         """Measure it on some of the training frames, states fitted to each. Raises NeecoError when an image cannot be
         read."""
-        recorded, renderer = fitter.instruments.scene.recorded, LabelRenderer.of(fitter)
+        recorded, renderer = fitter.instruments.scene.recorded, LabelRenderer(fitter)
         states = dict(zip(recorded.names, recorded.states, strict=True))
         prior = loose_prior(fitter.parameters, 2.0, 2.0, 4.0)
         judged, misfits, shares = [], [], []
@@ -175,29 +169,6 @@ class Reference:
         return {**asdict(self.errors), "misfit": round(self.misfit, 5), "observed": round(self.observed, 5)}
 
 
-@dataclass(frozen=True)
-class RecordedDirections:
-    """Directions from which training frames observed the instruments."""
-
-    instruments: tuple[TrackedInstrument, ...]
-    directions: tuple[Tensor, ...]  # of every instrument [M, 3] unit, instrument frame: from its pivot to the camera
-
-    @classmethod
-    def of(cls, instruments: tuple[TrackedInstrument, ...], recorded: Recorded) -> RecordedDirections:
-        """Return those of all recorded frames."""
-        pairs = list(zip(recorded.states, recorded.cameras, strict=True))
-        directions = [torch.stack([_direction(item, state, camera) for state, camera in pairs]) for item in instruments]
-        return cls(instruments, tuple(directions))
-
-    def beyond(self, state: State, camera: Camera) -> float:
-        """Return the angle (deg) to the nearest recorded direction, of the instrument for which it is largest."""
-        angles = [
-            float((recorded @ _direction(item, state, camera)).amax().clamp(-1, 1).arccos()) / DEG
-            for item, recorded in zip(self.instruments, self.directions, strict=True)
-        ]
-        return max(angles)
-
-
 def _direction(item: TrackedInstrument, state: State, camera: Camera) -> Tensor:
     """Return the unit direction [3] float64 from an instrument's pivot to the camera, instrument frame."""
     pose, centre = state.instruments[item.name].pose.double().cpu(), camera.world_from_camera[:3, 3].double().cpu()
@@ -214,14 +185,23 @@ class Judge:
     allowance: float = 1.0  # times the reference's misfit that is usual: light and tissue may be learned less well
 
     @cached_property
-    def directions(self) -> RecordedDirections:
-        """Directions of the frames that the scene was learned from."""
-        return RecordedDirections.of(self.fitter.parameters.instruments, self.search.recorded)
+    def directions(self) -> list[Tensor]:
+        """Directions from which training frames observed every instrument, [M, 3] unit, instrument frame."""
+        recorded = list(zip(self.search.recorded.states, self.search.recorded.cameras, strict=True))
+        instruments = self.fitter.parameters.instruments
+        return [torch.stack([_direction(item, state, camera) for state, camera in recorded]) for item in instruments]
+
+    def beyond(self, state: State, camera: Camera) -> float:
+        """Return the angle (deg) to the nearest recorded direction, of the instrument for which it is largest."""
+        return max(
+            float((recorded @ _direction(item, state, camera)).amax().clamp(-1, 1).arccos()) / DEG
+            for item, recorded in zip(self.fitter.parameters.instruments, self.directions, strict=True)
+        )
 
     @cached_property
     def renderer(self) -> LabelRenderer:
         """The renderer of fits with their labels."""
-        return LabelRenderer.of(self.fitter)
+        return LabelRenderer(self.fitter)
 
     def judge(self, fit: StateFit, search_rolls: bool = False) -> tuple[TrackTrust, StateFit | None]:
         """Return the trust in a fitted state, and the best other state where one was searched for: with
@@ -229,7 +209,7 @@ class Judge:
         drawing, view = self.renderer.render(fit), fit.view
         neighbourhood = SETTINGS.neighbourhood * view.diagonal / math.hypot(view.camera.width, view.camera.height)
         overlap = estimate_trust(drawing, view.image, view.weight > 0, self.reference.errors, neighbourhood).value
-        beyond = self.directions.beyond(fit.state, view.camera)
+        beyond = self.beyond(fit.state, view.camera)
         half = TRUST.half_trust_misfit * self.allowance * self.reference.misfit / (1 + beyond / TRUST.halving_deg)
         explained = 1 / (1 + (fit.misfit / half) ** TRUST.steepness)
         observed = min(1.0, drawing.observed_share / (TRUST.min_observed * self.reference.observed))

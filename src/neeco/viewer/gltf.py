@@ -23,7 +23,7 @@ from neeco.capture.model import Camera
 from neeco.evaluation.image_metrics import to_uint8
 from neeco.geometry.rotations import matrix_to_quat
 from neeco.raster.reference import SH_C0
-from neeco.viewer.moving import MovingScene, local_splats
+from neeco.viewer.moving import MovingScene
 from neeco.viewer.splats import Splats
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -84,30 +84,25 @@ class _Document:
 
 def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") -> None:
     """Write the scene and its camera, lengths in `unit`. Raises NeecoError where the disk refuses."""
-    document, splats = _Document(UNITS[unit]), scene.splats
+    document = _Document(UNITS[unit])
     root = document.node("neeco", rotation=TURN.tolist())
-    _add_mesh(document, document.node("tissue", root), local_splats(splats, scene.still, np.eye(4)))
-    clock = document.add(scene.times, bounds=True) if len(scene.times) > 1 else None
+    clock: int | None = None
     channels: list[dict[str, Any]] = []
     samplers: list[dict[str, Any]] = []
-
-    def animate(node: int, poses: np.ndarray) -> None:
-        """Give a node its poses [T, 4, 4] mm: the first at rest, all of them as an animation."""
-        rotations, places = _rotations(poses), (poses[:, :3, 3] * document.per_mm).astype(np.float32)
-        document.nodes[node] |= {"rotation": rotations[0].tolist(), "translation": places[0].tolist()}
-        for target, values in (("rotation", rotations), ("translation", places)):
-            if clock is not None and np.ptp(values, axis=0).max() > 0:
-                samplers.append({"input": clock, "output": document.add(values), "interpolation": "LINEAR"})
-                channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": target}})
-
-    for instrument in scene.instruments:
-        body = document.node(instrument.name, root, extras=instrument.facts)
-        animate(body, instrument.poses)
-        for part in instrument.parts:
-            extras = {"instrument": instrument.name, "part": part.name, "link": part.link}
-            node = document.node(part.name, body, extras=extras)
-            animate(node, part.poses)
-            _add_mesh(document, node, local_splats(splats, part.rows, instrument.poses[0] @ part.poses[0]))
+    for item in scene.nodes:  # numbered from 1 on in the file
+        parent = root if item.parent is None else item.parent + 1
+        node = document.node(item.name, parent, **({"extras": item.facts} if item.facts else {}))
+        if item.poses is not None:  # the first at rest, all of them as an animation
+            if clock is None and len(scene.times) > 1:
+                clock = document.add(scene.times, bounds=True)
+            rotations, places = _rotations(item.poses), (item.poses[:, :3, 3] * document.per_mm).astype(np.float32)
+            document.nodes[node] |= {"rotation": rotations[0].tolist(), "translation": places[0].tolist()}
+            for target, values in (("rotation", rotations), ("translation", places)):
+                if clock is not None and np.ptp(values, axis=0).max() > 0:
+                    samplers.append({"input": clock, "output": document.add(values), "interpolation": "LINEAR"})
+                    channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": target}})
+        if item.splats is not None:
+            _add_mesh(document, node, item.splats)
     pose = camera.world_from_camera.double().cpu()
     lens = {
         "yfov": 2 * math.atan(camera.height / (2 * camera.fy)),
@@ -115,9 +110,7 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") 
         "znear": document.per_mm,  # 1 mm
     }
     document.content["cameras"] = [{"name": "laparoscope", "type": "perspective", "perspective": lens}]
-    rotation = _rotations(
-        np.stack([np.block([[(pose[:3, :3] @ CAMERA_TURN).numpy(), np.zeros((3, 1))], [np.eye(4)[3:]]])])
-    )
+    rotation = _rotations((pose[:3, :3] @ CAMERA_TURN).numpy()[None])
     place = (pose[:3, 3] * document.per_mm).tolist()
     # glTF cannot state a principal point off the image's centre
     document.node("laparoscope", root, camera=0, rotation=rotation[0].tolist(), translation=place)
@@ -148,7 +141,8 @@ def _add_mesh(document: _Document, node: int, splats: Splats) -> None:
 
 
 def _rotations(poses: np.ndarray) -> np.ndarray:
-    """Return quaternions [T, 4] xyzw float32 of poses [T, 4, 4], each nearer to the one before than its negative."""
+    """Return quaternions [T, 4] xyzw float32 of poses [T, 4, 4] or rotations [T, 3, 3], each nearer to the one before
+    than its negative."""
     quats = matrix_to_quat(torch.from_numpy(np.ascontiguousarray(poses[:, :3, :3]))).numpy()[:, [1, 2, 3, 0]]
     for k in range(1, len(quats)):
         if quats[k] @ quats[k - 1] < 0:

@@ -7,8 +7,8 @@ in that.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,33 +34,23 @@ class MovingSettings:
 MOVING = MovingSettings()
 
 
-@dataclass(frozen=True)
-class MovingPart:
-    """A part of one link of an instrument."""
+@dataclass(frozen=True, kw_only=True)
+class MovingNode:
+    """The tissue, an instrument, or a part of one of its links: rigid in itself."""
 
     name: str
-    link: int
-    rows: np.ndarray  # [M] its Gaussians
-    poses: np.ndarray  # [T, 4, 4] instrument_from_part in every state, mm
-
-
-@dataclass(frozen=True)
-class MovingInstrument:
-    """An instrument in every state."""
-
-    name: str
-    poses: np.ndarray  # [T, 4, 4] world_from_instrument, mm
-    parts: tuple[MovingPart, ...]
-    facts: dict[str, Any]  # joints, their limits, and the axes by which they move links
+    parent: int | None = None  # its number among the scene's nodes; None: the world
+    poses: np.ndarray | None = None  # [T, 4, 4] parent_from_node in every state, mm; None: it stays in the world
+    splats: Splats | None = None  # its Gaussians, in its own frame
+    # of an instrument: joints, their limits, and the axes by which they move links; of a part: instrument, part, link
+    facts: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class MovingScene:
     """A scene in a sequence of states."""
 
-    splats: Splats  # in the first state
-    still: np.ndarray  # [M] rows of these that no instrument's part has
-    instruments: tuple[MovingInstrument, ...]
+    nodes: tuple[MovingNode, ...]  # parents before their children
     times: np.ndarray  # [T] s, from 0 on
     blended: float  # share of the instruments' Gaussians that blend links: right in the first state only
 
@@ -89,35 +79,33 @@ def times_of(states: Sequence[State]) -> np.ndarray:
 def moving_scene(scene: GaussianScene, states: Sequence[State], camera: Camera) -> MovingScene:
     """Return the scene moving through `states`, lit as `camera` observes the first one; still where its method has no
     joints to move by. Raises NeecoError where its numbers are not finite."""
-    motion, rows = scene.motion(), np.arange(len(scene.canonical))
+    motion = scene.motion()
     splats, times = splats_of(scene, states[0], camera, moving=motion is not None), times_of(states)
     if motion is None:
-        return MovingScene(splats, rows, (), times, 0.0)
-    blended = [weights.max(1).values < MOVING.least_weight for weights, _ in motion.links]
-    share = float(torch.cat(blended).float().mean()) if blended else 0.0
-    instruments = tuple(_moving_instruments(scene, motion, states))
-    return MovingScene(splats, rows[: scene.canonical.counts[0]], instruments, times, share)
-
-
-def _moving_instruments(
-    scene: GaussianScene, motion: ArticulatedMotion, states: Sequence[State]
-) -> Iterator[MovingInstrument]:
+        return MovingScene((MovingNode(name="tissue", splats=splats),), times, 0.0)
+    tissue = local_splats(splats, np.arange(scene.canonical.counts[0]), np.eye(4))
+    nodes, labels = [MovingNode(name="tissue", splats=tissue)], scene.label_channels().cpu().numpy()
     corrected = [scene.registered(state) for state in states]
-    labels = scene.label_channels().cpu().numpy()
     for number, instrument in enumerate(scene.instruments):
         rows = np.arange(len(scene.canonical))[scene.canonical.body(number + 1)]
         given = [state.instruments[instrument.name] for state in corrected]
         columns = [k for k, (name, _) in enumerate(scene.label_names) if name == instrument.name]
-        links, parts = motion.links[number][0].argmax(1).cpu().numpy(), []
+        links, body = motion.links[number][0].argmax(1).cpu().numpy(), len(nodes)
+        bodies = np.stack([item.pose.double().cpu().numpy() for item in given])
+        facts = _facts(instrument, motion, number)
+        nodes.append(MovingNode(name=instrument.name, poses=bodies, facts=facts))
         for link in np.unique(links).tolist():
             own = rows[links == link]
             shown = labels[np.ix_(own, columns)].argmax(1) if columns else np.zeros(len(own), int)
             poses = np.stack([_link_pose(motion, number, link, item) for item in given])
             for part in np.unique(shown).tolist():
                 name = scene.label_names[columns[part]][1] if columns else f"link {link}"
-                parts.append(MovingPart(name, link, own[shown == part], poses))
-        bodies = np.stack([item.pose.double().cpu().numpy() for item in given])
-        yield MovingInstrument(instrument.name, bodies, tuple(parts), _facts(instrument, motion, number))
+                local = local_splats(splats, own[shown == part], bodies[0] @ poses[0])
+                facts = {"instrument": instrument.name, "part": name, "link": link}
+                nodes.append(MovingNode(name=name, parent=body, poses=poses, splats=local, facts=facts))
+    blended = [weights.max(1).values < MOVING.least_weight for weights, _ in motion.links]
+    share = float(torch.cat(blended).float().mean()) if blended else 0.0
+    return MovingScene(tuple(nodes), times, share)
 
 
 def local_splats(splats: Splats, rows: np.ndarray, world_from_part: np.ndarray) -> Splats:

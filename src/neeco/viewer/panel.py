@@ -15,8 +15,8 @@ import numpy as np
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.synthesis.states import JointRange, Shaft
 from neeco.viewer.controls import Controls, InstrumentControls, slider_ranges
-from neeco.viewer.runs import LoadedRun, Timeline
-from neeco.viewer.views import IMAGE, RunPicture, views_of
+from neeco.viewer.runs import FrameScore, LoadedRun, Timeline
+from neeco.viewer.views import IMAGE, Picture, views_of
 
 if TYPE_CHECKING:
     import viser
@@ -196,18 +196,23 @@ class InstrumentPanel:
             spans = self._ranges.items()
             self._joints = {joint: _joint_slider(gui, joint, span, self._per_unit[joint]) for joint, span in spans}
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
-            end, most, angle = "About the shaft's end.", PANEL.slide_mm, PANEL.yaw_deg
-            self.slide = gui.add_slider("along shaft (mm)", -most, most, 0.5, 0.0, hint=f"Along {about}.")
-            self.roll = gui.add_slider("roll (°)", -180.0, 180.0, 1.0, 0.0, hint=f"About {about}.")
-            self.yaw = gui.add_slider("yaw (°)", -angle, angle, 0.5, 0.0, hint=end)
-            self.pitch = gui.add_slider("pitch (°)", -angle, angle, 0.5, 0.0, hint=end)
+            end, angle = "About the shaft's end.", PANEL.yaw_deg
+            self._moves = [  # slide in mm; roll, yaw and pitch in degrees
+                gui.add_slider(label, -most, most, step, 0.0, hint=hint)
+                for label, most, step, hint in (
+                    ("along shaft (mm)", PANEL.slide_mm, 0.5, f"Along {about}."),
+                    ("roll (°)", 180.0, 1.0, f"About {about}."),
+                    ("yaw (°)", angle, 0.5, end),
+                    ("pitch (°)", angle, 0.5, end),
+                )
+            ]
             hint = "Arrows and rings move and turn the instrument; sliders add to that."
             self.gizmo = gui.add_checkbox("drag it in the scene", False, hint=hint)
             self.back = gui.add_button("back to the recording")
         for slider in self._joints.values():
             slider.on_update(_by_user(self._joint_moved))
-        for control in (self.slide, self.roll, self.yaw, self.pitch):
-            control.on_update(_by_user(changed))
+        for slider in self._moves:
+            slider.on_update(_by_user(changed))
         self.gizmo.on_update(_by_user(self._gizmo_toggled))
         self.back.on_click(lambda _: self.reset())
 
@@ -219,14 +224,9 @@ class InstrumentPanel:
                 span = self._ranges[joint]
                 # a degree and back may lie a hair outside the limits
                 joints[joint] = min(max(slider.value / self._per_unit[joint], span.lower), span.upper)
-        return InstrumentControls(
-            joints,
-            float(self.slide.value),
-            math.radians(self.roll.value),
-            math.radians(self.yaw.value),
-            math.radians(self.pitch.value),
-            pose if self.gizmo.value else None,
-        )
+        slide, *turns = (float(slider.value) for slider in self._moves)
+        roll, yaw, pitch = map(math.radians, turns)
+        return InstrumentControls(joints, slide, roll, yaw, pitch, pose if self.gizmo.value else None)
 
     def follow(self, state: InstrumentState) -> None:
         """Show the recorded readings, unless the user has set others."""
@@ -239,7 +239,7 @@ class InstrumentPanel:
 
     def straighten(self) -> None:
         """Reset slide and turns to zero: the instrument's present pose becomes their starting point."""
-        for slider in (self.slide, self.roll, self.yaw, self.pitch):
+        for slider in self._moves:
             slider.value = 0.0
 
     def reset(self) -> None:
@@ -276,29 +276,34 @@ def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: flo
     return gui.add_slider(f"{joint} ({unit})", lower, upper, step, min(max(0.0, lower), upper))
 
 
-def status_html(rendered: RunPicture, seconds: float, note: str) -> str:
-    """HTML of the status: what is shown, how well, how fast. seconds: of the rendering; note: what else is to be
+def status_html(
+    loaded: LoadedRun,
+    controls: Controls,
+    picture: Picture,
+    seconds: float,
+    notes: Sequence[str] = (),
+    score: FrameScore | None = None,
+) -> str:
+    """HTML of the status: what is shown, how well, how fast. seconds: of the rendering; notes: what else is to be
     known."""
-    loaded, scene = rendered.loaded, rendered.loaded.scene
-    frame = min(max(round(rendered.frame), 0), len(loaded.recorded.names) - 1)
+    scene, recorded = loaded.scene, loaded.recorded
+    frame = min(max(round(controls.frame), 0), len(recorded.names) - 1)
     count = "no Gaussians" if scene.num_gaussians is None else f"{scene.num_gaussians:,} Gaussians"
     training = [] if loaded.iteration is None else [f"iteration {loaded.iteration:,}, still training"]
-    place = f"{rendered.frame:g} ({_text(loaded.recorded.names[frame])}, {_text(loaded.recorded.splits[frame])})"
+    place = f"{controls.frame:g} ({_text(recorded.names[frame])}, {_text(recorded.splits[frame])})"
     lines = [
         f"<b>{_text(loaded.name)}</b>",
         " · ".join([_text(scene.method), count, *training]),
-        f"frame {place}" + ("" if rendered.exact else ", steered or between frames"),
+        f"frame {place}" + (", steered or between frames" if controls.recorded_frame is None else ""),
     ]
-    if rendered.score is not None:
-        overlap = "" if rendered.score.iou is None else f" · IoU {rendered.score.iou:.3f}"
-        lines.append(f"PSNR {rendered.score.psnr:.2f} dB{overlap}")
-    if loaded.recorded.still:
+    if score is not None:
+        overlap = "" if score.iou is None else f" · IoU {score.iou:.3f}"
+        lines.append(f"PSNR {score.psnr:.2f} dB{overlap}")
+    if recorded.still:
         lines.append("still scope: views far from the recorded one show what no frame saw")
-    if rendered.trouble:
-        lines.append(_text(rendered.trouble, 3 * PANEL.line))
-    height, width = rendered.picture.depth.shape
+    height, width = picture.depth.shape
     lines.append(f"{seconds * 1e3:.0f} ms at {width} × {height}")
-    return _block([*lines, _text(note, 3 * PANEL.line)] if note else lines)
+    return _block([*lines, *(_text(note, 3 * PANEL.line) for note in notes if note)])
 
 
 def message_html(text: str) -> str:

@@ -111,48 +111,38 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
         """Answer all that one page asks over its web socket."""
         for message in connection:
             try:
-                answer = self._answer(json.loads(message))
+                ask, fields = self._question(json.loads(message), QUESTIONS)
+                answer = getattr(self, ask)(**fields)
             except (NeecoError, ValueError, RecursionError) as error:
                 answer = {"error": str(error)}
             connection.send(json.dumps(answer, allow_nan=False))
-
-    def _answer(self, message: Any) -> dict[str, Any]:
-        ask, instrument, question = self._question(message, QUESTIONS)
-        if ask == "overview":
-            return self.overview(instrument)
-        if ask == "frame":
-            return self._frame(instrument, question["index"])
-        if ask == "undo":
-            return self._undo(instrument)
-        return self.save(instrument, question["index"], question["roll"], question["joints"])
 
     def _respond(self, connection: Any, request: Any) -> Any:
         """The page or a picture; None for the web socket."""
         if "Upgrade" in request.headers:
             return None
-        ask, _, fields = request.path.removeprefix("/").partition("/")
+        ask, _, text = request.path.removeprefix("/").partition("/")
         # scripts of a page may run: what is refused, which repeats what was asked, is none
         status, kind = HTTPStatus.OK, "text/plain; charset=utf-8"
         try:
             if not ask:
                 body, kind = page(), "text/html; charset=utf-8"
             elif ask in IMAGES:
-                message = json.loads(unquote(fields))
-                asked = message | {"ask": ask} if isinstance(message, dict) else message
-                body, kind = self._image(*self._question(asked, IMAGES))
+                message = json.loads(unquote(text))
+                ask, fields = self._question(message | {"ask": ask} if isinstance(message, dict) else message, IMAGES)
+                body, kind = getattr(self, ask)(**fields)
             else:
                 status, body = HTTPStatus.NOT_FOUND, b"neeco view: no such page\n"
         except (NeecoError, ValueError, RecursionError) as error:
             status, body = HTTPStatus.BAD_REQUEST, str(error).encode(errors="replace")
         response = connection.respond(status, "")
+        del response.headers["Content-Length"], response.headers["Content-Type"]
+        response.headers.update({"Content-Length": str(len(body)), "Content-Type": kind})
         response.body = body
-        for name, value in (("Content-Length", str(len(body))), ("Content-Type", kind)):
-            del response.headers[name]
-            response.headers[name] = value
         return response
 
-    def _question(self, message: Any, questions: Mapping[str, dict[str, Any]]) -> tuple[str, str, dict[str, Any]]:
-        """Return what of the `questions` is asked, of which instrument, and its fields. Raises NeecoError."""
+    def _question(self, message: Any, questions: Mapping[str, dict[str, Any]]) -> tuple[str, dict[str, Any]]:
+        """Return what of the `questions`, which are methods, is asked, and its arguments. Raises NeecoError."""
         remedy = "reload the page"
         ask = require_like(message, {"ask": str}, "page", remedy)["ask"]
         if ask not in questions:
@@ -160,7 +150,7 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
         question = require_like(message, {"ask": str, "instrument": str, **questions[ask]}, "page", remedy)
         instrument = question["instrument"] or next(iter(self._posings))
         self._posing(instrument, question.get("index", 0))
-        return ask, instrument, question
+        return ask, {name: question[name] for name in questions[ask]} | {"instrument": instrument}
 
     def overview(self, instrument: str) -> dict[str, Any]:
         """Requests, answers and estimates of an instrument, as JSON for the page. Raises NeecoError."""
@@ -169,7 +159,7 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
                 self._answers, self._posings = answers, self.posed.solve(answers)
             return self._overview(instrument)
 
-    def _frame(self, instrument: str, index: int) -> dict[str, Any]:
+    def frame(self, instrument: str, index: int) -> dict[str, Any]:
         """Estimates in one frame, and the geometry of the page's lines."""
         with self._lock:
             posing = self._posings[instrument]
@@ -190,18 +180,18 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
                 "origin_along": float(posing.shafts.directions[index] @ origin),
             }
 
-    def save(self, instrument: str, index: int, roll_deg: float, joints_deg: Mapping[str, float]) -> dict[str, Any]:
-        """Add an answer, solve again and write both; the overview, and under `said` what contradicts the answer. Raises
-        NeecoError."""
+    def save(self, instrument: str, index: int, roll: float, joints: Mapping[str, float]) -> dict[str, Any]:
+        """Add an answer (degrees), solve again and write both; the overview, and under `said` what contradicts the
+        answer. Raises NeecoError."""
         with self._lock, own_folder(self.posed.root, wait_s=LOCK_WAIT_S):
-            _require_state(self._posings[instrument], roll_deg, joints_deg)
+            _require_state(self._posings[instrument], roll, joints)
             now = datetime.datetime.now().strftime("%Y-%m-%d %H:%M")
-            answer = HandPose(self.posed.frames[index], instrument, roll_deg, dict(joints_deg), now)
+            answer = HandPose(self.posed.frames[index], instrument, roll, dict(joints), now)
             self._keep([*read_answers(self.posed.root), answer])
             outliers = [outlier for outlier in self._posings[instrument].outliers() if outlier.frame == index]
             return self._overview(instrument) | {"said": [str(outlier) for outlier in outliers]}
 
-    def _undo(self, instrument: str) -> dict[str, Any]:
+    def undo(self, instrument: str) -> dict[str, Any]:
         """Take the last answer for an instrument out again; the overview, and under `frame` what it was of."""
         with self._lock, own_folder(self.posed.root, wait_s=LOCK_WAIT_S):
             answers = read_answers(self.posed.root)
@@ -225,47 +215,42 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
             raise NeecoError(f"no frame {index}; there are {len(self.posed.frames)}")
         return self._posings[instrument]
 
-    def _image(self, ask: str, instrument: str, question: Mapping[str, Any]) -> tuple[bytes, str]:
-        """A frame along the shaft, which points to the right, or the run's instruments there; and its media type."""
-        posing, index = self._posings[instrument], question["index"]
-        if ask == "ghost":
-            pixels = self._ghost(posing, index, question["roll"], question["joints"])
-            width, order, kind = PICTURES.ghost_width, cv2.COLOR_RGBA2BGRA, "png"
-        else:
-            pixels = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
-            width = PICTURES.thumbnail_width if question["small"] else PICTURES.width
-            order, kind = cv2.COLOR_RGB2BGR, "jpeg"
-        left, right, top, bottom = self._window(posing)
-        scale = (right - left) / width
-        along = left + (np.arange(width) + 0.5) * scale
-        across = top + (np.arange(round((bottom - top) / scale)) + 0.5) * scale
-        pixels = crop(posing.shafts, index, pixels, along, across).transpose(1, 0, 2)
-        quality = [cv2.IMWRITE_JPEG_QUALITY, PICTURES.jpeg_quality] if kind == "jpeg" else []
-        return cv2.imencode(f".{kind}", cv2.cvtColor(pixels, order), quality)[1].tobytes(), f"image/{kind}"
+    def picture(self, instrument: str, index: int, small: bool) -> tuple[bytes, str]:
+        """A frame along the shaft, which points to the right, and its media type. Raises NeecoError."""
+        pixels = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
+        width, quality = PICTURES.thumbnail_width if small else PICTURES.width, PICTURES.jpeg_quality
+        along = self._along_shaft(instrument, index, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), width)
+        return cv2.imencode(".jpeg", along, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes(), "image/jpeg"
 
-    def _ghost(self, posing: SolvedPosing, index: int, roll_deg: float, joints_deg: Mapping[str, float]) -> np.ndarray:
-        """The run's instruments in such a state of a frame, RGBA uint8 [H, W, 4], clear elsewhere."""
+    def ghost(self, instrument: str, index: int, roll: float, joints: Mapping[str, float]) -> tuple[bytes, str]:
+        """The run's instruments in such a state (degrees) of a frame along the shaft, clear elsewhere, and the media
+        type. Raises NeecoError."""
         if self.scene is None:
             raise NeecoError("ghost: no run is given")
-        _require_state(posing, roll_deg, joints_deg)
-        frame, name = self.posed.capture.frames[index], posing.instrument.name
-        recorded = frame.state.instruments[name]
+        posing, frame = self._posings[instrument], self.posed.capture.frames[index]
+        _require_state(posing, roll, joints)
+        recorded = frame.state.instruments[instrument]
         pose = recorded.pose.clone()
-        pose[:3, :3] = torch.from_numpy(posing.shafts.rotation(index, math.radians(roll_deg)))
-        joints = {**recorded.joints, **{joint: math.radians(value) for joint, value in joints_deg.items()}}
-        instruments = {**frame.state.instruments, name: replace(recorded, pose=pose, joints=joints)}
+        pose[:3, :3] = torch.from_numpy(posing.shafts.rotation(index, math.radians(roll)))
+        turned = {**recorded.joints, **{joint: math.radians(value) for joint, value in joints.items()}}
+        instruments = {**frame.state.instruments, instrument: replace(recorded, pose=pose, joints=turned)}
         with self._drawing, self.scene.torch_threads():
             drawing = draw(self.scene, replace(frame.state, instruments=instruments), frame.camera)
         if drawing.parts is None:
             raise NeecoError("ghost: the run's scene does not tell instruments from tissue; train method kinematic")
-        color = (drawing.image.numpy() * 255).round().astype(np.uint8)
-        return np.dstack([color, (drawing.parts.numpy() > 0).astype(np.uint8) * 255])
+        color = (drawing.image.numpy()[..., ::-1] * 255).round().astype(np.uint8)
+        pixels = np.dstack([color, (drawing.parts.numpy() > 0).astype(np.uint8) * 255])
+        along = self._along_shaft(instrument, index, pixels, PICTURES.ghost_width)
+        return cv2.imencode(".png", along)[1].tobytes(), "image/png"
 
-    def _window(self, posing: SolvedPosing) -> tuple[float, float, float, float]:
-        """Left, right (mm along the shaft), top and bottom (across) of a picture."""
-        length = posing.shafts.working_length_mm
-        aside = PICTURES.aside * length
-        return -PICTURES.before * length, PICTURES.beyond * length, -aside, aside
+    def _along_shaft(self, instrument: str, index: int, pixels: np.ndarray, width: int) -> np.ndarray:
+        """The part of a frame's pixels [H, W, C] about the shaft, which points to the right, so wide."""
+        posing = self._posings[instrument]
+        left, right, top, bottom = _window(posing)
+        scale = (right - left) / width
+        along = left + (np.arange(width) + 0.5) * scale
+        across = top + (np.arange(round((bottom - top) / scale)) + 0.5) * scale
+        return np.ascontiguousarray(crop(posing.shafts, index, pixels, along, across).transpose(1, 0, 2))
 
     def _overview(self, instrument: str) -> dict[str, Any]:
         posing = self._posing(instrument, 0)
@@ -296,7 +281,7 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
             ],
             "done": len(answered),
             "sure": {name: [round(value, 1) for value in pair] for name, pair in posing.deviations().items()},
-            "window": self._window(posing),
+            "window": _window(posing),
             "length": posing.shafts.working_length_mm,
             "radius": posing.shafts.diameter_mm / 2,
             "joints": {
@@ -312,6 +297,12 @@ def page() -> bytes:
     folder = files("neeco.viewer") / "posing_page"
     html, style, script = (folder.joinpath(f"page.{kind}").read_text("utf-8") for kind in ("html", "css", "js"))
     return html.replace("{{ style }}", style).replace("{{ script }}", script).encode()
+
+
+def _window(posing: SolvedPosing) -> list[float]:
+    """Left, right (mm along the shaft), top and bottom (across) of a picture."""
+    shares = (-PICTURES.before, PICTURES.beyond, -PICTURES.aside, PICTURES.aside)
+    return [share * posing.shafts.working_length_mm for share in shares]
 
 
 def _require_state(posing: SolvedPosing, roll_deg: float, joints_deg: Mapping[str, float]) -> None:

@@ -17,7 +17,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.labels.drawing import to_numpy
 from neeco.viewer.access import HOST, PORT
 from neeco.viewer.panel import message_html
-from neeco.viewer.runs import VIEW
+from neeco.viewer.runs import VIEW, median_distance
 from neeco.viewer.server import ViserPage
 from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, stands_at, wxyz_of
 
@@ -46,9 +46,14 @@ class RecordingServer(ViserPage):
     def __init__(self, root: Path, host: str = HOST, port: int = PORT) -> None:
         """Raises NeecoError."""
         self.capture = read_capture(root)
-        self.distance = _distance(self.capture)
+        points, frames = self.capture.points.positions, self.capture.frames
+        middle = [np.median(points, 0)] if len(points) else None
+        self.distance = median_distance(
+            (frame.camera, middle or [to_numpy(item.pose)[:3, 3] for item in frame.state.instruments.values()])
+            for frame in frames
+        )
         self.unit = VIEW.distance_units / self.distance
-        super().__init__(host, port, [frame.camera for frame in self.capture.frames], self.distance, self.unit)
+        super().__init__(host, port, [frame.camera for frame in frames], self.distance, self.unit)
         self.sessions: dict[int, RecordingSession] = {}
         self._server.on_client_connect(self._connect)
         self._server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
@@ -147,15 +152,3 @@ def image_behind(frame: Frame, aspect: float) -> np.ndarray:
     place = np.array([[across, 0, size[0] / 2 - across * camera.cx], [0, down, size[1] / 2 - down * camera.cy]])
     place[:, 2] += (place[:, :2].sum(1) - 1) / 2  # OpenCV counts from the first pixel's centre
     return cv2.warpAffine(image, place, size, flags=cv2.INTER_LINEAR)
-
-
-def _distance(capture: Capture) -> float:
-    """Median distance in mm from the cameras, along what they look at, of the points, or else of the instruments."""
-    middle = np.median(capture.points.positions, 0) if len(capture.points.positions) else None
-    depths = []
-    for frame in capture.frames:
-        pose = to_numpy(frame.camera.world_from_camera)
-        origins = [to_numpy(item.pose)[:3, 3] for item in frame.state.instruments.values()]
-        depths += [float((place - pose[:3, 3]) @ pose[:3, 2]) for place in (origins if middle is None else [middle])]
-    ahead = [depth for depth in depths if depth > 0]
-    return float(np.median(ahead)) if ahead else VIEW.assumed_mm

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,14 +22,12 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
 from neeco.geometry.camera import Camera
-from neeco.labels.drawing import draw
+from neeco.labels.drawing import draw, to_numpy
 from neeco.scene import DrawableScene, Recorded, load_scene
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.synthesis.samplers import shafts_of
 from neeco.synthesis.states import Shaft
-from neeco.training.run import checkpoint_path, read_checkpoint, read_config
-
-SCENE_FILE = "scene.safetensors"
+from neeco.training.run import SCENE_FILE, checkpoint_path, read_checkpoint, read_config
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,17 +72,25 @@ class LoadedRun:
     @cached_property
     def distance(self) -> float:
         """Median distance of the recorded cameras from the centre of the scene, along what they look at, in mm."""
-        centre = getattr(self.scene, "center", torch.zeros(3)).detach().cpu().double()
-        poses = [camera.world_from_camera.detach().cpu().double() for camera in self.recorded.cameras]
-        depths = [float((centre - pose[:3, 3]) @ pose[:3, 2]) for pose in poses]
-        ahead = [depth for depth in depths if depth > 0]
-        return float(np.median(ahead)) if ahead else VIEW.assumed_mm
+        centre = getattr(self.scene, "center", torch.zeros(3)).detach().cpu().double().numpy()
+        return median_distance((camera, [centre]) for camera in self.recorded.cameras)
 
     @property
     def signature(self) -> tuple[Any, ...]:
         """Everything that sliders depend on: where it changes, they are created again."""
         joints = tuple((item.name, tuple(item.joints.items())) for item in self.scene.instruments)
         return joints, self.recorded.names, tuple(self.scene.label_names), bool(self.frames)
+
+
+def median_distance(looked_at: Iterable[tuple[Camera, Sequence[np.ndarray]]]) -> float:
+    """Median distance in mm of places [3] from the cameras that look at them, along what these look at, of those ahead;
+    `assumed_mm` where none is."""
+    depths = []
+    for camera, places in looked_at:
+        pose = to_numpy(camera.world_from_camera)
+        depths += [float((place - pose[:3, 3]) @ pose[:3, 2]) for place in places]
+    ahead = [depth for depth in depths if depth > 0]
+    return float(np.median(ahead)) if ahead else VIEW.assumed_mm
 
 
 class ViewedRun:
@@ -134,16 +140,6 @@ class ViewedRun:
 
         threading.Thread(target=look, name="neeco-watcher", daemon=True).start()
 
-    def advance_timeline(self) -> bool:
-        """Score one more frame; False: all are."""
-        timeline = self.timeline
-        if timeline.done:
-            return False
-        # of a frame whose image cannot be read the status says so to whoever goes there
-        with timeline.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
-            timeline.advance()
-        return True
-
     def _current_stamp(self) -> tuple[str, int, int, int]:
         """File, its inode, time and size."""
         read_config(self.path)
@@ -167,9 +163,14 @@ class ViewedRun:
             iteration = int(header["iteration"])
         if self.device is not None:
             scene = scene.to(self.device)
-        capture, trouble = _read_capture_of(config)
-        if capture is not None:
-            capture = scene.recorded.completed(capture, scene.instruments)
+        capture, trouble, root = None, "", Path(config["capture"])
+        try:
+            if root.is_dir():
+                capture = scene.recorded.completed(read_capture(root, config["transforms"]), scene.instruments)
+            else:
+                trouble = f"capture: {root} no longer exists: no recorded images to compare with"
+        except NeecoError as error:
+            trouble = str(error)
         if not scene.recorded.states and capture is None:
             raise NeecoError(f"{self.path}: the scene holds no frames, and its capture is missing; train again")
         frames = () if capture is None else capture.frames
@@ -188,17 +189,6 @@ class ViewedRun:
             iteration=iteration,
             trouble=trouble,
         )
-
-
-def _read_capture_of(config: dict[str, Any]) -> tuple[Capture | None, str]:
-    """The capture that a run was trained on, or why it cannot be read."""
-    root = Path(config["capture"])
-    if not root.is_dir():
-        return None, f"capture: {root} no longer exists: no recorded images to compare with"
-    try:
-        return read_capture(root, config["transforms"]), ""
-    except NeecoError as error:
-        return None, str(error)
 
 
 @dataclass(frozen=True)
@@ -238,10 +228,15 @@ class Timeline:
         """Whether every frame is scored."""
         return self.count == len(self.psnr)
 
-    def advance(self) -> None:
-        """Score one more frame; one that cannot be read raises NeecoError and stays unknown."""
+    def advance(self) -> bool:
+        """Score one more frame; False: all are. One that cannot be read stays unknown: the status says so to whoever
+        goes there."""
+        if self.done:
+            return False
         self.count += 1
-        self.psnr[self.count - 1] = coarse_psnr(self.loaded, self.count - 1)
+        with self.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
+            self.psnr[self.count - 1] = coarse_psnr(self.loaded, self.count - 1)
+        return True
 
     @property
     def known(self) -> np.ndarray:
@@ -262,7 +257,8 @@ class Timeline:
 def coarse_psnr(loaded: LoadedRun, index: int) -> float:
     """PSNR in dB of one frame, rendered and recorded at no more than `timeline_width` px. Raises NeecoError."""
     frame = loaded.frames[index]
-    camera = narrowed(frame.camera, VIEW.timeline_width if loaded.scene.has_gaussians else VIEW.field_width)
+    width = VIEW.timeline_width if loaded.scene.has_gaussians else VIEW.field_width
+    camera = frame.camera.scaled(min(1.0, width / frame.camera.width))
     size = camera.width, camera.height
     image = cv2.resize(frame.load_image().numpy(), size, interpolation=cv2.INTER_AREA)
     mask = frame.load_mask()
@@ -270,8 +266,3 @@ def coarse_psnr(loaded: LoadedRun, index: int) -> float:
         mask = torch.from_numpy(cv2.resize(mask.numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
     rendered = loaded.scene.render(frame.state, camera).color.clamp(0, 1).cpu()
     return psnr(rendered, torch.from_numpy(image), mask)
-
-
-def narrowed(camera: Camera, width: int) -> Camera:
-    """Return the same view in an image at most `width` px wide."""
-    return camera if camera.width <= width else camera.scaled(width / camera.width)

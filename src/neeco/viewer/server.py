@@ -79,7 +79,7 @@ class ViewerServer(ViserPage):
         height = size.of(cameras[0].width, cameras[0].height)[1]
         self._sharp_px = None if size == RECORDED_SIZE else height
         self.saved = SavedStates(run, size)
-        self.render_thread = RenderThread(self.run.advance_timeline)
+        self.render_thread = RenderThread(lambda: self.run.timeline.advance())
         super().__init__(host, port, cameras, self.run.distance, self.run.unit)
         self._server.on_client_connect(self._connect)
         self._server.on_client_disconnect(lambda client: self.render_thread.remove(client.client_id))

@@ -20,9 +20,9 @@ from neeco.capture.model import State
 from neeco.labels.drawing import to_numpy
 from neeco.viewer.controls import Controls, controlled_state, interpolated_state
 from neeco.viewer.panel import Panel, message_html, status_html
-from neeco.viewer.runs import LoadedRun, ViewedRun
+from neeco.viewer.runs import LoadedRun, ViewedRun, score_frame
 from neeco.viewer.saving import SavedStates
-from neeco.viewer.views import Picture, RunPicture, render_run, scored
+from neeco.viewer.views import Picture, render_run
 from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, pose_of, stands_at
 
 if TYPE_CHECKING:
@@ -88,8 +88,7 @@ class RenderThread:
         self._when_idle = when_idle
         self._lock, self._wake = threading.Lock(), threading.Event()
         self._sessions: dict[int, ClientSession] = {}
-        self._requested: dict[int, float] = {}  # when, of requests that nothing was rendered for; the oldest first
-        self._unsharp: dict[int, float] = {}  # when the last request was, of pictures that are to be rendered sharp
+        self._due: dict[int, tuple[bool, float]] = {}  # sharp or coarse, and from when on, of wanted pictures
         self._jobs: list[Callable[[], None]] = []
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="neeco-render", daemon=True)
@@ -119,17 +118,15 @@ class RenderThread:
     def remove(self, key: int) -> None:
         """Remove a browser that has gone."""
         with self._lock:
-            for table in (self._sessions, self._requested, self._unsharp):
-                table.pop(key, None)
+            self._sessions.pop(key, None)
+            self._due.pop(key, None)
 
     def request(self, key: int | None = None) -> None:
         """Request another picture for a session, or for every one."""
-        now = time.perf_counter()
         with self._lock:
             for which in list(self._sessions) if key is None else [key]:
-                if which in self._sessions:
-                    self._requested.setdefault(which, now)
-                    self._unsharp[which] = now
+                if which in self._sessions and self._due.get(which, (True, 0.0))[0]:
+                    self._due[which] = False, time.perf_counter()
         self._wake.set()
 
     def run_job(self, job: Callable[[], None]) -> None:
@@ -142,13 +139,11 @@ class RenderThread:
         while not self._stopped:
             self._wake.clear()
             moments = self._tick()
-            if self._do_most_urgent():
+            if self._do_most_urgent() or _attempted(self._when_idle, False):
                 continue
-            if _attempted(self._when_idle, False):
-                continue
-            now = time.perf_counter()
             with self._lock:
-                moments += [since + VIEWER.settled_s for since in self._unsharp.values()]
+                moments += [when for _, when in self._due.values()]
+            now = time.perf_counter()
             self._wake.wait(max(0.0, min([VIEWER.idle_s, *(moment - now for moment in moments)])))
 
     def _tick(self) -> list[float]:
@@ -164,18 +159,16 @@ class RenderThread:
 
     def _do_most_urgent(self) -> bool:
         """Do a job or render a picture; return whether there was one."""
+        now = time.perf_counter()
         with self._lock:
             job = self._jobs.pop(0) if self._jobs else None
-            key, sharp = next(iter(self._requested), None), False
-            if key is None:
-                now = time.perf_counter()
-                key = next((key for key, since in self._unsharp.items() if now - since >= VIEWER.settled_s), None)
-                sharp = True
-            session = None if job is not None or key is None else self._sessions[key]
-            if session is not None:
-                del (self._unsharp if sharp else self._requested)[session.key]
-        if job is None and session is not None:
-            job = partial(session.render, sharp)
+            due = [(sharp, when, key) for key, (sharp, when) in self._due.items() if when <= now]
+            if job is None and due:
+                sharp, _, key = min(due)
+                job = partial(self._sessions[key].render, sharp)
+                del self._due[key]
+                if not sharp:
+                    self._due[key] = True, now + VIEWER.settled_s
         if job is not None:
             _attempted(job, None)
         return job is not None
@@ -236,15 +229,15 @@ class ClientSession:
         height = self._resolution.height(sharp, window.image_height, aspect_of(window))
         camera = browser_camera(window, self._run.unit, height)
         try:
-            rendered = render_run(self._run, controls, camera, self._panel.view.value)
+            picture, as_recorded = render_run(current, controls, camera, self._panel.view.value)
         except NeecoError as error:
             self._panel.status.content = message_html(str(error))
             return
         seconds = time.perf_counter() - began
-        self._resolution.record(seconds, rendered.picture.depth.size)
+        self._resolution.record(seconds, picture.depth.size)
         if self._connected():
-            self._send(rendered.picture, sharp)
-            self._show_status(rendered, seconds, sharp)
+            self._send(picture, sharp)
+            self._show_status(controls, picture, as_recorded, seconds, sharp)
 
     def tick(self, now: float) -> float | None:
         """Let the recording play on, and show what is newly known of its frames. now: of time.perf_counter(); returns
@@ -365,15 +358,18 @@ class ClientSession:
         self._client.scene.set_background_image(picture.pixels, format="jpeg", jpeg_quality=quality, depth=depth)
         self._client.flush()
 
-    def _show_status(self, rendered: RunPicture, seconds: float, sharp: bool) -> None:
-        now = time.perf_counter()
+    def _show_status(
+        self, controls: Controls, picture: Picture, as_recorded: bool, seconds: float, sharp: bool
+    ) -> None:
+        now, loaded = time.perf_counter(), self._loaded
         if not sharp and now - self.status_at < VIEWER.status_every_s:
             return
         self.status_at = now
-        notes = [rendered.note] if rendered.note else []
-        if sharp:  # else things move on before the numbers are read
+        notes, score = [self._run.trouble or loaded.trouble, picture.note], None
+        if sharp and as_recorded and loaded.frames:  # else things move on before it is read
             try:
-                rendered = scored(rendered)
+                with loaded.scene.torch_threads():
+                    score = score_frame(loaded, int(controls.frame))
             except NeecoError as error:
                 notes.append(str(error))
-        self._panel.status.content = status_html(rendered, seconds, "; ".join(notes))
+        self._panel.status.content = status_html(loaded, controls, picture, seconds, notes, score)

@@ -16,7 +16,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import write_atomically
-from neeco.viewer.moving import MovingScene, local_splats
+from neeco.viewer.moving import MovingScene
 from neeco.viewer.splats import Splats
 
 SCHEMA = "ParticleField3DGaussianSplat"
@@ -51,7 +51,7 @@ def write_usd(scene: MovingScene, path: Path) -> None:
     require_usd()
     from pxr import Tf, Usd, UsdGeom
 
-    splats, codes = scene.splats, scene.times * USD.codes_per_second
+    codes = scene.times * USD.codes_per_second
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageMetersPerUnit(stage, USD.meters_per_unit)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -61,17 +61,18 @@ def write_usd(scene: MovingScene, path: Path) -> None:
     root = UsdGeom.Xform.Define(stage, PRIM)
     root.AddRotateXOp().Set(180.0)
     stage.SetDefaultPrim(root.GetPrim())
-    _define_field(stage, f"{PRIM}/tissue", local_splats(splats, scene.still, np.eye(4)), "tissue")
-    for instrument in scene.instruments:
-        place = f"{PRIM}/{_identifier(instrument.name)}"
-        body = UsdGeom.Xform.Define(stage, place)
-        _set_poses(body, instrument.poses, codes)
-        body.GetPrim().SetCustomDataByKey("neeco:instrument", instrument.name)
-        for part in instrument.parts:
-            local = local_splats(splats, part.rows, instrument.poses[0] @ part.poses[0])
-            taken = f"{place}/{_identifier(part.name)}"
-            name = f"{taken}_{part.link}" if stage.GetPrimAtPath(taken) else taken
-            _set_poses(_define_field(stage, name, local, part.name), part.poses, codes)
+    places: list[str] = []
+    for node in scene.nodes:
+        name = re.sub(r"^(\d)|\W", r"_\1", node.name)  # a prim's name
+        place = f"{PRIM if node.parent is None else places[node.parent]}/{name}"
+        places.append(f"{place}_{node.facts['link']}" if stage.GetPrimAtPath(place) and "link" in node.facts else place)
+        if node.splats is None:
+            prim = UsdGeom.Xform.Define(stage, places[-1])
+            prim.GetPrim().SetCustomDataByKey("neeco:instrument", node.name)
+        else:
+            prim = _define_field(stage, places[-1], node.splats, node.name)
+        if node.poses is not None:
+            _set_poses(prim, node.poses, codes)
 
     def write(temporary: Path) -> None:
         try:
@@ -80,11 +81,6 @@ def write_usd(scene: MovingScene, path: Path) -> None:
             raise OSError(f"OpenUSD: {str(error).splitlines()[-1]}") from error
 
     write_atomically(path, write)
-
-
-def _identifier(name: str) -> str:
-    """Return a name that prims may have."""
-    return re.sub(r"^(\d)|\W", r"_\1", name)
 
 
 def _set_poses(prim: Any, poses: np.ndarray, codes: np.ndarray) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from neeco.raster.types import Rendering
 from neeco.scene import DrawableScene
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.viewer.controls import Controls, controlled_state
-from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRun, score_frame
+from neeco.viewer.runs import LoadedRun
 from neeco.viewer.viser_scene import stands_at
 
 IMAGE, OVERLAY, PARTS = "image", "labels over image", "parts"
@@ -40,20 +40,6 @@ class Picture:
     pixels: Pixels  # uint8 [H, W, 3]
     depth: np.ndarray  # [H, W] mm, 0 = nothing there
     note: str = ""  # what the colours mean, where that differs from picture to picture
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunPicture:
-    """A run's picture, and what the status says of it."""
-
-    loaded: LoadedRun
-    picture: Picture
-    frame: float  # where in the recording
-    exact: bool  # the state is that of the frame
-    seen_as_recorded: bool = False  # so is the camera
-    note: str = ""
-    trouble: str = ""  # what of the run could not be read
-    score: FrameScore | None = None
 
 
 def views_of(scene: DrawableScene, has_images: bool) -> tuple[str, ...]:
@@ -104,44 +90,21 @@ def difference(scene: DrawableScene, state: State, recorded_by: Camera, image: n
     return Picture(pixels, np.where(inside, surface_depth(rendering)[rows, columns], 0.0))
 
 
-def dimmed(original: Picture) -> Picture:
-    """Darken a picture that is not the requested one."""
-    return replace(original, pixels=to_uint8(original.pixels * DIMMED))
-
-
-def render_run(run: ViewedRun, controls: Controls, camera: Camera, view: str) -> RunPicture:
-    """Render a run from `camera`, at the controls. Raises NeecoError."""
-    loaded = run.loaded
+def render_run(loaded: LoadedRun, controls: Controls, camera: Camera, view: str) -> tuple[Picture, bool]:
+    """Render a run from `camera`, at the controls; return the picture, and whether state and camera are those of a
+    recorded frame. Raises NeecoError."""
     scene, state = loaded.scene, controlled_state(loaded.recorded.states, loaded.shafts, controls)
     frame = controls.recorded_frame
     as_recorded = frame is not None and stands_at(camera, loaded.recorded.cameras[frame], loaded.distance)
-    note = ""
     with scene.torch_threads(), readable_failures():
         if view == DIFFERENCE and frame is not None and as_recorded and loaded.frames:
             image = loaded.frames[frame].load_image().numpy()
-            rendered = difference(scene, state, loaded.recorded.cameras[frame], image, camera)
-        elif view in views_of(scene, False):
-            rendered = picture(scene, state, camera, view, loaded.labels)
-        else:
-            rendered = dimmed(picture(scene, state, camera, IMAGE))
-            note = ONLY_RECORDED if view == DIFFERENCE else f"{view}: a scene of method {scene.method} has none"
-    return RunPicture(
-        loaded=loaded,
-        picture=rendered,
-        frame=controls.frame,
-        exact=frame is not None,
-        seen_as_recorded=as_recorded,
-        note=note or rendered.note,
-        trouble=run.trouble or loaded.trouble,
-    )
-
-
-def scored(rendered: RunPicture) -> RunPicture:
-    """Add the score where the frame is rendered as recorded and its capture is at hand. Raises NeecoError."""
-    if not rendered.seen_as_recorded or not rendered.loaded.frames:
-        return rendered
-    with rendered.loaded.scene.torch_threads():
-        return replace(rendered, score=score_frame(rendered.loaded, int(rendered.frame)))
+            return difference(scene, state, loaded.recorded.cameras[frame], image, camera), True
+        if view in views_of(scene, False):
+            return picture(scene, state, camera, view, loaded.labels), as_recorded
+        plain = picture(scene, state, camera, IMAGE)  # darkened, since it is not what was asked for
+    note = ONLY_RECORDED if view == DIFFERENCE else f"{view}: a scene of method {scene.method} has none"
+    return Picture(to_uint8(plain.pixels * DIMMED), plain.depth, note), as_recorded
 
 
 def _rendering(scene: DrawableScene, state: State, camera: Camera, view: str, labels: Tensor | None) -> Rendering:

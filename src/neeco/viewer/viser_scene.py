@@ -120,9 +120,11 @@ class Overlays:
         """clicked: gets the frame whose camera was clicked on; dragged: called when a gizmo moved."""
         self._scene, self._unit, self._dragged = client.scene, unit, dragged
         self.cameras = self._scene.add_frame("/cameras", show_axes=False, visible=False)
-        for frame in _frustum_frames(cameras):
-            camera = cameras[frame]
-            pose = to_numpy(camera.world_from_camera)
+        poses = [to_numpy(camera.world_from_camera) for camera in cameras]
+        spread = evenly_spaced(len(cameras), SCENE.max_frusta)  # some from everywhere, none twice in one place
+        places = np.unique([poses[frame].round(3) for frame in spread], axis=0, return_index=True)[1]
+        for frame in (spread[place] for place in places.tolist()):
+            camera, pose = cameras[frame], poses[frame]
             frustum = self._scene.add_camera_frustum(
                 f"/cameras/{frame}",
                 fov=field_of_view(camera),
@@ -184,10 +186,3 @@ class Overlays:
             precision="float32",
             visible=False,
         )
-
-
-def _frustum_frames(cameras: Sequence[Camera]) -> list[int]:
-    """Frames whose cameras are shown: some from everywhere, none twice in one place."""
-    frames = evenly_spaced(len(cameras), SCENE.max_frusta)
-    poses = [to_numpy(cameras[frame].world_from_camera).round(3) for frame in frames]
-    return [frames[first] for first in np.unique(poses, axis=0, return_index=True)[1]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
@@ -45,14 +44,6 @@ def test_labels_stay_under_what_they_label() -> None:
         assert (strongest[there] == colour).float().mean() > 0.95  # edges are blurred
 
 
-def test_colours_and_shares_stay_between_none_and_all() -> None:
-    images, _ = made()
-    assert images.shape == (COUNT, 6, *SIZE)
-    assert images.min() >= 0
-    assert images.max() <= 1 + 1e-6
-    assert images[:, 3:5].sum(1).max() <= 1 + 1e-5
-
-
 def test_what_comes_from_outside_did_not_count_or_is_cut_out_does_not_count() -> None:
     given, half = made()[0], made(coloured(half_valid=True))[0]
     assert torch.equal(given[:, :3], half[:, :3])
@@ -88,13 +79,6 @@ def test_the_same_seed_gives_the_same_pixels_and_another_does_not() -> None:
     assert not torch.equal(first, other)
     assert torch.equal(before, planes(coloured()))
     assert len({image.numpy().tobytes() for image in first}) == COUNT
-
-
-def test_brightness_differs_between_images_of_a_batch() -> None:
-    images, _ = made()
-    inside = [(image[:3].mean(0)[image[4] > 0.99]).mean().item() for image in images if (image[4] > 0.99).any()]
-    assert max(inside) > 1.4 * min(inside)
-    assert pytest.approx(np.mean(inside), rel=0.5) == 250 / 3 / 255
 
 
 def test_parts_of_a_batch_stay_under_what_they_label_and_what_is_lost_is_ignored() -> None:

@@ -64,7 +64,7 @@ def test_counts_of_labelled_frames_are_numbers_or_all() -> None:
         labelled_count("31", 30)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=50)
 @given(st.data(), st.integers(1, 200), st.integers(0, 20))
 def test_spread_labels_as_many_frames_as_asked_with_no_wide_gap(data, frames: int, fold: int) -> None:
     count = data.draw(st.integers(1, frames))
@@ -77,7 +77,7 @@ def test_spread_labels_as_many_frames_as_asked_with_no_wide_gap(data, frames: in
     assert chosen == labelled_frames(frames, count, fold)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=10)
 @given(st.integers(1, 120), st.integers(0, 9))
 def test_frames_of_a_smaller_count_are_among_those_of_a_larger_one(frames: int, fold: int) -> None:
     nested = [set(labelled_frames(frames, count, fold)) for count in range(frames + 1)]

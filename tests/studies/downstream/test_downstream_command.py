@@ -8,7 +8,6 @@ import signal
 from pathlib import Path
 
 import pytest
-from downstream_world import read_grey, save_grey
 
 from neeco.base.errors import NeecoError
 from neeco.cli import main
@@ -131,11 +130,3 @@ def test_bad_input_is_one_line_and_exit_1(more, told, words, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     assert told in stopped_by([*words, *more], capsys)
     assert not (tmp_path / "out").exists()
-
-
-def test_parts_are_asked_of_labels_that_tell_them(words, recorded: Path, tmp_path: Path, capsys) -> None:
-    for name in ("000", "001"):
-        mask = (read_grey(recorded / "truth" / "masks" / f"{name}.png") > 0) * 255
-        save_grey(tmp_path / "labels" / f"{name}.png", mask)
-    more = ["--classes", "parts", "--labels", str(tmp_path / "labels"), "--num-real", "2"]
-    assert "--classes parts: the labels in" in stopped_by([*words, *more], capsys)

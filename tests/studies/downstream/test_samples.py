@@ -270,13 +270,3 @@ def test_reference_masks_are_truth_too_beside_parts(capture: Path) -> None:
     assert np.array_equal(samples[3].load().classes, other > 0)  # parts of the others are instrument all the same
     with refused("--classes parts", "use --classes instrument"):
         recorded_samples(read_capture(capture), "train", "parts")
-
-
-def test_labels_whose_ids_are_unnamed_say_where_to_name_them(capture: Path, tmp_path: Path) -> None:
-    labels = tmp_path / "labels"
-    save_grey(labels / "001.png", bar_parts(1) * 9)
-    with refused("001.png: id 9", "is not among", "parts.json"):
-        recorded_samples(read_capture(capture), "train", "instrument", labels)
-    (labels / "parts.json").write_text(json.dumps({"ids": [{"id": 9, "part": "shaft"}]}))
-    with refused("001.png: id 18", "parts.json"):
-        recorded_samples(read_capture(capture), "train", "instrument", labels)

@@ -1,17 +1,15 @@
 """`downstream`: models trained on recorded and on synthetic images within one budget, tested on recorded frames.
-
-A study is checked first (`plan_downstream`), then its trainings run (`run_downstream`), each a `DownstreamJob` with its
-data, its tests and its stored result.
-"""
+`plan_downstream` checks a study, `run_downstream` runs its trainings, each a `DownstreamJob`."""
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +22,7 @@ from neeco.capture import Capture, read_capture
 from neeco.capture.checks import read_checked
 from neeco.evaluation.mask_folders import truth_file
 from neeco.raster.devices import device_of
+from neeco.studies.downstream import DownstreamRequest
 from neeco.studies.downstream.model import Predict, TorchModel, TrainingTask, input_size, model_class
 from neeco.studies.downstream.results import (
     Detections,
@@ -38,7 +37,6 @@ from neeco.studies.downstream.results import (
 )
 from neeco.studies.downstream.samples import (
     CACHE,
-    ClassNames,
     ImageSet,
     RecordedSample,
     Sample,
@@ -63,7 +61,7 @@ from neeco.studies.downstream.training_data import (
     parse_condition,
     pasted_samples,
 )
-from neeco.studies.study import REMEDY, JobEvent, JobProgress, check_output, check_workers, machine, run_jobs
+from neeco.studies.study import REMEDY, Job, JobEvent, JobProgress, check_output, check_workers, machine, run_jobs
 
 SCHEMA = "neeco-downstream/3"
 FILE, TABLE = "downstream.json", "downstream.csv"
@@ -72,83 +70,33 @@ JOB_FILE = "job.json"
 PREFIX = "frame_"  # of the names of frames in files of predictions
 
 
+def steps_of(request: DownstreamRequest, kind: type[TorchModel]) -> int:
+    """Return the number of steps of a model."""
+    return request.steps or round(kind.steps * (request.parts_steps if request.classes == "parts" else 1))
+
+
+def input_of(request: DownstreamRequest, kind: type[TorchModel], frame: tuple[int, int]) -> tuple[int, int]:
+    """Return the input (width, height) of a model for frames of this size."""
+    return input_size(frame, request.size or kind.image_size, kind.multiple)
+
+
+def held_out_samples(request: DownstreamRequest, capture: Capture, test: str) -> tuple[RecordedSample, ...]:
+    """Return the frames of a test: all with truth of the other capture of that name, else of a split of the own one.
+    Raises NeecoError."""
+    if test in request.tests:
+        return recorded_samples(_read(request.tests[test], "transforms.json"), None, request.classes)
+    return recorded_samples(capture, test, request.classes)
+
+
 @dataclass(frozen=True, kw_only=True)
-class DownstreamSettings:
-    """A study: models, training data, budget and tests. None: the usual, or the model's."""
+class DownstreamJob(Job):
+    """One training. real: how many recorded frames are labelled."""
 
-    capture: Path
-    output: Path
-    sets: tuple[ImageSet, ...] = ()
-    models: tuple[str, ...] = ("unet",)
-    tests: Mapping[str, Path] = field(default_factory=dict)  # other captures, by name
-    num_real: tuple[str, ...] | None = None  # labelled recorded frames: numbers or all; 0 for sets alone
-    folds: int = 5
-    conditions: tuple[str, ...] | None = None
-    backgrounds: Path | None = None  # folder of images to paste over; None: the labelled frames, filled in
-    labels: Path | None = None  # folder of masks for the recorded training frames; None: the capture's truth
-    classes: ClassNames = "instrument"
-    splits: tuple[str, ...] = ()  # tested; empty: all but train that have truth
-    steps: int | None = None
-    size: int | None = None  # px, the longer side of a model's input images
-    batch: int | None = None
-    workers: int = 1
-    transforms: str = "transforms.json"
-    device: str = "auto"
-    default_counts: tuple[int, ...] = (5, 10, 20, 50)  # numbers of labelled frames trained on by default, besides all
-    kept_fold: ClassVar[int] = 0  # whose weights and predictions are kept
-    write_every_s: float = 30.0  # least s between two writings of the results so far, which are large
-    parts_steps: float = 2.5  # ratio of the steps for parts to the steps for one class: more of them do not help
-
-    @property
-    def all_tests(self) -> list[str]:
-        """Names of what is tested on: splits of the own capture, and other captures."""
-        return [*self.splits, *self.tests]
-
-    def steps_of(self, kind: type[TorchModel]) -> int:
-        """Return the number of steps of a model."""
-        return self.steps or round(kind.steps * (self.parts_steps if self.classes == "parts" else 1))
-
-    def batch_of(self, kind: type[TorchModel]) -> int:
-        """Return the number of images in a step."""
-        return self.batch or kind.batch
-
-    def input_of(self, kind: type[TorchModel], frame: tuple[int, int]) -> tuple[int, int]:
-        """Return its input (width, height) for frames of this size."""
-        return input_size(frame, self.size or kind.image_size, kind.multiple)
-
-    def samples(self, capture: Capture, test: str) -> tuple[RecordedSample, ...]:
-        """The frames of a test: all with truth of the other capture of that name, else of a split of the own one.
-        Raises NeecoError."""
-        if test in self.tests:
-            return recorded_samples(_read(self.tests[test], "transforms.json"), None, self.classes)
-        return recorded_samples(capture, test, self.classes)
-
-    def job_folder(self, model: str, condition: str, real: int, fold: int) -> Path:
-        """Return the folder of one job."""
-        return self.output / "jobs" / f"{model}-{condition}-real{real}-fold{fold}"
-
-
-@dataclass(frozen=True)
-class DownstreamJob:
-    """One training, a `neeco.studies.study.Job`. real: how many recorded frames are labelled."""
-
-    settings: DownstreamSettings
+    request: DownstreamRequest
     model: str
     condition: Condition
     real: int  # 0 where the condition has none
     fold: int
-
-    @property
-    def capture(self) -> Path:
-        return self.settings.capture
-
-    @property
-    def folder(self) -> Path:
-        return self.settings.job_folder(self.model, self.condition.name, self.real, self.fold)
-
-    @property
-    def device(self) -> str:
-        return self.settings.device
 
     @property
     def title(self) -> str:
@@ -159,34 +107,31 @@ class DownstreamJob:
     @property
     def sets(self) -> list[ImageSet]:
         """The image sets of its training data."""
-        return [data for data in self.settings.sets if data.name in self.condition.sets]
+        return [data for data in self.request.image_sets if data.name in self.condition.sets]
 
     def identity(self) -> dict[str, Any]:
         """Return what a folder must agree with to be this job's. Its keys are those of job.json."""
-        settings, kind = self.settings, model_class(self.model)
+        request, kind = self.request, model_class(self.model)
+        backgrounds = request.backgrounds if PASTE in self.condition else None
         return {
             "model": self.model,
             "condition": self.condition.name,
             "real": self.real,
             "fold": self.fold,
-            "capture": str(settings.capture.absolute()),
-            "labels": absolute(settings.labels),
-            "transforms": settings.transforms,
+            "capture": str(request.capture.absolute()),
+            "labels": request.labels and str(request.labels.absolute()),
+            "transforms": request.transforms,
             "sets": [data.described() for data in self.sets],
-            "backgrounds": absolute(settings.backgrounds) if PASTE in self.condition else None,
-            "classes": settings.classes,
-            "steps": settings.steps_of(kind),
-            "size": settings.size or kind.image_size,
-            "batch": settings.batch_of(kind),
+            "backgrounds": backgrounds and str(backgrounds.absolute()),
+            "classes": request.classes,
+            "steps": steps_of(request, kind),
+            "size": request.size or kind.image_size,
+            "batch": request.batch or kind.batch,
         }
 
-    def check(self) -> None:
-        """Raises NeecoError when the folder holds another job's result, or a test of another capture by this name."""
-        self.stored()
-
-    def stored(self) -> dict[str, Any] | None:
-        """Return the result of an earlier start, None where there is none of all tests. Raises NeecoError as `check`
-        does."""
+    def check(self) -> dict[str, Any] | None:
+        """Return the result of an earlier start; None where there is none of all tests. Raises NeecoError when the
+        folder holds another job's result, or a test of another capture by this name."""
         file = self.folder / JOB_FILE
         if not file.exists():
             return None
@@ -194,18 +139,18 @@ class DownstreamJob:
         now = {"schema": JOB_SCHEMA} | self.identity()
         require_same(str(file), ((key, stored.get(key), now[key]) for key in now), REMEDY)
         tested = require_like(stored, {"tests": {str: str}, "splits": dict}, str(file), REMEDY)["tests"]
-        tests = {name: str(path.absolute()) for name, path in self.settings.tests.items()}
+        tests = {name: str(path.absolute()) for name, path in self.request.tests.items()}
         require_same(f"{file}: --test", ((name, tested.get(name, tests[name]), tests[name]) for name in tests), REMEDY)
-        return dict(stored) if set(self.settings.all_tests) <= set(stored["splits"]) else None
+        return dict(stored) if set(self.request.all_tests) <= set(stored["splits"]) else None
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
         """Train, test, write `folder`/job.json last, and return what it holds; at once when it is there already."""
-        if (earlier := self.stored()) is not None:
+        if (earlier := self.check()) is not None:
             return earlier
         report = progress or (lambda stage, share, text: None)
         report("training", 0.0, "")
         cv2.setNumThreads(torch.get_num_threads())  # else every worker takes all cores
-        capture = capture or _read(self.capture, self.settings.transforms)
+        capture = capture or _read(self.capture, self.request.transforms)
         started = time.monotonic()
         task = replace(self.task(capture), progress=lambda share, text: report("training", share, text))
         predict = model_class(self.model)().fit(task)
@@ -214,12 +159,12 @@ class DownstreamJob:
         result = {
             "schema": JOB_SCHEMA,
             **self.identity(),
-            "tests": {name: str(path.absolute()) for name, path in self.settings.tests.items()},
+            "tests": {name: str(path.absolute()) for name, path in self.request.tests.items()},
             "labelled": [sample.name for sample in self.labelled(capture)],
             "iterations": task.steps,
             "seconds": round(seconds, 1),
             "input": list(task.size),
-            "splits": {test: self._test(predict, test, capture) for test in self.settings.all_tests},
+            "splits": {test: self._test(predict, test, capture) for test in self.request.all_tests},
         }
         write_json(self.folder / JOB_FILE, result)
         return result
@@ -228,39 +173,39 @@ class DownstreamJob:
         """The labelled frames."""
         if REAL not in self.condition:
             return []
-        recorded = recorded_samples(capture, "train", self.settings.classes, self.settings.labels)
+        recorded = recorded_samples(capture, "train", self.request.classes, self.request.labels)
         return [recorded[index] for index in labelled_frames(len(recorded), self.real, self.fold)]
 
     def task(self, capture: Capture) -> TrainingTask:
         """Return the training task. Its images depend on the fold, their order on nothing else."""
-        settings, kind, labelled = self.settings, model_class(self.model), self.labelled(capture)
-        size = frame_size(labelled or recorded_samples(capture, settings.splits[0], settings.classes))
-        names = class_names(capture, settings.classes)
+        request, kind, labelled = self.request, model_class(self.model), self.labelled(capture)
+        size = frame_size(labelled or recorded_samples(capture, request.splits[0], request.classes))
+        names = class_names(capture, request.classes)
         synthetic: list[Sequence[Sample]] = []
         for data in self.sets:
             samples = synthetic_samples(data, names, size)
             synthetic.append(permuted(samples) if PERMUTED in self.condition else samples)
         if PASTE in self.condition:
-            synthetic.append(pasted_samples(labelled, settings.backgrounds, self.fold))
+            synthetic.append(pasted_samples(labelled, request.backgrounds, self.fold))
         return TrainingTask(
             classes=names,
             batches=BatchSampler(labelled, synthetic, seed=self.fold, augmented=STRONG in self.condition),
-            size=settings.input_of(kind, size),
-            steps=settings.steps_of(kind),
-            batch=settings.batch_of(kind),
+            size=input_of(request, kind, size),
+            steps=steps_of(request, kind),
+            batch=request.batch or kind.batch,
             seed=self.fold,
-            device=device_of(settings.device, drawing=False),
+            device=device_of(request.device, drawing=False),
             folder=self.folder,
-            keep_weights=self.fold == settings.kept_fold,
+            keep_weights=self.fold == request.kept_fold,
         )
 
     def _test(self, predict: Predict, test: str, capture: Capture) -> dict[str, Any]:
         """Scores on one split or capture; the predictions of one fold are stored for pictures."""
-        names = class_names(capture, self.settings.classes)
-        samples = self.settings.samples(capture, test)
+        names = class_names(capture, self.request.classes)
+        samples = held_out_samples(self.request, capture, test)
         truth = [CACHE.load(sample) for sample in samples]
         predictions = predict([example.image for example in truth])
-        if self.fold == self.settings.kept_fold:
+        if self.fold == self.request.kept_fold:
             write_predictions(self.folder, test, [sample.name for sample in samples], predictions)
         frames = [
             {"box_iou": box_iou(found, true)} if isinstance(found, Detections) else mask_scores(found, true, names)
@@ -286,11 +231,9 @@ def write_predictions(job: Path, test: str, names: Sequence[str], predictions: S
         for name, prediction in zip(names, predictions, strict=True)
     }
 
-    def write(file: Path) -> None:
-        with open(file, "wb") as stream:
-            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-
-    write_atomically(job / "predictions" / f"{test}.npz", write)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    write_atomically(job / "predictions" / f"{test}.npz", lambda file: file.write_bytes(stream.getvalue()))
 
 
 def read_predictions(job: Path, test: str) -> dict[str, Prediction]:
@@ -312,16 +255,11 @@ def _read(path: Path, transforms: str) -> Capture:
     return read_capture(path, transforms)
 
 
-def absolute(path: Path | None) -> str | None:
-    """A path for a file; None stays None."""
-    return None if path is None else str(path.absolute())
-
-
 @dataclass(frozen=True, kw_only=True)
 class DownstreamPlan:
-    """A study whose settings are checked, ready to run."""
+    """A checked request, ready to run."""
 
-    settings: DownstreamSettings  # with the splits that are tested
+    request: DownstreamRequest  # with the splits that are tested
     capture: Capture
     jobs: tuple[DownstreamJob, ...]
     images: Mapping[str, int]  # of each set
@@ -329,58 +267,73 @@ class DownstreamPlan:
     frame_size: tuple[int, int]  # width, height
 
 
-def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
+def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
     """Check all that can be known before the work. Raises NeecoError for what cannot be trained or tested."""
     for option in ("folds", "steps", "size", "batch"):
-        value = getattr(settings, option)
-        if value is not None and value < 1:
+        if (value := getattr(request, option)) is not None and value < 1:
             raise NeecoError(f"--{option} must be at least 1 (got {value})")
-    check_workers(settings.workers, device_of(settings.device, drawing=False), share_gpus=True)
-    if not settings.models:
+    check_workers(request.workers, device_of(request.device, drawing=False), share_gpus=True)
+    if not request.models:
         raise NeecoError("--models: none is given; name at least one")
-    names = [data.name for data in settings.sets]
+    names = [data.name for data in request.image_sets]
     for name in names:
         if name in ("", *RESERVED) or {*name} & set("+/\\") or names.count(name) > 1:
             raise NeecoError(f"--sets {name}: reserved, not usable in file names, or given twice; choose another name")
-    if settings.backgrounds is not None:
-        background_files(settings.backgrounds)
-    words = default_conditions(names) if settings.conditions is None else settings.conditions
-    conditions = [parse_condition(word, names) for word in dict.fromkeys(words)]
-    capture = read_checked(settings.capture, settings.transforms)
-    settings = replace(settings, splits=_splits(capture, settings.splits))
-    size = frame_size(recorded_samples(capture, settings.splits[0], settings.classes))
-    classes = class_names(capture, settings.classes)
-    images = {data.name: len(synthetic_samples(data, classes, size)) for data in settings.sets}
-    _check_tests(settings, capture)
-    _check_models(settings, capture, size)
-    labelled, counts = 0, [0] if "0" in (settings.num_real or ("0",)) else []
-    for word in settings.num_real or ():
+    if request.backgrounds is not None:
+        background_files(request.backgrounds)
+    words = dict.fromkeys(request.conditions or default_conditions(names))
+    conditions = [parse_condition(word, names) for word in words]
+    capture = read_checked(request.capture, request.transforms)
+    splits = _splits(capture, request.splits)
+    request = replace(request, splits=splits, models=tuple(dict.fromkeys(request.models)))
+    size = frame_size(recorded_samples(capture, splits[0], request.classes))
+    classes = class_names(capture, request.classes)
+    images = {data.name: len(synthetic_samples(data, classes, size)) for data in request.image_sets}
+    for name, path in request.tests.items():
+        if name in capture.splits:
+            raise NeecoError(f"--test {name}: is a split's name or no file name; choose another: --test NAME={path}")
+        other = read_checked(path, "transforms.json")
+        if class_names(other, request.classes) != classes:
+            raise NeecoError(f"--test {name}: {path} has other parts than {capture.root}; use --classes instrument")
+        recorded_samples(other, None, request.classes)
+    _check_models(request, capture, size)
+    labelled, counts = 0, [0] if "0" in (request.num_real or ("0",)) else []
+    for word in request.num_real:
         labelled_count(word, 10**9)
-    if any(REAL in condition for condition in conditions) and set(settings.num_real or "all") != {"0"}:
-        labelled = len(recorded_samples(capture, "train", settings.classes, settings.labels))
-        usual = (str(count) for count in settings.default_counts if count < labelled)
-        wanted = settings.num_real or ("0", *usual, "all")
+    if any(REAL in condition for condition in conditions) and set(request.num_real or "all") != {"0"}:
+        labelled = len(recorded_samples(capture, "train", request.classes, request.labels))
+        usual = (str(count) for count in request.default_counts if count < labelled)
+        wanted = request.num_real or ("0", *usual, "all")
         counts = sorted({labelled_count(word, labelled) for word in wanted})
     jobs = tuple(
-        DownstreamJob(settings, model, condition, real, fold)
-        for fold in range(settings.folds)  # the first fold of everything comes first: results halfway are of all
-        for model in settings.models
+        DownstreamJob(
+            capture=request.capture,
+            folder=request.job_folder(model, condition.name, real, fold),
+            device=request.device,
+            request=request,
+            model=model,
+            condition=condition,
+            real=real,
+            fold=fold,
+        )
+        for fold in range(request.folds)  # the first fold of everything comes first: results halfway are of all
+        for model in request.models
         for condition in conditions
         for real in counts
         if bool(real) == (REAL in condition)
     )
     trained = {job.condition.name for job in jobs}
-    if missing := [item.name for item in conditions if item.name not in trained and (settings.conditions or not jobs)]:
+    if missing := [item.name for item in conditions if item.name not in trained and (request.conditions or not jobs)]:
         problem = f"leaves nothing to train {missing[0]} on"
         raise NeecoError(f"--num-real: {problem}; add 0 for sets alone, a number for real")
-    entries = [entry.name for entry in settings.output.iterdir()] if settings.output.is_dir() else []
+    entries = [entry.name for entry in request.output.iterdir()] if request.output.is_dir() else []
     if [name for name in entries if not name.startswith(".")] != ["jobs"]:  # not just before its first result
-        same = {"schema": SCHEMA, "capture": str(settings.capture.absolute())}
-        check_output(settings.output, FILE, "a downstream experiment", **same)
+        same = {"schema": SCHEMA, "capture": str(request.capture.absolute())}
+        check_output(request.output, FILE, "a downstream experiment", **same)
     for job in jobs:
         job.check()
     return DownstreamPlan(
-        settings=settings, capture=capture, jobs=jobs, images=images, labelled=labelled, frame_size=size
+        request=request, capture=capture, jobs=jobs, images=images, labelled=labelled, frame_size=size
     )
 
 
@@ -395,27 +348,16 @@ def _splits(capture: Capture, requested: Sequence[str]) -> tuple[str, ...]:
     return tuple(requested or usable)
 
 
-def _check_tests(settings: DownstreamSettings, capture: Capture) -> None:
-    """Raises NeecoError for other captures that cannot be tested on, or whose names mean something else."""
-    for name, path in settings.tests.items():
-        if name in (*capture.splits, "") or {*name} & {"/", "\\"}:
-            raise NeecoError(f"--test {name}: is a split's name or no file name; choose another: --test NAME={path}")
-        other = read_checked(path, "transforms.json")
-        if class_names(other, settings.classes) != class_names(capture, settings.classes):
-            raise NeecoError(f"--test {name}: {path} has other parts than {capture.root}; use --classes instrument")
-        recorded_samples(other, None, settings.classes)
-
-
-def _check_models(settings: DownstreamSettings, capture: Capture, frame: tuple[int, int]) -> None:
+def _check_models(request: DownstreamRequest, capture: Capture, frame: tuple[int, int]) -> None:
     """Raises NeecoError for models that cannot be trained here, or not on these images."""
-    for name in settings.models:
+    for name in request.models:
         kind = model_class(name)
         if missing := kind.missing_requirement():
             raise NeecoError(f"--models {name}: {missing}")
-        width, height = settings.input_of(kind, frame)
+        width, height = input_of(request, kind, frame)
         if kind.is_too_small((width, height)):
             raise NeecoError(f"--models {name}: its input of {width}x{height} px is too small; give a larger --size")
-        several = [str(data.path) for data in settings.sets if data.instruments() > 1]
+        several = [str(data.path) for data in request.image_sets if data.instruments() > 1]
         several += [str(capture.root)] if len(capture.instruments) > 1 else []
         if kind.predicts == "boxes" and several:
             problem = f"{several[0]}: has several instruments, and labels do not tell them apart"
@@ -423,71 +365,67 @@ def _check_models(settings: DownstreamSettings, capture: Capture, frame: tuple[i
 
 
 def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | None = None) -> dict[str, Any]:
-    """Train and test every model in every condition on every fold; writes downstream.csv and downstream.json, and
-    returns what the latter holds.
-
-    Started again after an interruption it continues where it stopped; started again with more models, sets, conditions,
-    labelled frames or folds, it adds them. A failed job is reported in its place.
-    """
-    file, jobs = plan.settings.output / FILE, plan.jobs
-    with own_folder(plan.settings.output):
-        finished = {index: stored for index, job in enumerate(jobs) if (stored := job.stored()) is not None}
-        captures = {plan.settings.capture: plan.capture}
+    """Train and test every model in every condition on every fold, but what an earlier start finished; writes
+    downstream.csv and downstream.json, and returns what the latter holds. A failed job is reported in its place."""
+    file, jobs = plan.request.output / FILE, plan.jobs
+    with own_folder(plan.request.output):
+        finished = {index: stored for index, job in enumerate(jobs) if (stored := job.check()) is not None}
+        captures = {plan.request.capture: plan.capture}
         written, recorded = 0.0, list[Mapping[str, Any]]()
 
         def record(results: Sequence[Mapping[str, Any]]) -> None:
             nonlocal written
             recorded[:] = results
-            if time.monotonic() > written + plan.settings.write_every_s:
+            if time.monotonic() > written + plan.request.write_every_s:
                 write_json(file, document(plan, recorded))
                 written = time.monotonic()
 
         try:
-            results = run_jobs(jobs, plan.settings.workers, record, finished, progress, captures, light=True)
+            results = run_jobs(jobs, plan.request.workers, record, finished, progress, captures, light=True)
         except KeyboardInterrupt:
             if recorded:
                 write_json(file, document(plan, recorded))
             raise
         result = document(plan, results) | {"complete": True}
         write_json(file, result)
-        write_text(plan.settings.output / TABLE, summary_text(result))
+        write_text(plan.request.output / TABLE, summary_text(result))
     return result
 
 
 def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the contents of downstream.json for these results."""
-    settings, kinds = plan.settings, {name: model_class(name) for name in plan.settings.models}
+    request, kinds = plan.request, {name: model_class(name) for name in plan.request.models}
     predicts = {name: kind.predicts for name, kind in kinds.items()}
     notes = []
-    if settings.folds < 3:
+    if request.folds < 3:
         notes.append("intervals of fewer than three folds hardly cover other seeds; give --folds 5 before concluding")
-    if settings.labels is not None:
-        notes.append(f"labels of recorded training frames: {settings.labels}; tests are scored by the capture's truth")
+    if request.labels is not None:
+        notes.append(f"labels of recorded training frames: {request.labels}; tests are scored by the capture's truth")
     made: dict[str, Any] = {
         "schema": SCHEMA,
         "version": __version__,
         "complete": False,
-        "capture": str(settings.capture.absolute()),
-        "machine": machine(device_of(settings.device, drawing=False), settings.workers),
-        "labels": absolute(settings.labels),
-        "classes": list(class_names(plan.capture, settings.classes)),
-        "tests": settings.all_tests,
-        "captures": {name: str(path.absolute()) for name, path in settings.tests.items()},  # of tests
-        "folds": settings.folds,
+        "capture": str(request.capture.absolute()),
+        "machine": machine(device_of(request.device, drawing=False), request.workers),
+        "labels": request.labels and str(request.labels.absolute()),
+        "classes": list(class_names(plan.capture, request.classes)),
+        "tests": request.all_tests,
+        "captures": {name: str(path.absolute()) for name, path in request.tests.items()},  # of tests
+        "folds": request.folds,
         "labelled": plan.labelled,
-        "sets": [data.described() | {"images": plan.images[data.name]} for data in settings.sets],
+        "sets": [data.described() | {"images": plan.images[data.name]} for data in request.image_sets],
         "models": [
             {
                 "name": name,
                 "predicts": kind.predicts,
-                "steps": settings.steps_of(kind),
-                "batch": settings.batch_of(kind),
-                "input": list(settings.input_of(kind, plan.frame_size)),
+                "steps": steps_of(request, kind),
+                "batch": request.batch or kind.batch,
+                "input": list(input_of(request, kind, plan.frame_size)),
             }
             for name, kind in kinds.items()
         ],
         "jobs": list(results),
-        "summary": summarise(results, predicts, settings.all_tests),
+        "summary": summarise(results, predicts, request.all_tests),
         "notes": notes,
     }
     return made | {"findings": findings(made)}

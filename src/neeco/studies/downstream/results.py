@@ -1,8 +1,5 @@
-"""Results of a downstream study: scores of predictions, their intervals over folds and frames, findings and tables.
-
-Masks are scored per frame, boxes over a split (by pycocotools). A study's results are one document, that of
-downstream.json, of plain values: "jobs" as they wrote them, "summary" and "findings" from here.
-"""
+"""Results of a downstream study, the document of downstream.json: scores of predictions (masks per frame, boxes over a
+split), their intervals over folds and frames, findings and tables."""
 
 from __future__ import annotations
 
@@ -12,6 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -151,11 +149,6 @@ class Arm(NamedTuple):
     condition: str
     real: int
 
-    @property
-    def words(self) -> list[str]:
-        """The words of its condition."""
-        return self.condition.split("+")
-
 
 class Estimate(NamedTuple):
     """A mean over folds with the ends of its interval, which are None where there is one value only."""
@@ -184,11 +177,6 @@ class Scores:
         """Return the score of every fold that has it."""
         scores = {fold: job["splits"].get(test, {}).get(metric) for fold, job in self.jobs.get(arm, {}).items()}
         return {fold: score for fold, score in sorted(scores.items()) if score is not None}
-
-    def mean(self, arm: Arm, test: str, metric: str) -> float | None:
-        """Return the mean over folds, without its interval; None where no fold has the score."""
-        values = self.by_fold(arm, test, metric)
-        return float(np.mean(list(values.values()))) if values else None
 
     def estimate(self, arm: Arm, test: str, metric: str, against: Arm | None = None) -> Estimate | None:
         """Return the mean of an arm's score over folds, or of its difference to another's over the folds that both
@@ -246,6 +234,16 @@ def block_weights(frames: int) -> np.ndarray:
     return covered[:, :frames] + covered[:, frames : 2 * frames]
 
 
+def mean_or_none(values: Mapping[int, float]) -> float | None:
+    """Return the mean over folds; None where no fold has the score."""
+    return float(np.mean(list(values.values()))) if values else None
+
+
+def words_of(condition: str) -> set[str]:
+    """The words of a condition, in whatever order they stand."""
+    return set(condition.split("+"))
+
+
 def title_of(condition: str, real: int) -> str:
     """`kinematic+real, 20 labelled`."""
     return f"{condition}, {real} labelled" if real else condition
@@ -269,12 +267,8 @@ def metrics_of(jobs: Sequence[Document], predicts: str) -> list[str]:
 
 def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequence[str]) -> list[dict[str, Any]]:
     """A row per arm and test: means of scores over `folds`, the 95 % interval of the main one as "low" and "high", and
-    its "difference" to the arm "against" over the folds that both finished, with an interval and a "verdict".
-
-    models: what each predicts, by name. A condition is compared with the better of labelled frames alone and strongly
-    augmented, at as many labelled frames (sets alone: at the most); strong augmentation with none; permuted labels with
-    the right ones.
-    """
+    its "difference" to the arm "against" over the folds that both finished, with an interval and a "verdict". models:
+    what each predicts, by name."""
     rows, scores = [], Scores(jobs)
     for arm in dict.fromkeys(Arm(job["model"], job["condition"], job["real"]) for job in jobs):
         main = MAIN[models[arm.model]]
@@ -282,7 +276,7 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
         for test in tests:
             score = scores.estimate(arm, test, main) or Estimate(0, math.nan, None, None)
             row: dict[str, Any] = {**arm._asdict(), "test": test, "folds": score.folds}
-            row |= {metric: scores.mean(arm, test, metric) for metric in metrics}
+            row |= {metric: mean_or_none(scores.by_fold(arm, test, metric)) for metric in metrics}
             row |= {"low": score.low, "high": score.high}
             reference = _reference(arm, test, scores, main)
             if reference is not None and (gain := scores.estimate(arm, test, main, reference)) is not None:
@@ -294,8 +288,9 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
 
 
 def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
-    """The arm that `arm` is compared with on a test, in whatever order their conditions' words stand."""
-    words, baselines = set(arm.words), [set(name.split("+")) for name in BASELINES]
+    """The arm that `arm` is compared with on a test: the better of labelled frames alone and strongly augmented, at as
+    many labelled frames (sets alone: at the most); strong augmentation with none; permuted labels with the right."""
+    words, baselines = words_of(arm.condition), [words_of(name) for name in BASELINES]
     others = [other for other in scores.jobs if other.model == arm.model and other != arm]
     wanted, real = baselines, arm.real
     if PERMUTED in words:
@@ -303,11 +298,13 @@ def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
     elif words in baselines:
         wanted = baselines[: baselines.index(words)]
     elif REAL not in words:
-        real = max((other.real for other in others if set(other.words) in baselines), default=0)
+        real = max((other.real for other in others if words_of(other.condition) in baselines), default=0)
     rivals = [
         (mean, other)
         for other in others
-        if set(other.words) in wanted and other.real == real and (mean := scores.mean(other, test, metric)) is not None
+        if words_of(other.condition) in wanted
+        and other.real == real
+        and (mean := mean_or_none(scores.by_fold(other, test, metric))) is not None
     ]
     return max(rivals)[1] if rivals else None
 
@@ -325,23 +322,18 @@ def rows_of(experiment: Document, model: Document, test: str) -> list[Document]:
     return sorted(rows, key=lambda row: row["real"])
 
 
-def models_and_tests(experiment: Document) -> list[tuple[Document, str]]:
-    """Every model with every test."""
-    return [(model, test) for model in experiment["models"] for test in experiment["tests"]]
-
-
 def is_synthetic(row: Document, experiment: Document) -> bool:
     """Return whether a row's condition has a set with its own labels."""
-    words = row["condition"].split("+")
+    words = words_of(row["condition"])
     return PERMUTED not in words and any(entry["name"] in words for entry in experiment["sets"])
 
 
 def findings(experiment: Document) -> list[str]:
     """Return the findings: a sentence for every model, test and condition with synthetic images that is compared."""
     sentences = []
-    for model, test in models_and_tests(experiment):
+    for model, test in product(experiment["models"], experiment["tests"]):
         for row in rows_of(experiment, model, test):
-            if "against" in row and (is_synthetic(row, experiment) or PERMUTED in row["condition"].split("+")):
+            if "against" in row and (is_synthetic(row, experiment) or PERMUTED in words_of(row["condition"])):
                 score = f"{_title(MAIN[model['predicts']])} {row[MAIN[model['predicts']]]:.3f}"
                 against = f"{title_of(row['against'], row['against_real'])} ({_difference(row)})"
                 arm = f"{model['name']}, {test}: {title_of(row['condition'], row['real'])}"
@@ -385,7 +377,7 @@ def _title(metric: str) -> str:
 
 def tables_of(experiment: Document) -> list[ResultTable]:
     """The table of every model and test."""
-    return [table_of(experiment, model, test) for model, test in models_and_tests(experiment)]
+    return [table_of(experiment, *pair) for pair in product(experiment["models"], experiment["tests"])]
 
 
 def summary_text(experiment: Document) -> str:

@@ -15,6 +15,7 @@ from scipy.ndimage import find_objects
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes, read_json, read_json_lines, require_inside, require_like
+from neeco.base.settings import name_and_value
 from neeco.capture.checks.truth import PARTS_FILE
 from neeco.capture.images import image_files, image_size, read_image_bytes, read_labels
 from neeco.capture.model import Capture, Frame
@@ -196,6 +197,18 @@ class ImageSet:
     path: Path
     count: int | None = None
 
+    @classmethod
+    def of(cls, word: str) -> ImageSet:
+        """Return that of NAME=DATASET or NAME=DATASET:COUNT; a folder whose name ends so is the folder. Raises
+        NeecoError."""
+        name, place = name_and_value("--sets", word, "kinematic=dataset")
+        folder, colon, count = place.rpartition(":")
+        if not colon or not count.isdecimal() or Path(place).exists():
+            return cls(name, Path(place))
+        if int(count) < 1:
+            raise NeecoError(f"--sets {word}: the number of images must be at least 1 (got {count})")
+        return cls(name, Path(folder), int(count))
+
     def file(self, *names: str) -> Path:
         """A file or folder of it. Raises NeecoError where a link leads out of it."""
         return require_inside(self.path.joinpath(*names), self.path)
@@ -226,12 +239,8 @@ class ImageSet:
 def recorded_samples(
     capture: Capture, split: str | None, classes: ClassNames, labels: Path | None = None
 ) -> tuple[RecordedSample, ...]:
-    """The labelled frames of a split (None: of all): by the capture's truth, or by a folder of masks named as the
-    frames.
-
-    Frames without a label are left out. Raises NeecoError where there is none at all, or where parts are requested and
-    the labels have none.
-    """
+    """The labelled frames of a split (None: of all), by the capture's truth or a folder of masks named as the frames.
+    Raises NeecoError where there is none at all, or where parts are requested and the labels have none."""
     masks = None if labels is None else open_masks(labels, option=f"{labels / PARTS_FILE}:")
     chosen = capture.frames if split is None else capture.split(split)
     if masks is None and any(truth_file(capture.root, frame.name) for frame in chosen):
@@ -257,12 +266,9 @@ def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:
 
 
 def synthetic_samples(data: ImageSet, classes: Sequence[str], size: tuple[int, int]) -> tuple[SyntheticSample, ...]:
-    """The images of a data set in their order, each with its labels; the first `count` of them.
-
-    The dataset.json of `neeco synthesize` says what ids mean; without it, masks/ separate instrument and tissue. Of a
-    set that `neeco annotate` wrote only the frames of split train are used: models are tested on the others. size:
-    (width, height) that all must have. Raises NeecoError.
-    """
+    """The images of a data set in their order, each with its labels; the first `count` of them. Of a set that `neeco
+    annotate` wrote only the frames of split train are used. size: (width, height) that all must have. Raises
+    NeecoError."""
     folder, info = data.file(IMAGE_FOLDER), data.info()
     images = image_files(folder) if folder.is_dir() else ()
     if info is not None and "annotates" in info["settings"]:

@@ -1,7 +1,5 @@
-"""Training data of a downstream model: conditions in words, labelled frames, cut-and-paste, batches at its input size.
-
-Cut-and-paste (Dwibedi et al., "Cut, Paste and Learn", 2017): labelled instruments over backgrounds without one.
-"""
+"""Training data of a downstream model: conditions in words, labelled frames, cut-and-paste (Dwibedi et al., "Cut, Paste
+and Learn", 2017), batches at its input size."""
 
 from __future__ import annotations
 
@@ -28,11 +26,8 @@ IMAGES = Cache()  # of training images; in one with the examples, which are larg
 
 @dataclass(frozen=True)
 class Condition:
-    """The training data of a model: a sum of words, `SET+real+strong`. `word in condition` asks for one of them.
-
-    sets: names of data sets. real: with labelled recorded frames; strong: strong augmentation of every image; paste:
-    with the labelled instruments pasted over backgrounds; permuted: the sets' labels belong to other images.
-    """
+    """The training data of a model: a sum of words, `SET+real+strong` (docs/downstream.md), of which `word in
+    condition` asks for one. sets: names of data sets."""
 
     name: str
     sets: tuple[str, ...] = ()
@@ -75,12 +70,9 @@ def labelled_count(word: str, frames: int) -> int:
 
 
 def labelled_frames(frames: int, count: int, fold: int) -> list[int]:
-    """Choose the `count` of so many recorded frames that are labelled in a fold, in their order.
-
-    Those of a smaller count are among those of a larger one, and the same for every condition and model of a fold: the
-    additive recurrence of the golden ratio from a start of the fold's own, whose first points are spread evenly
-    whatever their number (Steinhaus' three-gap theorem); of a frame taken already the next one.
-    """
+    """Choose the `count` of so many recorded frames that are labelled in a fold, in their order: the additive
+    recurrence of the golden ratio from a start of the fold's own, whose first points are spread evenly whatever their
+    number (Steinhaus' three-gap theorem); of a frame taken already the next one."""
     start = np.random.default_rng(np.random.SeedSequence([fold, 0])).random()
     free = np.ones(frames, bool)
     for k in range(count):
@@ -106,11 +98,8 @@ class PasteSettings:
 
 @dataclass(frozen=True)
 class Backgrounds:
-    """Images without an instrument: files, else the labelled frames with their instruments filled in.
-
-    Where the camera stands still a pixel is filled by its median over the frames that show it; what none shows, and
-    where the camera moves, by inpainting (Telea, 2004).
-    """
+    """Images without an instrument: files, else the labelled frames with their instruments filled in: where the camera
+    stands still by each pixel's median over the frames that show it, elsewhere by inpainting (Telea, 2004)."""
 
     samples: tuple[RecordedSample, ...]
     files: tuple[Path, ...] = ()
@@ -286,12 +275,9 @@ def collate(images: Sequence[TrainingImage], device: torch.device, rng: torch.Ge
 
 
 class BatchSampler:
-    """Draws samples from sources without end. A source is shuffled anew after each pass.
-
-    sources: recorded frames where there are any, then the synthetic ones, of which each has an equal share. Where there
-    are both, synthetic ones are drawn until `real_alone_from`, then recorded ones alone. The seed decides the order.
-    augmented: whether a batch is to be strongly augmented.
-    """
+    """Draws samples from sources without end, each shuffled anew after a pass: recorded frames, and synthetic ones, of
+    which each has an equal share. Where there are both, synthetic ones are drawn until `real_alone_from`, then recorded
+    ones alone. augmented: whether a batch is to be strongly augmented."""
 
     real_alone_from = 0.6  # share of the steps from which only recorded frames are drawn
 
