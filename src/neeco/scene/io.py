@@ -16,8 +16,8 @@ from torch import Tensor
 from neeco import __version__
 from neeco.base.errors import NeecoError
 from neeco.base.files import HALVES, finite, require_content, require_like, write_atomically
-from neeco.base.settings import plain
-from neeco.capture.documents import Node, RaisingReport
+from neeco.base.settings import faults_in, plain
+from neeco.capture.documents import Node
 from neeco.capture.model import SEPARATE_TISSUES, Camera, Instrument, InstrumentState, State, share_lamps
 from neeco.capture.readers import kinematics_of
 from neeco.capture.readers.cameras import parse_lens
@@ -199,7 +199,8 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
         pose = _pose(tensors["recorded.cameras"][index], f"camera in frame {index}")
         cameras.append(_camera(pose, dict(zip(INTRINSICS, map(_number, entry["intrinsics"]), strict=True))))
     names, splits = (tuple(entry[key] for entry in header["recorded"]) for key in ("name", "split"))
-    lens = None if "lens" not in header else parse_lens(Node(header["lens"], "header", "lens", RaisingReport()))
+    with faults_in("header"):
+        lens = parse_lens(Node(header["lens"], "header", "lens")) if "lens" in header else None
     scale = _number(header.get("scale", 1.0))
     if not 0 < scale <= 1:
         raise ValueError(f"its scale is {scale}, not a share of the images' size")

@@ -161,7 +161,7 @@ def _parse(path: Path, report: ProblemReport, transforms: str, background: float
     try:
         file = inside(path, path, transforms)
     except NeecoError as error:
-        Node(None, transforms, "", report).error_from(error)
+        Node(None, transforms, "", report).error(*str(error).split("; ", 1))
         return Parsed(path)
     if file.is_file():
         document = load_document(file, path, report)

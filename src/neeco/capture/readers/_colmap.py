@@ -121,7 +121,7 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
             path = inside(root, root / "images", image.name)
             camera = _camera(image, cameras, parsed)
         except NeecoError as error:
-            place.error_from(error)
+            place.error(*str(error).split("; ", 1))
             continue
         if not path.is_file():
             message, remedy = missing_file(root / "images", image.name)

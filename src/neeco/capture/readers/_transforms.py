@@ -30,14 +30,12 @@ _MILLIMETRES = ("mm", "millimeter", "millimetre", "millimeters", "millimetres")
 
 def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
     """A JSON file as the node of its object. What cannot be parsed is reported and gives an empty object."""
-    name = relative_name(file, root)
-    value: Any = {}
+    node = Node({}, relative_name(file, root), "", report)
     try:
-        value = read_json(file)
+        node = node.at(read_json(file), "")
     except NeecoError as error:
-        report.error(name, "", str(error).removeprefix(f"{file}: "))
-    node = Node(value, name, "", report)
-    return node if node.is_object() else Node({}, name, "", report)
+        report.error(node.file, "", str(error).removeprefix(f"{file}: "))
+    return node if node.tried(Node.members) is not None else node.at({}, "")
 
 
 def parse_transforms(
@@ -147,7 +145,7 @@ def _parse_header(document: Node, parsed: Parsed) -> None:
         document.child("camera_motion").error(f"is {printable(motion)}", "write 'moving' or 'still'")
     parsed.still = parsed.still or motion == "still"
     if document.has("lens"):
-        parsed.lens = parse_lens(document.child("lens"))
+        parsed.lens = document.child("lens").tried(parse_lens)
     parsed.says_units = parsed.says_units or value.get("units") is not None or value.get("schema") == SCHEMA
 
 
@@ -160,35 +158,25 @@ def _parse_frames(
     extensions: tuple[str, ...] = (),
 ) -> None:
     """Append the file's frames. `split` names them all where given; `extensions` are tried on paths without one."""
-    nodes = document.child("frames")
-    if nodes.value is None:
-        nodes.error("is missing", "list the images and their cameras there")
+    frames = document.child("frames")
+    if not frames.value:
+        frames.error("is missing" if frames.value is None else "is empty", "list the images and their cameras there")
         return
-    if not isinstance(nodes.value, list):
-        nodes.error(f"expected a list, found {printable(nodes.value)}")
-        return
-    splits, header = _Splits(document, split), _HeaderReport(document, len(nodes.value))
-    timed = 0
-    for index, node in enumerate(nodes.items()):
-        if not node.is_object():
+    nodes = frames.tried(Node.items) or []
+    splits, first, timed = _Splits(document, split), len(document.report.problems), 0
+    for index, node in enumerate(nodes):
+        if node.tried(Node.members) is None:
             continue
-        image_path = None
-        if (file := node.child("file_path")).value is None:
-            file.error("is missing", "name the frame's image")
-        else:
-            image_path = _image(file, folder, parsed, extensions)
+        image_path = _image(node.child("file_path"), folder, parsed, extensions)
         name = splits.of(node, index)
-        pose = node.child("transform_matrix").rigid()
-        mask_path = _file(node.child("mask_path"), folder, parsed.root) if node.has("mask_path") else None
-        time = node.child("time").number() if node.has("time") else float(index)
-        if time is not None and (fault := time_fault(time)) is not None:
-            node.child("time").error(*fault)
-            time = None
+        pose = node.child("transform_matrix").tried(Node.rigid)
+        mask_path = node.given("mask_path", lambda mask: mask.tried(_file, folder, parsed.root), None)
+        time = node.given("time", lambda stated: stated.tried(_time), float(index))
         timed += node.has("time")
         instruments = parse_instruments(node)
         if image_path is None:
             continue
-        camera = CameraFields(node, header.document, image_path, parsed).camera()
+        camera = CameraFields(node, document, image_path, parsed).camera()
         if name is None or time is None or instruments is None:
             continue
         if pose is None or camera is None:
@@ -199,20 +187,36 @@ def _parse_frames(
             camera = replace(camera, world_from_camera=opencv)
         parsed.frames.append(Frame(image_path, camera, State(instruments, time), name, mask_path, background))
         parsed.places.append(node)
-    header.pass_on()
-    if nodes.value == []:
-        nodes.error("is empty", "list the images and their cameras there")
-    elif timed < len(nodes.value):  # where not every frame has a time, the order stands in for all: no mix of units
+    _count_shared(document.report, first, len(nodes))
+    if timed < len(nodes):  # where not every frame has a time, the order stands in for all: no mix of units
         parsed.timed = False
         for order, frame in enumerate(parsed.frames):
             parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
 
 
+def _count_shared(report: ProblemReport, first: int, frames: int) -> None:
+    """Merge problems, from the `first` on, of the camera at the file's top level: each once, before those of frames,
+    with the number of frames it concerns."""
+    found = report.problems[first:]
+    shared = Counter(problem for problem in found if not problem.field.startswith("frames["))
+    merged = []
+    for problem, count in shared.items():
+        concerned = "" if frames == 1 else f", for {count} of {frames} frames"
+        merged.append(replace(problem, message=problem.message + concerned))
+    report.problems[first:] = [*merged, *(problem for problem in found if problem not in shared)]
+
+
+def _time(node: Node) -> float:
+    time = node.number()
+    if (fault := time_fault(time)) is not None:
+        node.fail(*fault)
+    return time
+
+
 def _parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
     """Read the point cloud that `ply_file_path` names, if it names one."""
     parsed.points_place = document.child("ply_file_path")
-    path = _file(parsed.points_place, folder, parsed.root) if document.has("ply_file_path") else None
-    if path is None:
+    if (path := document.given("ply_file_path", lambda node: node.tried(_file, folder, parsed.root), None)) is None:
         return
     name = relative_name(path, parsed.root)
     parsed.points_place = Node(None, name, "vertex", document.report)
@@ -236,16 +240,16 @@ class _Splits:
         if any(node.value is not None for _, node in lists):
             self.listed = {}
             for name, node in lists:
-                for item in node.items() if node.value is not None else ():
-                    text = item.text()
-                    self.listed.update({} if text is None else {text: name})
+                for item in (node.tried(Node.items) if node.value is not None else None) or ():
+                    if (text := item.tried(Node.text)) is not None:
+                        self.listed[text] = name
         self.some_say = any(frame.get("split") is not None for frame in _frame_objects(document))
 
     def of(self, frame: Node, index: int) -> str | None:
         if self.fixed is not None:
             return self.fixed
         if frame.has("split"):
-            return frame.child("split").text()
+            return frame.child("split").tried(Node.text)
         if self.listed is not None:
             name = self.listed.get(str(frame.value.get("file_path")))
             if name is None:
@@ -257,48 +261,23 @@ class _Splits:
         return "test" if index % TEST_EVERY == 0 else "train"
 
 
-def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path | None:
-    """The existing file inside the capture that a node names; `extensions` are tried on paths without one."""
+def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path:
+    """The existing file inside the capture that a node names; `extensions` are tried on paths without one. Raises Fault
+    and, for paths that lead out, NeecoError."""
     text = node.text()
-    if text is None:
-        return None
-    try:
-        candidates = [inside(root, folder, text + extension) for extension in ("", *extensions)]
-    except NeecoError as error:
-        node.error_from(error)
-        return None
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    node.error(*missing_file(folder, text))
-    return None
+    candidates = [inside(root, folder, text + extension) for extension in ("", *extensions)]
+    if not (existing := [candidate for candidate in candidates if candidate.is_file()]):
+        node.fail(*missing_file(folder, text))
+    return existing[0]
 
 
 def _image(node: Node, folder: Path, parsed: Parsed, extensions: tuple[str, ...]) -> Path | None:
-    """`_file` of a frame's image. Of a source, one that is nowhere is counted, and no error."""
-    before = len(node.report.problems)
-    path = _file(node, folder, parsed.root, extensions)
-    problems = node.report.problems
-    if parsed.as_source and len(problems) > before and problems[-1].remedy == NOWHERE:
+    """`_file` of a frame's image; None, and reported, without one. Of a source, one that is nowhere is counted, and no
+    error."""
+    if node.value is None:
+        node.error("is missing", "name the frame's image")
+        return None
+    path, problems = node.tried(_file, folder, parsed.root, extensions), node.report.problems
+    if path is None and parsed.as_source and problems[-1].remedy == NOWHERE:
         parsed.absent.append(problems.pop())
     return path
-
-
-class _HeaderReport(ProblemReport):
-    """Problems of the camera at the file's top level, each reported once with the number of frames it concerns.
-
-    A number that neither a frame nor the top level gives counts as the top level's.
-    """
-
-    def __init__(self, document: Node, frames: int) -> None:
-        super().__init__()
-        self.document = Node(document.value, document.file, document.field, self)
-        self.report, self.first, self.frames = document.report, len(document.report.problems), frames
-
-    def pass_on(self) -> None:
-        """Pass the problems on, each once, before those of the frames."""
-        merged = []
-        for problem, count in Counter(self.problems).items():
-            concerned = "" if self.frames == 1 else f", for {count} of {self.frames} frames"
-            merged.append(replace(problem, message=problem.message + concerned))
-        self.report.problems[self.first : self.first] = merged

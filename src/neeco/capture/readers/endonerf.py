@@ -60,7 +60,7 @@ def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
     try:
         table = _load(root)
     except NeecoError as error:
-        file.error_from(error)
+        file.error(*str(error).split("; ", 1))
         return parsed
     images = folder_images(root, "images", report)
     if len(images) != len(table):
@@ -96,7 +96,7 @@ def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
         try:
             paths.append(inside(root, root / folder, path.name))
         except NeecoError as error:
-            Node(None, f"{folder}/{path.name}", "", report).error_from(error)
+            Node(None, f"{folder}/{path.name}", "", report).error(*str(error).split("; ", 1))
     return paths
 
 
@@ -123,7 +123,7 @@ def _row(values: np.ndarray, place: Node) -> _Row | None:
     matrix = values[:15].reshape(3, 5)
     with np.errstate(invalid="ignore"):
         pose = LLFF.camera_to_opencv(matrix[:, :4])
-    rigid = replace(place, value=pose.tolist()).rigid()
+    rigid = replace(place, value=pose.tolist()).tried(Node.rigid)
     height, width, focal = (float(value) for value in matrix[:, 4])
     if (fault := size_fault(width, height) or focal_fault(focal, focal, width, height)) is not None:
         message = f"its height, width and focal length are {height:g}, {width:g}, {focal:g}: {fault[0]}"
