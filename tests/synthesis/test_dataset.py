@@ -18,7 +18,7 @@ from neeco.base.files import LOCK, TEMPORARY
 from neeco.capture.writer import state_to_json
 from neeco.labels.settings import LABELS
 from neeco.synthesis.dataset import synthesize
-from neeco.synthesis.generator import Acceptance, SampleGenerator, draw_to_folder
+from neeco.synthesis.generator import Acceptance, SampleGenerator, draw_encoded
 from neeco.synthesis.rendered_views import render, split_views, state_views
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers import WrittenImages
@@ -227,11 +227,11 @@ def test_states_jsonl_draws_the_same_images_again(made, run, tmp_path):
 def test_an_image_depends_on_seed_and_index_only(made, run, tmp_path):
     generator = SampleGenerator.of(run.scene, SETTINGS)
     for index in (4, 1):  # out of order, the others never drawn
-        draw_to_folder(generator, tmp_path, index)
+        draw_encoded(generator, index).write(tmp_path)
         for folder in ("images", "parts", "depth"):
             name = f"{folder}/{index:06d}.png"
             assert (tmp_path / name).read_bytes() == (made / name).read_bytes()
-    draw_to_folder(replace(generator, settings=replace(SETTINGS, seed=4)), tmp_path, 1)
+    draw_encoded(replace(generator, settings=replace(SETTINGS, seed=4)), 1).write(tmp_path)
     assert (tmp_path / "images/000001.png").read_bytes() != (made / "images/000001.png").read_bytes()
 
 

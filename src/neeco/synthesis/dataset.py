@@ -32,12 +32,11 @@ from neeco.synthesis.generator import (
     ENTERS_TISSUE,
     LEAVES_IMAGE,
     UNOBSERVED_TISSUE,
-    GeneratorSpec,
     SampleGenerator,
-    draw_to_folder,
+    draw_encoded,
     format_counts,
 )
-from neeco.synthesis.parallel import draw_in_workers
+from neeco.synthesis.parallel import GeneratorSpec, draw_in_workers
 from neeco.synthesis.samplers import SAMPLING, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
 from neeco.synthesis.writers import Writer, WrittenImages
@@ -138,13 +137,13 @@ def synthesize(
         missing, made = [k for k in range(settings.count) if k not in records], 0
         processes = min(workers, len(missing))
         if missing and (processes > 1 or address()):
-            scene_file, *others = (Path(each.path) / SCENE_FILE for each in runs)
+            scenes = tuple(Path(each.path) / SCENE_FILE for each in runs)
             # workers need not find the tolerance again
             resolved = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
-            spec = GeneratorSpec(scene_file, resolved, str(scene.center.device), tuple(others))
+            spec = GeneratorSpec(scenes, resolved, str(scene.center.device))
             rendered = draw_in_workers(spec, output, missing, processes)
         else:
-            rendered = (draw_to_folder(generator, output, index) for index in missing)
+            rendered = (draw_encoded(generator, index).write(output) for index in missing)
         for record in rendered:
             records[record["index"]] = record
             made += not record.get("skipped")

@@ -19,7 +19,7 @@ from neeco.capture.model import Capture, Instrument, State, share_lamps
 from neeco.capture.points import points_in_view
 from neeco.capture.readers._colmap import find_models, parse_colmap
 from neeco.capture.readers._states import StateLine, read_states
-from neeco.capture.readers._transforms import is_blender, load_document, parse_blender, parse_transforms
+from neeco.capture.readers._transforms import is_blender, load_document, parse_transforms
 from neeco.capture.readers.cameras import parse_lens
 from neeco.capture.readers.endonerf import is_endonerf_folder, parse_endonerf
 from neeco.capture.readers.kinematics import kinematics_of, parse_kinematics, read_dvrk_tool, read_urdf
@@ -165,16 +165,15 @@ def _parse(path: Path, report: ProblemReport, transforms: str, background: float
         return Parsed(path)
     if file.is_file():
         document = load_document(file, path, report)
-        if is_blender(document):
-            return parse_blender({file: document}, path, background, as_source=as_source)
-        return parse_transforms(document, file.parent, path, background, as_source=as_source)
+        blender = is_blender(document)
+        return parse_transforms({file: document}, path, background, blender=blender, as_source=as_source)
     if transforms != "transforms.json":
         report.error(transforms, "", "no such file", "name a transforms file of the capture")
         return Parsed(path)
     splits = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
     if blender_files := [file for file in splits if file.is_file()]:
         documents = {file: load_document(file, path, report) for file in blender_files}
-        return parse_blender(documents, path, background, as_source=as_source)
+        return parse_transforms(documents, path, background, blender=True, as_source=as_source)
     if models := find_models(path):
         return parse_colmap(models, path, report, as_source=as_source)
     if is_endonerf_folder(path):

@@ -38,21 +38,47 @@ def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
     return node if node.tried(Node.members) is not None else node.at({}, "")
 
 
+def is_blender(document: Node) -> bool:
+    """Return True if a transforms file has the field of view for intrinsics and no states, as Blender writes."""
+    value = document.value
+    states = "instruments" in value or any("instruments" in frame for frame in _frame_objects(document))
+    return "camera_angle_x" in value and "fl_x" not in value and not states
+
+
 def parse_transforms(
-    document: Node, folder: Path, root: Path, background: float = 1.0, *, as_source: bool = False
+    files: dict[Path, Node], root: Path, background: float = 1.0, *, blender: bool = False, as_source: bool = False
 ) -> Parsed:
-    """Read the transforms file in `folder` of the capture at `root`, given its content. Relative paths start at the
-    file. as_source: see `Parsed`."""
-    parsed = Parsed(root, as_source=as_source)
-    if document.has("tissues"):
-        document.child("tissues").error("a capture has one tissue", SEPARATE_TISSUES)
-        return parsed
-    _parse_header(document, parsed)
-    _parse_frames(document, folder, parsed, background)
-    parsed = _by_name(parsed)
-    _parse_points(document, folder, parsed)
-    parsed.instruments = all_instruments(parsed.frames, declared_instruments(document))
-    _warn_of_unread_states(document, parsed)
+    """Read the transforms file of the capture at `root`, or Blender's files of one split each, named by the file; all
+    given with their content. Relative paths start at the file. as_source: see `Parsed`.
+
+    Transparent pixels show `background`. Of Blender's without states, and without a point cloud, seeded random points
+    in a cube are used; where no frame at all has a time nothing moves (NeRF's synthetic scenes): every frame then has
+    time 0.
+    """
+    parsed, documents = Parsed(root, as_source=as_source), list(files.values())
+    declared: dict[str, Instrument] = {}
+    for file, document in files.items():
+        if document.has("tissues"):
+            document.child("tissues").error("a capture has one tissue", SEPARATE_TISSUES)
+            return parsed
+        suffix = file.stem.rpartition("_")[2]
+        split = suffix if blender and suffix in ("train", "val", "test") else None
+        _parse_header(document, parsed)
+        _parse_frames(document, file.parent, parsed, background, split, EXTENSIONS if blender else ())
+        if parsed.points is None:
+            _parse_points(document, file.parent, parsed)
+        declared = {item.name: item for item in declared_instruments(document)} | declared
+    parsed.instruments = all_instruments(parsed.frames, tuple(declared.values()))
+    for document in documents:
+        _warn_of_unread_states(document, parsed)
+    if not blender:
+        return _by_name(parsed)
+    if not parsed.instruments and not any("time" in frame for one in documents for frame in _frame_objects(one)):
+        parsed.frames = [replace(frame, state=replace(frame.state, time=0.0)) for frame in parsed.frames]
+        parsed.timed = True
+    if not parsed.instruments and parsed.points is None:
+        parsed.points = random_points(np.zeros(3), BLENDER_HALF_SIZE)
+        parsed.points_place = documents[0].child("ply_file_path")
     return parsed
 
 
@@ -68,44 +94,6 @@ def _by_name(parsed: Parsed) -> Parsed:
         for frame, rank in zip(ordered.frames, sorted(ranks), strict=True)
     ]
     return ordered
-
-
-def is_blender(document: Node) -> bool:
-    """Return True if a transforms file has the field of view for intrinsics and no states, as Blender writes."""
-    value = document.value
-    states = "instruments" in value or any("instruments" in frame for frame in _frame_objects(document))
-    return "camera_angle_x" in value and "fl_x" not in value and not states
-
-
-def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0, *, as_source: bool = False) -> Parsed:
-    """Read the files of a Blender capture, given with their content, one split each, named by the file.
-
-    Transparent pixels show `background`. Without a point cloud, and without states, seeded random ones in a cube are
-    used. Where no frame at all has a time and no state nothing moves (NeRF's synthetic scenes): every frame then has
-    time 0. as_source: see `Parsed`.
-    """
-    parsed = Parsed(root, as_source=as_source)
-    declared: dict[str, Instrument] = {}
-    for file, document in files.items():
-        suffix = file.stem.rpartition("_")[2]
-        split = suffix if suffix in ("train", "val", "test") else None
-        _parse_header(document, parsed)
-        _parse_frames(document, file.parent, parsed, background, split, EXTENSIONS)
-        if parsed.points is None:
-            _parse_points(document, file.parent, parsed)
-        declared = {item.name: item for item in declared_instruments(document)} | declared
-    parsed.instruments = all_instruments(parsed.frames, tuple(declared.values()))
-    for document in files.values():
-        _warn_of_unread_states(document, parsed)
-    if parsed.instruments:
-        return parsed
-    if not any("time" in frame for document in files.values() for frame in _frame_objects(document)):
-        parsed.frames = [replace(frame, state=replace(frame.state, time=0.0)) for frame in parsed.frames]
-        parsed.timed = True
-    if parsed.points is None:
-        parsed.points = random_points(np.zeros(3), BLENDER_HALF_SIZE)
-        parsed.points_place = next(iter(files.values())).child("ply_file_path")
-    return parsed
 
 
 def _frame_objects(document: Node) -> list[dict[str, Any]]:
@@ -128,24 +116,18 @@ def _parse_header(document: Node, parsed: Parsed) -> None:
     """Check what holds for the whole file: schema and units, and read `instrument_frame`, `camera_motion` and
     `lens`."""
     value = document.value
-    schema = value.get("schema", SCHEMA)
-    if schema != SCHEMA:
-        document.child("schema").error(
-            f"is {printable(schema)}, not {SCHEMA!r}", "use a version of neeco that knows it"
-        )
+    if (schema := value.get("schema", SCHEMA)) != SCHEMA:
+        message = f"is {printable(schema)}, not {SCHEMA!r}"
+        document.child("schema").error(message, "use a version of neeco that knows it")
     if value.get("units", "mm") not in _MILLIMETRES:
         message = f"is {printable(value['units'])}; lengths must be mm"
         document.child("units").error(message, "convert all poses and points")
-    registration = value.get("instrument_frame", "world")
-    if registration not in ("world", "unregistered"):
-        document.child("instrument_frame").error(f"is {printable(registration)}", "write 'world' or 'unregistered'")
-    parsed.registered = parsed.registered and registration != "unregistered"
-    motion = value.get("camera_motion", "moving")
-    if motion not in ("moving", "still"):
-        document.child("camera_motion").error(f"is {printable(motion)}", "write 'moving' or 'still'")
-    parsed.still = parsed.still or motion == "still"
-    if document.has("lens"):
-        parsed.lens = document.child("lens").tried(parse_lens)
+    for key, words in (("instrument_frame", ("world", "unregistered")), ("camera_motion", ("moving", "still"))):
+        if (stated := value.get(key, words[0])) not in words:
+            document.child(key).error(f"is {printable(stated)}", f"write {' or '.join(map(repr, words))}")
+    parsed.registered = parsed.registered and value.get("instrument_frame") != "unregistered"
+    parsed.still = parsed.still or value.get("camera_motion") == "still"
+    parsed.lens = document.given("lens", lambda node: node.tried(parse_lens), parsed.lens)
     parsed.says_units = parsed.says_units or value.get("units") is not None or value.get("schema") == SCHEMA
 
 

@@ -31,6 +31,7 @@ UNIT_TOLERANCE = 1e-12  # of the length of a unit vector of float64
 
 def parse_kinematics(node: Node) -> KinematicTree:
     """The tree that a node describes. Raises Fault where that is none."""
+    node.members()
     links, pose_of = node.child("links"), node.given("pose_of", Node.text, None)
     parsed = tuple(map(_parse_link, links.items()))
     with links.blamed():

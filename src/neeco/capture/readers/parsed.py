@@ -130,12 +130,8 @@ def missing_file(folder: Path, text: str) -> Fault:
     message, similar = f"no such file: {printable(text)}", similar_file(folder, text)
     if similar is None:
         return message, NOWHERE
-    if _normal(similar) == _normal(text):
-        form = (
-            "in another Unicode form (macOS decomposes accents)" if similar.lower() != text.lower() else "in other case"
-        )
-        return message, f"{printable(similar)} is there, {form}: correct the path"
-    return message, f"{printable(similar)} is there: correct the path"
+    form = ", in another Unicode form or case" if _normal(similar) == _normal(text) else ""
+    return message, f"{printable(similar)} is there{form}: correct the path"
 
 
 def similar_file(folder: Path, text: str) -> str | None:
