@@ -48,7 +48,6 @@ OPENED = {
     "pycolmap.Database",
     "webbrowser",
     "VideoFile",
-    "_unpacked",
 }  # no files of the user's
 ALLOWED = {
     "neeco.base.files": "holds the helpers",

@@ -126,12 +126,7 @@ def write_labels(path: Path, labels: Tensor) -> None:
     """Write part ids (or a 0/255 mask), uint8 [H, W], as grey PNG, atomically. Raises NeecoError."""
     if labels.dtype != torch.uint8 or labels.ndim != 2:
         raise ValueError(f"labels must be uint8 [H, W], got {labels.dtype} {tuple(labels.shape)}")
-    write_png(path, labels.detach().cpu().numpy())
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write uint8 [H, W, 3] (BGR), or uint8 or uint16 [H, W], as PNG, atomically. Raises NeecoError."""
-    _write(path, encoded_png(pixels))
+    _write(path, encoded_png(labels.detach().cpu().numpy()))
 
 
 def encoded_image(image: Tensor, quality: int | None = None) -> bytes:

@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import parse_yaml, read_text
-from neeco.capture.documents import as_float
+from neeco.base.settings import faults_in
+from neeco.capture.documents import Node, as_float
 from neeco.capture.model import InstrumentState, State
 from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid
@@ -119,29 +120,29 @@ def read_effects(path: Path) -> CameraEffects:
     soft = lines.pop(SOFT_MASKS, "mid")
     if soft not in ("mid", "mean"):
         raise NeecoError(f"{path}: {SOFT_MASKS}: {soft!r} is neither mid nor mean")
-    unknown = sorted(set(map(str, lines)) - set(EFFECTS))
-    if unknown:
+    if unknown := sorted(set(map(str, lines)) - set(EFFECTS)):
         raise NeecoError(f"{path}: {unknown[0]}: no such effect; there are {', '.join([*EFFECTS, SOFT_MASKS])}")
-    return CameraEffects({name: _range(value, EFFECTS[name], f"{path}: {name}") for name, value in lines.items()}, soft)
+    with faults_in(path):
+        return CameraEffects(
+            {name: _range(Node(value, field=name), EFFECTS[name]) for name, value in lines.items()}, soft
+        )
 
 
-def _range(value: Any, effect: Effect, where: str) -> Range:
-    share: Any = 1.0
+def _range(node: Node, effect: Effect) -> Range:
+    value, share = node.value, 1.0
     if isinstance(value, dict):
         if not set(value) <= {"range", "share"} or "range" not in value:
-            raise NeecoError(f"{where}: give a number, [LOW, HIGH], or {{range: [LOW, HIGH], share: S}}")
-        value, share = value["range"], value.get("share", 1.0)
-    ends = value if isinstance(value, list) else [value, value]
-    numbers = [number for number in map(as_float, (*ends, share)) if number is not None]
-    if len(ends) != 2 or len(numbers) != 3:
-        raise NeecoError(f"{where}: {value!r} is no range; give a number or [LOW, HIGH]")
-    low, high, share = numbers
-    if not effect.lowest <= low <= high <= effect.highest:
+            node.fail("give a number, [LOW, HIGH], or {range: [LOW, HIGH], share: S}")
+        value, share = value["range"], node.given("share", Node.number, 1.0)
+    ends = [as_float(end) for end in (value if isinstance(value, list) else [value, value])]
+    if len(ends) != 2 or ends[0] is None or ends[1] is None:
+        node.fail(f"{value!r} is no range; give a number or [LOW, HIGH]")
+    if not effect.lowest <= ends[0] <= ends[1] <= effect.highest:
         limits = f"{effect.lowest:g} to {effect.highest:g} ({effect.meaning})"
-        raise NeecoError(f"{where}: {value} is out of range; give LOW <= HIGH within {limits}")
+        node.fail(f"{value} is out of range; give LOW <= HIGH within {limits}")
     if not 0 <= share <= 1:
-        raise NeecoError(f"{where}: share: {share:g} is not a share of the images; give 0 to 1")
-    return Range(low, high, share)
+        node.fail(f"share: {share:g} is not a share of the images; give 0 to 1")
+    return Range(ends[0], ends[1], share)
 
 
 def srgb_to_linear(image: np.ndarray) -> np.ndarray:

@@ -71,7 +71,8 @@ class GeneratorSpec:
             file = Path(folder.name) / name
             file.parent.mkdir(exist_ok=True)
             file.write_bytes(content)
-        generator = replace(self, files={})._moved(lambda _, path: Path(folder.name) / path).open()
+        spec = replace(self, files={})._moved(lambda _, path: Path(folder.name) / path)
+        generator = spec.open()
         weakref.finalize(generator, folder.cleanup)  # backgrounds are read when they are needed
         return generator
 
