@@ -172,7 +172,12 @@ def apply_effects(image: np.ndarray, depth: np.ndarray, values: Mapping[str, flo
     if not set(values) - {"shutter_s", "smoke_grey"}:
         return image
     height, width = depth.shape
-    light = _smoked(srgb_to_linear(image), depth, values)
+    light = srgb_to_linear(image)
+    if (density := values.get("smoke", 0.0)) > 0:  # homogeneous (Beer-Lambert): it attenuates light, and has its own
+        far = np.where(depth > 0, depth, depth.max(initial=SMOKE_MM))
+        transmission = ((1 - density) ** (far / SMOKE_MM)).astype(np.float32)[..., None]
+        smoke = srgb_to_linear(np.full(3, values.get("smoke_grey", SETTINGS.smoke_grey)))
+        light = light * transmission + smoke * (1 - transmission)
     if values.get("lens_blur_px", 0) > 0:
         light = cv2.GaussianBlur(light, (0, 0), values["lens_blur_px"])
     if values.get("vignette", 0) > 0:
@@ -181,8 +186,18 @@ def apply_effects(image: np.ndarray, depth: np.ndarray, values: Mapping[str, flo
         light = light * image_circle(height, width, values["field_of_view"])[..., None]
     gains = [values.get("red_gain", 1.0), 1.0, values.get("blue_gain", 1.0)]
     light = light * np.float32(2 ** values.get("exposure_stops", 0.0) * np.array(gains))
-    stored = linear_to_srgb(_noisy(light, values, rng)) ** np.float32(values.get("gamma", 1.0))
-    return _jpeg_compressed(stored, values["jpeg_quality"]) if "jpeg_quality" in values else stored
+    shot, read = values.get("shot_noise", 0.0), values.get("read_noise", 0.0)
+    if shot or read:  # both normally distributed (Poisson-Gaussian noise of many photons)
+        deviation = np.sqrt(shot**2 * np.clip(light, 0, 1) + read**2)
+        light = light + (deviation * rng.standard_normal(light.shape)).astype(np.float32)
+    stored = linear_to_srgb(light) ** np.float32(values.get("gamma", 1.0))
+    if "jpeg_quality" not in values:
+        return stored
+    pixels = np.round(stored[..., ::-1] * 255).astype(np.uint8)
+    code = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, round(values["jpeg_quality"])])[1]
+    decoded = cv2.imdecode(code, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return decoded[..., ::-1].astype(np.float32) / 255
 
 
 def image_circle(height: int, width: int, radius: float) -> np.ndarray:
@@ -195,34 +210,6 @@ def _distance_from_centre(height: int, width: int) -> np.ndarray:
     """[H, W] distance from the image's centre, 1 in the corners."""
     y, x = np.mgrid[0:height, 0:width].astype(np.float32) + np.float32(0.5)
     return np.hypot(x - width / 2, y - height / 2) / (np.hypot(height, width) / 2)
-
-
-def _smoked(light: np.ndarray, depth: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
-    """Homogeneous smoke (Beer-Lambert): light from far away is attenuated and replaced by the smoke's own."""
-    density = values.get("smoke", 0.0)
-    if density <= 0:
-        return light
-    far = np.where(depth > 0, depth, depth.max(initial=SMOKE_MM))
-    transmission = ((1 - density) ** (far / SMOKE_MM)).astype(np.float32)[..., None]
-    grey = srgb_to_linear(np.full(3, values.get("smoke_grey", SETTINGS.smoke_grey)))
-    return light * transmission + grey * (1 - transmission)
-
-
-def _noisy(light: np.ndarray, values: Mapping[str, float], rng: Generator) -> np.ndarray:
-    """Shot and read noise, both normally distributed (Poisson-Gaussian noise of many photons)."""
-    shot, read = values.get("shot_noise", 0.0), values.get("read_noise", 0.0)
-    if shot == read == 0:
-        return light
-    deviation = np.sqrt(shot**2 * np.clip(light, 0, 1) + read**2)
-    return light + (deviation * rng.standard_normal(light.shape)).astype(np.float32)
-
-
-def _jpeg_compressed(stored: np.ndarray, quality: float) -> np.ndarray:
-    pixels = np.round(stored[..., ::-1] * 255).astype(np.uint8)
-    _, code = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, round(quality)])
-    decoded = cv2.imdecode(code, cv2.IMREAD_COLOR)
-    assert decoded is not None
-    return decoded[..., ::-1].astype(np.float32) / 255
 
 
 @dataclass(frozen=True)

@@ -242,23 +242,21 @@ class DataSetFolder:
     def _stored(self) -> dict[int, Record]:
         return {k: record for k in range(self.count) if (record := load_record(self.output, k)) is not None}
 
-    def _with_classes(self, record: Record) -> Record:
-        """The record with its labels named by class, and their instruments as `instrument`."""
-        names = ((label, label["name"]) for label in record["labels"])
-        labels = [label | {"name": self.class_names.get(name, name), "instrument": name} for label, name in names]
-        return record | {"labels": labels}
-
     def _write_indexes(self, records: list[Record], complete: bool) -> None:
         """(Re)write everything that is about the whole data set, from the records."""
         output, names, images = self.output, self.labeller.names, with_image(records)
         keypoints = keypoint_names(self.scene)
+
+        def with_class(label: dict[str, Any]) -> dict[str, Any]:
+            return label | {"name": self.class_names.get(label["name"], label["name"]), "instrument": label["name"]}
+
         write_states(output, images)
         # formats of earlier starts, too: their index files would else lack the images made now
         formats = [*self.formats, *(name for name in format_names() if name not in self.formats)]
         formats = [name for name in formats if name in self.formats or (output / name).is_dir()]
         written = WrittenImages(
             root=output,
-            records=[self._with_classes(record) for record in images],
+            records=[record | {"labels": [*map(with_class, record["labels"])]} for record in images],
             part_names=tuple(dict.fromkeys((self.class_names.get(owner, owner), part) for owner, part in names)),
             keypoint_names=keypoints,
             bones=self.scene.skeleton(),

@@ -76,12 +76,20 @@ class Mixture:
         if any(not scene.recorded.states for scene in (tissue, *instrument_scenes)):
             raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
         gains = tuple(_gain(tissue, scene) for scene in instrument_scenes)
+        depths = []
+        for recorded, scene in ((scene.recorded, scene) for scene in instrument_scenes):
+            pairs = zip(recorded.states, recorded.cameras, strict=True)
+            depths.append(min(float(_working_end(scene, state, camera)[2]) for state, camera in pairs))
         mixture = cls(
             scene=merged_scene(tissue, instrument_scenes, gains),
             tissue=tissue,
             instrument_scenes=tuple(instrument_scenes),
             gains=gains,
-            min_depth={item.name: _min_depth(scene) for scene in instrument_scenes for item in scene.instruments},
+            min_depth={
+                item.name: depth
+                for scene, depth in zip(instrument_scenes, depths, strict=True)
+                for item in scene.instruments
+            },
             tissue_alone=tissue_gaussians(tissue),
             own_tissue_alone=tuple(tissue_gaussians(scene) for scene in instrument_scenes),
         )
@@ -169,13 +177,6 @@ def _working_end(scene: GaussianScene, state: State, camera: Camera) -> np.ndarr
     return camera_from_world[:3, :3] @ np.mean(ends, axis=0) + camera_from_world[:3, 3]
 
 
-def _min_depth(scene: GaussianScene) -> float:
-    """Depth mm of the working ends in the recorded frame where they were nearest to the lens."""
-    recorded = scene.recorded
-    pairs = zip(recorded.states, recorded.cameras, strict=True)
-    return min((float(_working_end(scene, state, camera)[2]) for state, camera in pairs), default=0.0)
-
-
 @torch.no_grad()
 def tissue_gaussians(scene: GaussianScene) -> Gaussians:
     """The scene's tissue alone, which stands still; for its depth, so without its light."""
@@ -210,7 +211,10 @@ def merged_scene(
     deformation = combined([scene.deformation for scene in instrument_scenes])
     bodies = [_body(tissue, 0, deformation)]
     for scene, gain in zip(instrument_scenes, gains or [(1.0, 1.0, 1.0)] * len(instrument_scenes), strict=True):
-        bodies += [_brightened(_body(scene, k + 1, deformation), gain) for k in range(len(scene.instruments))]
+        for body in (_body(scene, k + 1, deformation) for k in range(len(scene.instruments))):
+            factor = body.sh_dc.new_tensor(gain)
+            changed = {"sh_dc": brightened(body.sh_dc, factor), "sh_rest": body.sh_rest * factor}
+            bodies.append(dataclasses.replace(body, **changed))
     mixed = GaussianScene(
         method, join_bodies(bodies), deformation, instruments, tissue.recorded, tissue.center.detach().clone()
     ).to(tissue.center.device)
@@ -232,12 +236,6 @@ def _body(scene: GaussianScene, index: int, deformation: Deformation) -> Canonic
     stored = {name: tensor[rows] for name, tensor in canonical.extras.items()}
     extras = deformation.fit_extras(deformation.initial_extras(alone) | stored)
     return alone.with_extras(**extras, **{VISIBILITY: seen})
-
-
-def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> CanonicalGaussians:
-    """The same Gaussians, their colours multiplied."""
-    factor = body.sh_dc.new_tensor(gain)
-    return dataclasses.replace(body, sh_dc=brightened(body.sh_dc, factor), sh_rest=body.sh_rest * factor)
 
 
 def _gain(tissue: GaussianScene, instruments: GaussianScene) -> tuple[float, float, float]:
