@@ -176,7 +176,15 @@ class Sampler:
 def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views, count: int) -> Sampler:
     """The sampler named by `states` (interpolate, extrapolate, grid, path:FILE or FILE) and `views`. Raises
     NeecoError."""
-    view_sampler = _view_sampler(scene, views)
+    recorded = RecordedViews(scene.recorded.cameras, scene.recorded.states)
+    view_sampler: ViewSampler = recorded
+    still = scene.recorded.still
+    if views == "perturbed":
+        view_sampler = PerturbedViews(recorded, *((SAMPLING.still_degrees, SAMPLING.still_mm) if still else ()))
+    if views == "orbit":
+        if still:
+            raise NeecoError("--views orbit: the scope stood still, which shows no side; use recorded or perturbed")
+        view_sampler = OrbitViews(recorded, surface_centre(scene))
     if states == "interpolate":
         return Sampler(scene, InterpolatedStates(scene.recorded.states), view_sampler)
     if states == "extrapolate":
@@ -190,16 +198,6 @@ def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views,
     poses = [line.world_from_camera for line in lines]
     cameras = tuple(None if pose is None else moved_camera(intrinsics, pose) for pose in poses)
     return Sampler(scene, ListedStates([line.state for line in lines]), view_sampler, cameras)
-
-
-def _view_sampler(scene: GaussianScene, views: Views) -> ViewSampler:
-    recorded = RecordedViews(scene.recorded.cameras, scene.recorded.states)
-    still = scene.recorded.still
-    if views == "perturbed":
-        return PerturbedViews(recorded, *((SAMPLING.still_degrees, SAMPLING.still_mm) if still else ()))
-    if views == "orbit" and still:
-        raise NeecoError("--views orbit: the scope stood still, which shows no side; use recorded or perturbed")
-    return OrbitViews(recorded, surface_centre(scene)) if views == "orbit" else recorded
 
 
 def states_file(states: str) -> Path:

@@ -9,10 +9,9 @@ import math
 import os
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import dropwhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -53,16 +52,14 @@ _COEFFICIENTS = {  # in a model's parameters, behind the focal lengths and the p
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Intrinsics:
+class _Intrinsics(NamedTuple):
     model: str
     width: int
     height: int
     params: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class _Image:
+class _Image(NamedTuple):
     name: str
     camera_id: int
     quaternion: tuple[float, ...]  # wxyz, camera_from_world
@@ -107,7 +104,16 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
     except NeecoError as error:
         report.error(relative_name(model, root), "", str(error).removeprefix(f"{model}/"))
         return parsed
-    _parse_points(model / f"points3D{suffix}", parse_points, parsed, report)
+    path = model / f"points3D{suffix}"
+    parsed.points_place = Node(None, relative_name(path, root), "", report)
+    try:
+        rows = np.array(_parse(path, parse_points), dtype=np.float64).reshape(-1, 6)
+        positions = rows[:, :3].astype(np.float32)
+        if not np.isfinite(positions).all():
+            raise NeecoError("holds points that are NaN or infinite; remove them")
+        parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
+    except NeecoError as error:
+        parsed.points_place.error(*str(error).removeprefix(f"{path}: ").split("; ", 1))
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
@@ -149,22 +155,6 @@ def _note_left_out(model: Path, others: Sequence[Path], images: Sequence[_Image]
         place.warning(message, "they are left out")
 
 
-def _parse_points(
-    path: Path, parse: Callable[[bytes], list[tuple[float, ...]]], parsed: Parsed, report: ProblemReport
-) -> None:
-    parsed.points_place = Node(None, relative_name(path, parsed.root), "", report)
-    try:
-        rows = np.array(_parse(path, parse), dtype=np.float64).reshape(-1, 6)
-    except NeecoError as error:
-        parsed.points_place.error(str(error).removeprefix(f"{path}: "))
-        return
-    positions = rows[:, :3].astype(np.float32)
-    if not np.isfinite(positions).all():
-        parsed.points_place.error("holds points that are NaN or infinite", "remove them")
-        return
-    parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
-
-
 def _camera(image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> Camera:
     """Raises NeecoError, which does not name the image, for distorted images read in place, too."""
     if image.camera_id not in cameras:
@@ -188,18 +178,14 @@ def _camera(image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> C
             f"its camera model is {camera.model}: the images are distorted; undistort them: neeco ingest {parsed.root} "
             "--output CAPTURE (or `colmap image_undistorter`)"
         )
-    pose = torch.from_numpy(_world_from_camera(image)).float()
-    return Camera(pose, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
-
-
-def _world_from_camera(image: _Image) -> np.ndarray:
-    """[4, 4] from COLMAP's camera_from_world. Raises NeecoError when it is no rigid transform."""
     quaternion, translation = np.array(image.quaternion), np.array(image.translation)
     norm = np.linalg.norm(quaternion)
     if not (0.99 < norm < 1.01 and np.abs(translation).max() < 1e9):  # nor when NaN
         raise NeecoError("its pose is not a finite unit quaternion and translation; drop it")
     rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
-    return COLMAP.camera_to_opencv(rigid(rotation.T, -rotation.T @ translation))
+    world_from_camera = COLMAP.camera_to_opencv(rigid(rotation.T, -rotation.T @ translation))
+    pose = torch.from_numpy(world_from_camera).float()
+    return Camera(pose, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
 
 
 def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:

@@ -101,8 +101,13 @@ def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) 
     readings.
     """
     path = Path(path)
+    text = _STRING_OR_COMMENT.sub(lambda match: match[1] or " ", read_text(path, DVRK_TOOL))
+    try:
+        document = json.loads(text, object_pairs_hook=distinct_keys)
+    except (ValueError, RecursionError) as error:
+        raise NeecoError(f"{path}: not readable as {DVRK_TOOL} ({error}); correct it") from None
     with faults_in(path):
-        return _dvrk_tool(Node(_json_with_comments(path), str(path)), dict(readings or {}))
+        return _dvrk_tool(Node(document, str(path)), dict(readings or {}))
 
 
 def _dvrk_tool(document: Node, names: Mapping[str, str]) -> KinematicTree:
@@ -132,16 +137,11 @@ def _dvrk_tool(document: Node, names: Mapping[str, str]) -> KinematicTree:
             links.append(Link(f"jaw_{side}", "wrist", REVOLUTE, pivot, yaw_axis, {yaw: 1.0, jaw: share}))
     else:
         links.append(Link("end_effector", "wrist", REVOLUTE, pivot, yaw_axis, {yaw: 1.0}))
-    tip = pivot @ _tool_tip(document)
+    key = "tooltip_offset" if document.has("tooltip_offset") else "tooltip-offset"
+    yaw_from_tip = document.given(key, Node.rigid, np.eye(4))
+    yaw_from_tip[:3, 3] *= MM
+    tip = pivot @ yaw_from_tip
     return KinematicTree((*links, Link("tip", "wrist", REVOLUTE, tip, yaw_axis, {yaw: 1.0}, body=False)), "tip")
-
-
-def _json_with_comments(path: Path) -> object:
-    text = _STRING_OR_COMMENT.sub(lambda match: match[1] or " ", read_text(path, DVRK_TOOL))
-    try:
-        return json.loads(text, object_pairs_hook=distinct_keys)
-    except (ValueError, RecursionError) as error:
-        raise NeecoError(f"{path}: not readable as {DVRK_TOOL} ({error}); correct it") from None
 
 
 def _frame(joint: Node) -> tuple[Array, Array]:
@@ -155,16 +155,6 @@ def _frame(joint: Node) -> tuple[Array, Array]:
     c, s = math.cos(theta + offset), math.sin(theta + offset)
     turned = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, MM * depth], [0, 0, 0, 1]], np.float64)
     return before @ turned, before[:3, 2].copy()
-
-
-def _tool_tip(document: Node) -> Array:
-    """yaw_from_tip [4, 4] mm."""
-    key = "tooltip_offset" if document.has("tooltip_offset") else "tooltip-offset"
-    if not document.has(key):
-        return np.eye(4)
-    tip = document.child(key).rigid()
-    tip[:3, 3] *= MM
-    return tip
 
 
 TYPES = {"fixed": FIXED, "revolute": REVOLUTE, "continuous": REVOLUTE, "prismatic": PRISMATIC}
