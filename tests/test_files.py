@@ -263,12 +263,6 @@ def test_json_without_measure_is_refused(text: str, tmp_path: Path) -> None:
         read_json(tmp_path / "a.json")
 
 
-def test_a_pipe_is_no_json(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "a.json")
-    with pytest.raises(NeecoError, match=r"a.json: is not a file; expected JSON"):
-        read_json(tmp_path / "a.json")
-
-
 LIKE = {"name": str, "splits": {str: {"psnr": (float, None)}}, "rows": [int]}
 GOOD = {"name": "x", "splits": {"test": {"psnr": None}, "seen": {"psnr": 3}}, "rows": [1], "more": []}
 

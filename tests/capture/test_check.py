@@ -308,7 +308,9 @@ def test_a_file_that_is_no_capture_is_one_error(folder, text):
 
 
 def test_no_folder_and_empty_folder_are_errors(tmp_path):
-    assert "no such folder" in check_capture(tmp_path / "none")[0].message
+    assert (
+        str(check_capture(tmp_path / "none")[0]) == f"{tmp_path / 'none'}: no such folder; give the folder of a capture"
+    )
     assert str(check_capture(tmp_path)[0]).startswith(f"{tmp_path}: is not the folder of a capture; one holds")
 
 

@@ -267,23 +267,6 @@ def test_a_data_set_killed_before_its_first_whole_file_begins_again(made, run, t
     assert contents(tmp_path / "set") == contents(made)
 
 
-def test_a_data_set_from_before_soft_and_ignore_gets_them_for_every_image(made, run, tmp_path):
-    output = tmp_path / "dataset"
-    shutil.copytree(made, output)
-    info = json.loads((output / "dataset.json").read_text())
-    for folder in ("soft", "ignore"):
-        shutil.rmtree(output / folder)
-        del info[folder]
-    (output / "dataset.json").write_text(json.dumps(info))
-    for path in (output / ".records").iterdir():
-        record = json.loads(path.read_text())
-        for folder in ("soft", "ignore"):
-            del record["files"][f"{folder}/{path.stem}.png"]
-        path.write_text(json.dumps(record))
-    assert synthesize(run, output, SETTINGS, resume=True).made_now == COUNT
-    assert contents(output) == contents(made)
-
-
 def test_a_data_set_can_grow(made, run, tmp_path):
     output = tmp_path / "dataset"
     synthesize(run, output, replace(SETTINGS, count=2))

@@ -190,9 +190,8 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
     if not isinstance(begun.get("settings"), dict):
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
     settings = begun["settings"]
-    compared = [(key, begun.get(key), description[key]) for key in ("schema", "version", "scene_sha256")]
-    # a version that wrote neither of these folders named neither: all its images are rendered anew
-    compared += [(key, begun[key], description[key]) for key in ("soft", "ignore") if begun.get(key) is not None]
+    keys = ("schema", "version", "scene_sha256", "soft", "ignore")
+    compared = [(key, begun.get(key), description[key]) for key in keys]
     compared += [(f"settings.{key}", settings.get(key), value) for key, value in description["settings"].items()]
     require_same(str(output / INFO), compared)
     return True
