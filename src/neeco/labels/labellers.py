@@ -39,11 +39,6 @@ def instruments_of(names: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(instrument for instrument, _ in names))
 
 
-def composited_parts(rendering: Rendering, threshold: float) -> Tensor:
-    """Return the part ids of `composited_labels`."""
-    return composited_labels(rendering, threshold)[0]
-
-
 def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, Tensor]:
     """Return part ids (uint8 [H, W]) and share of instrument ([H, W]) of an image rendered with label channels.
 
