@@ -13,7 +13,7 @@ from PIL import Image, ImageFile
 from neeco.base.errors import NeecoError
 from neeco.capture.images import has_alpha, image_size, open_image, read_mask
 from neeco.ingest.readers.video import open_images
-from neeco.synthesis.card import draw_tile
+from neeco.synthesis.card import preview_figure
 
 READERS: list[Callable[[Path], object]] = [
     open_image,
@@ -21,7 +21,7 @@ READERS: list[Callable[[Path], object]] = [
     has_alpha,
     read_image,
     read_mask,
-    lambda path: draw_tile(path.parent, {"image": path.name, "index": 0, "labels": []}),
+    lambda path: preview_figure(path.parent, [{"image": path.name, "width": 4, "height": 4}], []),
 ]
 
 

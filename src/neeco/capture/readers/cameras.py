@@ -56,7 +56,7 @@ def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion:
         model = "OPENCV_FISHEYE"
     wrong = [node for key in NOT_READ if (node := node_of(key)).value]
     for node in wrong + ([named] if model not in MODELS else []):
-        message = f"is {printable(node.value)}; this lens model cannot be undistorted"
+        message = f"is {printable(node.value)}: this lens model cannot be undistorted"
         node.fail(message, "undistort the images first, and write PINHOLE")
     nodes: dict[str, Node] = {}
     for key in LISTS:
