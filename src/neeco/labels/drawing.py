@@ -144,6 +144,7 @@ def surface_depth(rendering: Rendering | Layer) -> np.ndarray:
     return to_numpy(rendering.depth * (rendering.alpha > LABELS.surface_alpha))
 
 
+@torch.no_grad()
 def keypoint_arrays(scene: GaussianScene, state: State) -> dict[str, dict[str, np.ndarray]]:
     """Return the keypoints [3] mm, world frame, by instrument and name."""
     return {

@@ -25,8 +25,8 @@ from neeco.capture.documents import Node, as_float
 from neeco.capture.model import InstrumentState, State
 from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid
-from neeco.labels.annotation import place_in_image, working_ends
-from neeco.labels.drawing import LayeredDrawing, to_numpy
+from neeco.labels.annotation import place_in_image, working_ends_of
+from neeco.labels.drawing import LayeredDrawing, keypoint_arrays, to_numpy
 from neeco.scene import GaussianScene, Recorded
 from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
 
@@ -275,7 +275,7 @@ def subframes(
     places = []  # where working ends and places on the tissue are in the image, at the start and at the end
     for side in (-1, 1):
         state, camera = motion.advanced(drawing.state, drawing.camera, side * shutter_s / 2)
-        points = [point for ends in working_ends(scene, state).values() for point in ends]
+        points = [point for ends in working_ends_of(keypoint_arrays(scene, state)).values() for point in ends]
         points += list(surface_points(drawing.tissue_depth, drawing.camera, SETTINGS.tissue_step_px))
         places.append([place_in_image(point, camera) for point in points])
     moved = [np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in zip(*places, strict=True) if a and b]
