@@ -121,17 +121,6 @@ def test_what_was_added_later_has_its_default(packed: Packed, tmp_path: Path) ->
     assert not scene.base_corrections.any()
 
 
-def test_a_scene_from_before_shadows_casts_none(packed: Packed, tmp_path: Path) -> None:
-    tensors, header = packed
-    for part in ("offsets", "strengths", "width"):
-        del tensors[f"module.shadow_{part}"]
-    header["schema"] = "neeco-scene/1"
-    assert not load_scene(written(packed, tmp_path)).casts_shadow
-    header["schema"] = "neeco-scene/2"
-    with pytest.raises(NeecoError, match="damaged scene"):
-        load_scene(written(packed, tmp_path))
-
-
 def drop(name: str) -> Damage:
     return lambda tensors, header: tensors.pop(name)
 
@@ -154,7 +143,10 @@ NOT_RIGID = "the recorded pose of {} in frame 0 is not a rigid transform"
 @pytest.mark.parametrize(
     ("damage", "told"),
     [
-        *((drop(name), "damaged scene") for name in ("canonical.means", "module.falloff", "recorded.poses")),
+        *(
+            (drop(name), "damaged scene")
+            for name in ("canonical.means", "module.falloff", "module.shadow_width", "recorded.poses")
+        ),
         (change("canonical.quats", lambda tensor: tensor[:-1]), r"quats has shape \[\d+, 4\], not \[\d+, 4\]"),
         (change("canonical.sh_dc", lambda tensor: tensor[..., :2]), "sh_dc has shape"),
         (change("canonical.extras.part_logits", lambda tensor: tensor[:-1]), "extras.part_logits has shape"),
@@ -167,7 +159,7 @@ NOT_RIGID = "the recorded pose of {} in frame 0 is not a rigid transform"
         (change("recorded.cameras", filled(0.0)), NOT_RIGID.format("camera")),
         (change("recorded.cameras", filled(torch.nan)), NOT_RIGID.format("camera")),
         (change("recorded.poses", filled(7.0)), NOT_RIGID.format("grasper")),
-        (head(schema="neeco-scene/9"), "schema 'neeco-scene/9', this version reads 'neeco-scene/2'"),
+        (head(schema="neeco-scene/1"), "schema 'neeco-scene/1', this version reads 'neeco-scene/2'"),
         (head(tissues=["bowel", "stomach"]), "tissues: a scene has one tissue, and this 2; make one"),
         *((head(background=grey), "its background is .*, not a grey") for grey in (1e300, -0.5, math.nan)),
         *((head(**wrong), "header: .*; it is damaged") for wrong in ({"recorded": 3}, {"instruments": [{"name": 1}]})),
