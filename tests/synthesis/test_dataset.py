@@ -313,15 +313,6 @@ def test_threshold_labels_make_a_data_set_of_one_part(run, tmp_path):
     assert info["delta_thresholds"]["means"] > 0
 
 
-@pytest.mark.parametrize(
-    ("wrong", "option"), [({"count": 0}, "--count"), ({"seed": -1}, "--seed"), ({"max_attempts": 0}, "--max-attempts")]
-)
-def test_senseless_numbers_are_refused(run, tmp_path, wrong, option):
-    with pytest.raises(NeecoError, match=option):
-        synthesize(run, tmp_path / "dataset", replace(SETTINGS, **wrong))
-    assert not (tmp_path / "dataset").exists()
-
-
 def test_render_writes_image_part_ids_and_mask_for_every_view(run, tmp_path, state):
     given = states_file(tmp_path / "states.jsonl", [state(), state(x=200.0)])
     render(run.scene, state_views(run.scene, given), tmp_path / "out")

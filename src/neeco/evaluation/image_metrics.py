@@ -258,7 +258,7 @@ def outline(mask: np.ndarray) -> np.ndarray:
 
 def _colored(fraction: np.ndarray) -> Pixels:
     """Return the colours of values [H, W], which are clipped to [0, 1]: dark is right, bright is wrong."""
-    return cv2.cvtColor(cv2.applyColorMap(to_uint8(fraction * 255), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    return np.ascontiguousarray(cv2.applyColorMap(to_uint8(fraction * 255), cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8)
 
 
 def _legend(width: int, full_scale: float) -> Pixels:
