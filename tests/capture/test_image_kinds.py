@@ -15,13 +15,14 @@ from neeco.capture.images import has_alpha, image_size, open_image, read_mask
 from neeco.ingest.readers.video import open_images
 from neeco.synthesis.card import preview_figure
 
+PREVIEWED = {"index": 0, "split": "train", "width": 4, "height": 4, "labels": [], "instruments": []}
 READERS: list[Callable[[Path], object]] = [
     open_image,
     image_size,
     has_alpha,
     read_image,
     read_mask,
-    lambda path: preview_figure(path.parent, [{"image": path.name, "width": 4, "height": 4}], []),
+    lambda path: preview_figure(path.parent, [PREVIEWED | {"image": path.name}], []),
 ]
 
 

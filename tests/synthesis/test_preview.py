@@ -3,7 +3,7 @@
 import numpy as np
 from PIL import Image
 
-from neeco.synthesis.card import preview_figure
+from neeco.synthesis.card import PREVIEW, preview_figure
 
 
 def test_a_preview_has_every_plain_image_beside_the_one_with_labels_and_names_what_they_show(tmp_path):
@@ -19,10 +19,12 @@ def test_a_preview_has_every_plain_image_beside_the_one_with_labels_and_names_wh
         "instruments": [{"joints": {"jaw_angle": np.pi / 6, "depth_mm": 2.5}}],
     }  # fmt: skip
     figure = preview_figure(tmp_path, [record], [("arm", "shaft")])
-    plain, labelled = figure.axes
-    assert np.array_equal(plain.images[0].get_array(), pixels)
-    assert np.array_equal((labelled.images[0].get_array() != 90).any(-1), parts == 1)
-    assert plain.get_title(loc="left") == "000000 · train · jaw_angle 30° · depth 2.5 mm"
-    assert labelled.get_title(loc="left") == "arm 50% seen"
-    assert [text.get_text() for text in labelled.texts] == ["arm"]
-    assert "arm shaft" in [text.get_text() for text in figure.legends[0].get_texts()]
+    (axes,) = figure.axes
+    width = PREVIEW.width
+    sheet = axes.images[0].get_array()[-width // 3 :]  # without legend and captions
+    assert (sheet[:, :width] == 90).all()
+    labelled = (sheet[:, width + PREVIEW.gap : -PREVIEW.gap] != 90).any(-1)
+    assert np.array_equal(labelled, parts.repeat(width // 90, 0).repeat(width // 90, 1) == 1)
+    texts = [text.get_text() for text in axes.texts]
+    assert texts == ["000000 · train · jaw_angle 30° · depth 2.5 mm", "arm 50% seen", "arm"]
+    assert "arm shaft" in [text.get_text() for text in axes.get_legend().get_texts()]

@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import math
 import shlex
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import cv2
 import matplotlib
 import numpy as np
 import yaml
@@ -160,12 +162,15 @@ def _command(info: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class PreviewSettings:
-    """Layout of preview.png, and colours of labels over its images."""
+    """Layout of preview.png, px, and colours of labels over its images."""
 
     images: int = 8
     columns: int = 2
-    inches: float = 3.6  # width of an image
-    caption_inches: float = 0.5  # height
+    width: int = 360  # of an image
+    gap: int = 6
+    line: int = 13  # height of a caption's line
+    characters: int = 60  # of a line
+    legend: int = 64  # height
     dpi: int = 100
     font: int = 7  # points
     box: str = "white"
@@ -184,50 +189,57 @@ def write_preview(root: Path, records: Sequence[Record], names: Pairs, bones: Pa
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         figure = preview_figure(root, chosen, names, bones)
-        write_atomically(root / "preview.png", lambda temporary: figure.savefig(temporary, metadata={"Software": None}))
+        how: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 1}}
+        write_atomically(root / "preview.png", lambda temporary: figure.savefig(temporary, **how))
 
 
 def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: Pairs = ()) -> Figure:
     """Draw images, each plain and with parts, boxes and keypoints, which `bones` join."""
-    columns = min(PREVIEW.columns, len(records))
-    rows, shape = -(-len(records) // columns), records[0]["height"] / records[0]["width"]
-    size = 2 * columns * PREVIEW.inches, rows * (PREVIEW.inches * shape + PREVIEW.caption_inches) + 1
-    figure = Figure(size, dpi=PREVIEW.dpi, layout="constrained")
-    panels = figure.subplots(rows, 2 * columns, squeeze=False).reshape(-1, 2)
-    for axes in panels.flat:
-        axes.axis("off")
-    for record, (plain, labelled) in zip(records, panels, strict=False):
+    captions = [[textwrap.wrap(text, PREVIEW.characters) for text in _captions(record)] for record in records]
+    columns, wide = min(PREVIEW.columns, len(records)), PREVIEW.width
+    high = round(wide * records[0]["height"] / records[0]["width"])
+    above = PREVIEW.line * max(len(lines) for pair in captions for lines in pair) + PREVIEW.gap
+    rows = -(-len(records) // columns)
+    sheet = np.full((PREVIEW.legend + rows * (above + high), 2 * columns * (wide + PREVIEW.gap), 3), 255, np.uint8)
+    figure = Figure((sheet.shape[1] / PREVIEW.dpi, sheet.shape[0] / PREVIEW.dpi), dpi=PREVIEW.dpi)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.axis("off")
+    for k, record in enumerate(records):
+        row, column = divmod(k, columns)
         pixels = np.asarray(open_image(root / record["image"]).convert("RGB"))
         parts = np.asarray(open_image(root / "parts" / f"{stem(record['index'])}.png"))
-        plain.imshow(pixels)
-        labelled.imshow(overlay_parts(pixels / 255, parts))
+        y = PREVIEW.legend + row * (above + high) + above
+        for side, image in enumerate((pixels, overlay_parts(pixels / 255, parts))):
+            x = (2 * column + side) * (wide + PREVIEW.gap)
+            sheet[y : y + high, x : x + wide] = cv2.resize(image, (wide, high), interpolation=cv2.INTER_AREA)
+            axes.text(x, y - 4, "\n".join(captions[k][side]), fontsize=PREVIEW.font)
         for label in record["labels"]:
-            _draw_label(labelled, label, bones)
-        for axes, caption in zip((plain, labelled), _captions(record), strict=True):
-            axes.set_title(" \N{MIDDLE DOT} ".join(caption), fontsize=PREVIEW.font, loc="left", wrap=True)
+            _draw_label(axes, label, bones, np.array([x, y]), wide / record["width"])
+    axes.imshow(sheet)
     keys = [Patch(color=part_color(number), label=" ".join(name)) for number, name in enumerate(names, 1)]
     keys += [Patch(fill=False, color=PREVIEW.rectangle, label="minimum-area box")]
     keys += [Patch(color=PREVIEW.hidden, label="keypoint occluded")]
-    figure.legend(handles=keys, loc="outside upper left", ncols=4, fontsize=PREVIEW.font)
+    axes.legend(handles=keys, loc="upper left", ncols=4, fontsize=PREVIEW.font)
     return figure
 
 
-def _draw_label(axes: Axes, label: dict[str, Any], bones: Pairs) -> None:
-    edge = 0.5  # from pixel edges to matplotlib's pixel centres
+def _draw_label(axes: Axes, label: dict[str, Any], bones: Pairs, corner: np.ndarray, scale: float) -> None:
+    """Draw a label over its image, whose upper left corner [2] px is there, `scale` times its size."""
     if label["area"] > 0:
-        x, y, width, height = label["box"]
-        axes.add_patch(Rectangle((x - edge, y - edge), width, height, fill=False, color=PREVIEW.box))
-        axes.add_patch(Polygon(np.array(label["rectangle"]) - edge, fill=False, color=PREVIEW.rectangle))
-        axes.text(x - edge, y - edge, label["name"], fontsize=PREVIEW.font, backgroundcolor=PREVIEW.box)
-    points = {name: (x - edge, y - edge, v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
-    for ends in ((points[a], points[b]) for a, b in bones if {a, b} <= points.keys()):
-        axes.plot([end[0] for end in ends], [end[1] for end in ends], color=PREVIEW.bone, scalex=False, scaley=False)
-    for x, y, visibility in points.values():
+        x, y, width, height = (value * scale for value in label["box"])
+        x, y = x + corner[0], y + corner[1]
+        axes.add_patch(Rectangle((x, y), width, height, fill=False, color=PREVIEW.box))
+        axes.add_patch(Polygon(corner + scale * np.array(label["rectangle"]), fill=False, color=PREVIEW.rectangle))
+        axes.text(x, y, label["name"], fontsize=PREVIEW.font, backgroundcolor=PREVIEW.box)
+    points = {name: (corner + scale * np.array([x, y]), v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
+    for a, b in (bone for bone in bones if {*bone} <= points.keys()):
+        axes.plot(*np.stack([points[a][0], points[b][0]], 1), color=PREVIEW.bone)
+    for (x, y), visibility in points.values():
         color = PREVIEW.hidden if visibility == OCCLUDED else PREVIEW.box
-        axes.plot(x, y, "o", color=color, markeredgecolor=PREVIEW.bone, scalex=False, scaley=False)
+        axes.plot(x, y, "o", color=color, markeredgecolor=PREVIEW.bone)
 
 
-def _captions(record: Record) -> tuple[list[str], list[str]]:
+def _captions(record: Record) -> tuple[str, str]:
     """Return those of the plain image, its joint values, and of the labelled one, the instruments' visible shares."""
     joints = [
         f"{joint.removesuffix('_mm')} {value:.1f} mm"
@@ -237,4 +249,4 @@ def _captions(record: Record) -> tuple[list[str], list[str]]:
         for joint, value in instrument["joints"].items()
     ]
     seen = [f"{label['name']} {label['visibility']:.0%} seen" for label in record["labels"]]
-    return [f"{record['index']:06d}", record["split"], *joints], seen
+    return " · ".join([f"{record['index']:06d}", record["split"], *joints]), " · ".join(seen)
