@@ -38,9 +38,9 @@ def test_a_good_capture_has_no_errors(folder):
 
 
 def test_the_sample_capture_is_clean_and_quickly_checked():
-    start = time.perf_counter()
+    start = time.process_time()  # of all threads
     assert check_capture(SAMPLE) == []
-    assert time.perf_counter() - start < 20
+    assert time.process_time() - start < 20
 
 
 def _frame(index, key, value):

@@ -76,12 +76,7 @@ def byte_pixels(pixels: np.ndarray) -> np.ndarray:
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     """A loss mask as bool [H, W]: False where the stored image is black (darker than half). Raises NeecoError."""
-    return torch.from_numpy(read_mask_pixels(path, size))
-
-
-def read_mask_pixels(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """`read_mask` as an array."""
-    return np.asarray(_to_rgb(open_image(path, size), background=0.0).mean(axis=2) >= 0.5)
+    return torch.from_numpy(_to_rgb(open_image(path, size), background=0.0).mean(axis=2) >= 0.5)
 
 
 def read_labels(path: Path, size: tuple[int, int] | None = None) -> Tensor:
