@@ -19,19 +19,11 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes
 from neeco.base.plausible import center_fault, focal_fault, size_fault
-from neeco.capture.documents import Node, Problem, ProblemReport, printable
+from neeco.capture.documents import Node, ProblemReport, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
 from neeco.capture.readers.cameras import opencv_distortion
-from neeco.capture.readers.parsed import (
-    NOWHERE,
-    Parsed,
-    inside,
-    instants,
-    missing_file,
-    natural_order,
-    relative_name,
-)
+from neeco.capture.readers.parsed import Parsed, instants, named_image, natural_order, relative_name
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import COLMAP
 from neeco.geometry.rotations import quat_to_matrix, rigid
@@ -122,17 +114,9 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
     orders = instants([image.name for image in images], [image.camera_id for image in images])
     orders = orders or list(range(len(images)))
     for order, image in sorted(zip(orders, images, strict=True), key=lambda item: item[0]):
-        place = Node(None, file, printable(image.name), report)
-        try:
-            path = inside(root, root / "images", image.name)
-            camera = _camera(image, cameras, parsed)
-        except NeecoError as error:
-            place.error(*str(error).split("; ", 1))
-            continue
-        if not path.is_file():
-            message, remedy = missing_file(root / "images", image.name)
-            fault = Problem("error", file, place.field, f"{message} in images/", remedy)
-            (parsed.absent if as_source and remedy == NOWHERE else report.problems).append(fault)
+        place = Node(image.name, file, printable(image.name), report)
+        path, camera = named_image(place, root / "images", parsed), place.tried(_camera, image, cameras, parsed)
+        if path is None or camera is None:
             continue
         split = "test" if order % TEST_EVERY == 0 else "train"
         parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
@@ -155,7 +139,7 @@ def _note_left_out(model: Path, others: Sequence[Path], images: Sequence[_Image]
         place.warning(message, "they are left out")
 
 
-def _camera(image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> Camera:
+def _camera(place: Node, image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> Camera:
     """Raises NeecoError, which does not name the image, for distorted images read in place, too."""
     if image.camera_id not in cameras:
         raise NeecoError(f"uses camera {image.camera_id}, which the model lacks; export it again")

@@ -19,7 +19,7 @@ from neeco.capture.model import SCHEMA, SEPARATE_TISSUES, TEST_EVERY, Frame, Ins
 from neeco.capture.points import random_points, read_ply
 from neeco.capture.readers._states import all_instruments, declared_instruments, parse_instruments
 from neeco.capture.readers.cameras import CameraFields, parse_lens, placeholder_camera
-from neeco.capture.readers.parsed import NOWHERE, Parsed, inside, instants, missing_file, relative_name
+from neeco.capture.readers.parsed import Parsed, instants, named_file, named_image, relative_name
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
 
@@ -149,10 +149,10 @@ def _parse_frames(
     for index, node in enumerate(nodes):
         if node.tried(Node.members) is None:
             continue
-        image_path = _image(node.child("file_path"), folder, parsed, extensions)
+        image_path = named_image(node.child("file_path"), folder, parsed, extensions)
         name = splits.of(node, index)
         pose = node.child("transform_matrix").tried(Node.rigid)
-        mask_path = node.given("mask_path", lambda mask: mask.tried(_file, folder, parsed.root), None)
+        mask_path = node.given("mask_path", lambda mask: mask.tried(named_file, folder, parsed.root), None)
         time = node.given("time", lambda stated: stated.tried(_time), float(index))
         timed += node.has("time")
         instruments = parse_instruments(node)
@@ -198,7 +198,9 @@ def _time(node: Node) -> float:
 def _parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
     """Read the point cloud that `ply_file_path` names, if it names one."""
     parsed.points_place = document.child("ply_file_path")
-    if (path := document.given("ply_file_path", lambda node: node.tried(_file, folder, parsed.root), None)) is None:
+    if (
+        path := document.given("ply_file_path", lambda node: node.tried(named_file, folder, parsed.root), None)
+    ) is None:
         return
     name = relative_name(path, parsed.root)
     parsed.points_place = Node(None, name, "vertex", document.report)
@@ -241,25 +243,3 @@ class _Splits:
             frame.child("split").error("is missing while other frames have one", "name the frame's split")
             return None
         return "test" if index % TEST_EVERY == 0 else "train"
-
-
-def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path:
-    """The existing file inside the capture that a node names; `extensions` are tried on paths without one. Raises Fault
-    and, for paths that lead out, NeecoError."""
-    text = node.text()
-    candidates = [inside(root, folder, text + extension) for extension in ("", *extensions)]
-    if not (existing := [candidate for candidate in candidates if candidate.is_file()]):
-        node.fail(*missing_file(folder, text))
-    return existing[0]
-
-
-def _image(node: Node, folder: Path, parsed: Parsed, extensions: tuple[str, ...]) -> Path | None:
-    """`_file` of a frame's image; None, and reported, without one. Of a source, one that is nowhere is counted, and no
-    error."""
-    if node.value is None:
-        node.error("is missing", "name the frame's image")
-        return None
-    path, problems = node.tried(_file, folder, parsed.root, extensions), node.report.problems
-    if path is None and parsed.as_source and problems[-1].remedy == NOWHERE:
-        parsed.absent.append(problems.pop())
-    return path
