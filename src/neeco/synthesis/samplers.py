@@ -33,10 +33,8 @@ from neeco.synthesis.states import (
     ExtrapolatedStates,
     GridStates,
     InterpolatedStates,
-    ListedStates,
     PathStates,
     Shaft,
-    StateSampler,
     turn_about,
 )
 
@@ -54,6 +52,7 @@ class SamplerSettings:
 
 SAMPLING = SamplerSettings()
 
+StateSampler = Callable[[int, Generator], State]  # (index, its random numbers) -> state
 # Draws a camera for a state; intrinsics and image size are always those of a recorded camera.
 ViewSampler = Callable[[State, Generator], Camera]
 
@@ -144,11 +143,7 @@ class Sampler:
     states: StateSampler
     views: ViewSampler
     cameras: tuple[Camera | None, ...] = (None,)  # given with the states, in turn; None: the view sampler decides
-
-    @property
-    def prescribed(self) -> bool:
-        """Return whether the state of an index is given rather than random."""
-        return self.states.prescribed
+    prescribed: bool = False  # whether the state of an index is given rather than random
 
     def fixed(self, index: int) -> bool:
         """Return whether both state and camera of image `index` are given: another sample would be the same."""
@@ -190,14 +185,15 @@ def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views,
     if states == "extrapolate":
         return Sampler(scene, ExtrapolatedStates(scene.recorded.states, scene.instruments, margin), view_sampler)
     if states == "grid":
-        return Sampler(scene, GridStates(scene.recorded.states, shafts_of(scene)), view_sampler)
+        return Sampler(scene, GridStates(scene.recorded.states, shafts_of(scene)), view_sampler, prescribed=True)
     lines = read_states(states_file(states), scene.recorded.with_limits(scene.instruments))
     if states.startswith(PATH_PREFIX):
-        return Sampler(scene, PathStates([line.state for line in lines], count), view_sampler)
+        return Sampler(scene, PathStates([line.state for line in lines], count), view_sampler, prescribed=True)
     intrinsics = scene.recorded.cameras[0]
     poses = [line.world_from_camera for line in lines]
     cameras = tuple(None if pose is None else moved_camera(intrinsics, pose) for pose in poses)
-    return Sampler(scene, ListedStates([line.state for line in lines]), view_sampler, cameras)
+    # from the start again when more images than states are requested
+    return Sampler(scene, lambda index, _: lines[index % len(lines)].state, view_sampler, cameras, prescribed=True)
 
 
 def states_file(states: str) -> Path:
