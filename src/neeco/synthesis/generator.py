@@ -26,7 +26,7 @@ from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.labels.settings import LABELS
 from neeco.scene import GaussianScene
-from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, split
+from neeco.synthesis.backgrounds import ALL_AS_RECORDED, Appearance, Appearances, split
 from neeco.synthesis.camera_effects import (
     CameraEffects,
     RecordedMotion,
@@ -243,39 +243,29 @@ class SampleGenerator:
         colors = appearance.colors
         return image if colors is None else torch.from_numpy(colors.given_to(image.numpy()))
 
+    @torch.no_grad()
     def _through_camera(
-        self,
-        drawing: LayeredDrawing,
-        effects: Mapping[str, float],
-        rng: Generator,
-        appearance: Appearance = AS_RECORDED,
+        self, drawing: LayeredDrawing, effects: Mapping[str, float], rng: Generator, appearance: Appearance
     ) -> LayeredDrawing:
         """Apply the camera effects; labels stay those of the middle of the exposure."""
         if not effects:
             return drawing
-        drawing = self._motion_blurred(drawing, appearance, effects.get("shutter_s", 0.0), rng)
+        if self.effects is not None and self.motion is not None and (shutter_s := effects.get("shutter_s", 0.0)) > 0:
+            images, shares = [], []
+            for state, camera in subframes(self.scene, drawing, self.motion(drawing.state, rng), shutter_s):
+                gaussians = self.scene.at(state)
+                rendering, _, share = self.labeller.draw(gaussians, camera, self.labeller.owners(state, gaussians))
+                shares.append(share.clamp(0, 1).cpu())
+                image = rendering.color.clamp(0, 1).cpu()
+                image = self._image(state, camera, image, shares[-1], appearance)  # a background stands still
+                images.append(image.numpy())
+            drawing = replace(drawing, image=torch.from_numpy(average_exposure(images)))
+            if self.effects.soft_masks == "mean":
+                drawing = replace(drawing, share=torch.stack(shares).mean(0))
         if "field_of_view" in effects:
             drawing = _within_circle(drawing, effects["field_of_view"])
         image = apply_effects(drawing.image.numpy(), drawing.depth, effects, rng)
         return replace(drawing, image=torch.from_numpy(np.ascontiguousarray(image)))
-
-    @torch.no_grad()
-    def _motion_blurred(
-        self, drawing: LayeredDrawing, appearance: Appearance, shutter_s: float, rng: Generator
-    ) -> LayeredDrawing:
-        if self.motion is None or shutter_s <= 0:
-            return drawing
-        assert self.effects is not None
-        images, shares = [], []
-        for state, camera in subframes(self.scene, drawing, self.motion(drawing.state, rng), shutter_s):
-            gaussians = self.scene.at(state)
-            rendering, _, share = self.labeller.draw(gaussians, camera, self.labeller.owners(state, gaussians))
-            shares.append(share.clamp(0, 1).cpu())
-            image = rendering.color.clamp(0, 1).cpu()
-            image = self._image(state, camera, image, shares[-1], appearance)  # a background stands still
-            images.append(image.numpy())
-        drawing = replace(drawing, image=torch.from_numpy(average_exposure(images)))
-        return drawing if self.effects.soft_masks == "mid" else replace(drawing, share=torch.stack(shares).mean(0))
 
 
 def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
