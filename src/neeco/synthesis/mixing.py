@@ -75,7 +75,13 @@ class Mixture:
             raise NeecoError("--instruments: none of the runs has an instrument; train on captures that record them")
         if any(not scene.recorded.states for scene in (tissue, *instrument_scenes)):
             raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
-        gains = tuple(_gain(tissue, scene) for scene in instrument_scenes)
+        gains: list[tuple[float, float, float]] = []
+        for scene in instrument_scenes:  # 1 where there is no instrument to compare with, or it is the same run
+            gain = torch.ones(3)
+            if tissue is not scene and tissue.instruments:  # shafts are of a similar grey in both
+                ratio = _shaft_color(tissue) / _shaft_color(scene).clamp_min(1e-3)
+                gain = ratio.clamp(*MIXING.gain_range)
+            gains.append((float(gain[0]), float(gain[1]), float(gain[2])))
         depths = []
         for recorded, scene in ((scene.recorded, scene) for scene in instrument_scenes):
             pairs = zip(recorded.states, recorded.cameras, strict=True)
@@ -84,7 +90,7 @@ class Mixture:
             scene=merged_scene(tissue, instrument_scenes, gains),
             tissue=tissue,
             instrument_scenes=tuple(instrument_scenes),
-            gains=gains,
+            gains=tuple(gains),
             min_depth={
                 item.name: depth
                 for scene, depth in zip(instrument_scenes, depths, strict=True)
@@ -236,17 +242,6 @@ def _body(scene: GaussianScene, index: int, deformation: Deformation) -> Canonic
     stored = {name: tensor[rows] for name, tensor in canonical.extras.items()}
     extras = deformation.fit_extras(deformation.initial_extras(alone) | stored)
     return alone.with_extras(**extras, **{VISIBILITY: seen})
-
-
-def _gain(tissue: GaussianScene, instruments: GaussianScene) -> tuple[float, float, float]:
-    """Estimate the colour gains that make `instruments` look as under the light of `tissue`'s capture, from the shafts,
-    which are of a similar grey in both. 1 where the tissue's run has no instrument to compare with, or it is the
-    same run."""
-    if tissue is instruments or not tissue.instruments:
-        return 1.0, 1.0, 1.0
-    ratio = _shaft_color(tissue) / _shaft_color(instruments).clamp_min(1e-3)
-    red, green, blue = (float(value) for value in ratio.clamp(*MIXING.gain_range))
-    return red, green, blue
 
 
 def _shaft_color(scene: GaussianScene) -> Tensor:

@@ -179,7 +179,13 @@ def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views,
     if views == "orbit":
         if still:
             raise NeecoError("--views orbit: the scope stood still, which shows no side; use recorded or perturbed")
-        view_sampler = OrbitViews(recorded, surface_centre(scene))
+        chosen = evenly_spaced(len(scene.recorded.cameras), SAMPLING.n_surface_views, floor=True)
+        with torch.no_grad():
+            seen = [(scene.at(scene.recorded.states[k]), scene.recorded.cameras[k]) for k in chosen]
+            points = [surface_points(surface_depth(rasterize(*view)), view[1]) for view in seen]
+        if not sum(map(len, points)):
+            raise NeecoError("--views orbit: the scene shows no surface to orbit about; use --views recorded")
+        view_sampler = OrbitViews(recorded, np.median(np.concatenate(points), axis=0))
     if states == "interpolate":
         return Sampler(scene, InterpolatedStates(scene.recorded.states), view_sampler)
     if states == "extrapolate":
@@ -246,18 +252,6 @@ def surface_points(depth: np.ndarray, camera: Camera, step: int = 4) -> np.ndarr
         across, down = rays_of_pixels(pixels.reshape(-1, 2), camera).reshape(pixels.shape).transpose(2, 0, 1)
     points = np.stack([across * z, down * z, z, np.ones_like(z)], -1)[z > 0]
     return (points @ to_numpy(camera.world_from_camera).T)[:, :3]
-
-
-@torch.no_grad()
-def surface_centre(scene: GaussianScene) -> np.ndarray:
-    """The median [3] mm of the surface points that recorded cameras see."""
-    recorded = scene.recorded
-    chosen = evenly_spaced(len(recorded.cameras), SAMPLING.n_surface_views, floor=True)
-    views = [(scene.at(recorded.states[k]), recorded.cameras[k]) for k in chosen]
-    seen = np.concatenate([surface_points(surface_depth(rasterize(*view)), view[1]) for view in views])
-    if len(seen) == 0:
-        raise NeecoError("--views orbit: the scene shows no surface to orbit about; use --views recorded")
-    return np.median(seen, axis=0)
 
 
 @dataclass(frozen=True)
