@@ -17,7 +17,7 @@ from neeco.base.settings import Fault, Place, printable
 from neeco.base.settings import key_name as key_name
 from neeco.geometry.rotations import rigid_fault
 
-T = TypeVar("T")
+T, U = TypeVar("T"), TypeVar("U")
 MIN_CONDENSED = 3  # problems similar to another one, from which they are counted instead of listed
 VARYING = re.compile(
     r"'(?:[^'\\]|\\.)*'|\S+\.(?:png|jpe?g)\b|[-+]?\d[\d.]*(?:e[-+]?\d+)?|\b(?:nan|inf)\b", re.IGNORECASE
@@ -144,13 +144,15 @@ class Node(Place):
             self.fail(f"expected a list, found {printable(self.value)}")
         return [self.item(index) for index in range(len(self.value))]
 
-    def members(self) -> dict[str, Node]:
-        """The values of an object, by name."""
+    def members(self, *, optional: bool = False) -> dict[str, Node]:
+        """The values of an object, by name. optional: none where there is nothing."""
+        if optional and self.value is None:
+            return {}
         if not isinstance(self.value, dict):
             self.fail(f"expected an object, found {printable(self.value)}")
         return {name: self.child(name) for name in self.value}
 
-    def given(self, key: str, read: Callable[[Node], T], default: T) -> T:
+    def given(self, key: str, read: Callable[[Node], T], default: U) -> T | U:
         """Return `read` of the value under `key`; `default` where there is none, or null."""
         return read(self.child(key)) if self.has(key) else default
 

@@ -48,7 +48,7 @@ def _overlap(mask: Pixels, truth: Pixels, counted: Pixels | None) -> tuple[int, 
 def truth_table(names: Mapping[int, str], truth: Mapping[int, str]) -> np.ndarray:
     """Return uint8 [256]: the truth's id, of several of a part the first, of the part that each id names; 0 where it
     has none. names, truth: part by id."""
-    numbers = {part: number for number, part in reversed(truth.items())}
+    numbers = {part: number for number, part in reversed([*truth.items()])}
     table = np.zeros(256, np.uint8)
     for number, part in names.items():
         table[number] = numbers.get(part, 0)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
-from neeco.labels.drawing import LayeredDrawing, distances_to
+from neeco.labels.drawing import distances_to
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,18 @@ class TrustSettings:
 
 
 SETTINGS = TrustSettings()
+
+
+class LabelledRendering(Protocol):
+    """A rendering with its label, such as a `LayeredDrawing`: images [H, W, 3] in [0, 1]; parts [H, W], above 0 in the
+    label; the tissue rendered alone is required."""
+
+    @property
+    def image(self) -> Tensor: ...
+    @property
+    def parts(self) -> Tensor: ...
+    @property
+    def tissue_image(self) -> Tensor | None: ...
 
 
 @dataclass(frozen=True)
@@ -62,7 +75,7 @@ class _Errors:
     tissue: np.ndarray
 
 
-def typical_errors_of(drawings: Sequence[tuple[LayeredDrawing, Tensor, Tensor | None]]) -> TypicalErrors:
+def typical_errors_of(drawings: Sequence[tuple[LabelledRendering, Tensor, Tensor | None]]) -> TypicalErrors:
     """Return the typical errors of renderings of training frames, each with its image [H, W, 3] and loss mask."""
     errors = [_errors(*drawing) for drawing in drawings]
     inside = np.concatenate([frame.whole[frame.label] for frame in errors])
@@ -75,7 +88,7 @@ def typical_errors_of(drawings: Sequence[tuple[LayeredDrawing, Tensor, Tensor | 
 
 
 def estimate_trust(
-    drawing: LayeredDrawing,
+    drawing: LabelledRendering,
     image: Tensor,
     mask: Tensor | None,
     typical: TypicalErrors,
@@ -100,7 +113,7 @@ def estimate_trust(
 
 
 def _errors(
-    drawing: LayeredDrawing, image: Tensor, mask: Tensor | None, neighbourhood: float = SETTINGS.neighbourhood
+    drawing: LabelledRendering, image: Tensor, mask: Tensor | None, neighbourhood: float = SETTINGS.neighbourhood
 ) -> _Errors:
     votes = np.ones(drawing.parts.shape, dtype=bool) if mask is None else mask.numpy()
     label = drawing.parts.numpy() > 0

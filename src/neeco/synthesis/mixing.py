@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -219,7 +220,7 @@ def merged_scene(
     for scene, gain in zip(instrument_scenes, gains or [(1.0, 1.0, 1.0)] * len(instrument_scenes), strict=True):
         for body in (_body(scene, k + 1, deformation) for k in range(len(scene.instruments))):
             factor = body.sh_dc.new_tensor(gain)
-            changed = {"sh_dc": brightened(body.sh_dc, factor), "sh_rest": body.sh_rest * factor}
+            changed: dict[str, Any] = {"sh_dc": brightened(body.sh_dc, factor), "sh_rest": body.sh_rest * factor}
             bodies.append(dataclasses.replace(body, **changed))
     mixed = GaussianScene(
         method, join_bodies(bodies), deformation, instruments, tissue.recorded, tissue.center.detach().clone()

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -80,7 +81,7 @@ class GeneratorSpec:
         """The same with other paths of files, by `move` of a name and a path."""
         settings = self.settings
         named = {"camera_effects": settings.camera_effects} | settings.image_folders()
-        moved = {name: str(move(name, Path(path))) for name, path in named.items() if path is not None}
+        moved: dict[str, Any] = {name: str(move(name, Path(path))) for name, path in named.items() if path is not None}
         if settings.states not in SAMPLERS:
             prefix = PATH_PREFIX if settings.states.startswith(PATH_PREFIX) else ""
             moved["states"] = f"{prefix}{move('states.jsonl', states_file(settings.states))}"

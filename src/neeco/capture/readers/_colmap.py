@@ -96,16 +96,16 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
     except NeecoError as error:
         report.error(relative_name(model, root), "", str(error).removeprefix(f"{model}/"))
         return parsed
-    path = model / f"points3D{suffix}"
-    parsed.points_place = Node(None, relative_name(path, root), "", report)
+    points_file = model / f"points3D{suffix}"
+    parsed.points_place = Node(None, relative_name(points_file, root), "", report)
     try:
-        rows = np.array(_parse(path, parse_points), dtype=np.float64).reshape(-1, 6)
+        rows = np.array(_parse(points_file, parse_points), dtype=np.float64).reshape(-1, 6)
         positions = rows[:, :3].astype(np.float32)
         if not np.isfinite(positions).all():
             raise NeecoError("holds points that are NaN or infinite; remove them")
         parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
     except NeecoError as error:
-        parsed.points_place.error(*str(error).removeprefix(f"{path}: ").split("; ", 1))
+        parsed.points_place.error(*str(error).removeprefix(f"{points_file}: ").split("; ", 1))
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")

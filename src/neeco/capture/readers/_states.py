@@ -70,7 +70,7 @@ def _parse_state(item: Node) -> tuple[str, InstrumentState]:
     """An instrument's name and state."""
     item.members()
     name, pose = item.child("name").text(), item.child("pose").rigid()
-    joints = {joint: node.number() for joint, node in item.given("joints", Node.members, {}).items()}
+    joints = {joint: node.number() for joint, node in item.child("joints").members(optional=True).items()}
     trust = item.given("trust", Node.number, None)
     if trust is not None and not 0 <= trust <= 1:
         item.child("trust").fail(f"is {trust:g}, not a share", "give 0 to 1, or leave it out")
@@ -98,9 +98,8 @@ def _parse_declared(item: Node) -> Instrument:
     name = item.child("name").text()
     joints: dict[str, Limits] = {}
     unrecorded = []
-    for joint, node in item.given("joints", Node.members, {}).items():
-        if node.value is not None:
-            node.members()
+    for joint, node in item.child("joints").members(optional=True).items():
+        node.members(optional=True)
         joints[joint] = node.given("limits", lambda limits: limits.range("rad"), None)
         if not node.given("recorded", Node.flag, True):
             unrecorded.append(joint)
@@ -146,7 +145,7 @@ def _parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty:
     """`{"translation_mm": [x, y, z], "rotation_deg": [x, y, z], "joints_deg": {name: sd}}`, of a state with `joints`"""
     across, down, depth = node.child("translation_mm").numbers(3, "deviations in the camera's axes, mm", least=0)
     tilt, turn, roll = node.child("rotation_deg").numbers(3, "deviations about its x, y, z, degrees", least=0)
-    deviations = node.given("joints_deg", Node.members, {})
+    deviations = node.child("joints_deg").members(optional=True)
     for name, deviation in deviations.items():
         if name not in joints:
             deviation.fail("the state has no such joint", "leave it out")

@@ -51,7 +51,7 @@ def _parse_link(node: Node) -> Link:
         node.child("type").fail(f"is {printable(kind)}", f"write {', '.join(JOINT_TYPES)}")
     if kind != FIXED and not node.has("axis"):
         node.child("axis").fail("is missing", "give the joint's axis in the parent's frame, three numbers")
-    gains: dict[str, Node] = node.given("value", Node.members, {})
+    gains = node.child("value").members(optional=True)
     return Link(
         node.child("name").text(),
         node.given("parent", Node.text, None),
