@@ -264,8 +264,8 @@ class SampleGenerator:
                 drawing = replace(drawing, share=torch.stack(shares).mean(0))
         if "field_of_view" in effects:
             drawing = _within_circle(drawing, effects["field_of_view"])
-        image = apply_effects(drawing.image.numpy(), drawing.depth, effects, rng)
-        return replace(drawing, image=torch.from_numpy(np.ascontiguousarray(image)))
+        seen = apply_effects(drawing.image.numpy(), drawing.depth, effects, rng)
+        return replace(drawing, image=torch.from_numpy(np.ascontiguousarray(seen)))
 
 
 def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
