@@ -74,12 +74,11 @@ def run(arguments: Arguments) -> int:
                 write_video(trained.scene, views, arguments.video, advance, arguments.images)
             else:
                 assert arguments.output is not None
-                target = arguments.output / folder
-                render(trained.scene, views, target, advance, arguments.images)
-    if arguments.video is not None:
+                render(trained.scene, views, arguments.output / folder, advance, arguments.images)
+    if arguments.output is None:
         print(f"{len(views)} images in {arguments.video}")
         return 0
-    print(f"{len(views)} images in {target}")
+    print(f"{len(views)} images in {arguments.output / folder}")
     if not trained.scene.label_names:
         print(f"no part ids and masks: method {trained.scene.method!r} learns no labels")
     return 0

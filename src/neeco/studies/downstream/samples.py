@@ -156,8 +156,7 @@ class RecordedSample:
         if ids.shape != pixels.shape[:2]:
             raise NeecoError(f"{file}: is of another size than its frame; label the frames as recorded")
         remedy = "correct the mask, or leave its frame out"
-        valid = None if mask is None else mask.numpy()
-        return Example(pixels, _classes_of(ids, self.table, file, remedy), valid)
+        return Example(pixels, _classes_of(ids, self.table, file, remedy), None if mask is None else mask.numpy())
 
 
 @dataclass(frozen=True)
