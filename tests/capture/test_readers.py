@@ -336,13 +336,6 @@ def test_damaged_point_clouds_are_refused(tmp_path, content):
         read_ply(tmp_path / "bad.ply")
 
 
-def test_a_folder_that_is_not_there_is_told_in_one_plain_line(tmp_path):
-    missing = tmp_path / "nowhere"
-    with pytest.raises(NeecoError) as raised:
-        read_capture(missing)
-    assert str(raised.value) == f"{missing}: no such folder; give the folder of a capture"
-
-
 def arrays(count=5):
     """What a user's own recording may hold: images, camera poses, instrument poses, jaw angles."""
     random = np.random.default_rng(3)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neeco.capture.checks import check_capture, read_checked
+from neeco.capture.checks import inspect_capture
 
 SAMPLE = Path(__file__).resolve().parents[2] / "samples" / "liver-mini"
 
@@ -24,11 +24,9 @@ def root(tmp_path: Path) -> Path:
 
 
 def told_of(root: Path) -> list[str]:
-    before = {str(problem) for problem in check_capture(SAMPLE)}
-    found = [problem for problem in check_capture(root) if str(problem) not in before]
-    assert all(problem.severity == "warning" for problem in found)
-    read_checked(root)  # it can be trained on
-    return [str(problem) for problem in found]
+    checked = inspect_capture(root, motion=False)
+    assert all(problem.severity == "warning" for problem in checked.problems)  # it can be trained on
+    return [str(problem) for problem in checked.problems]
 
 
 def masks(root: Path) -> list[Path]:

@@ -1,5 +1,6 @@
 """A whole evaluation of a world whose recorded images the scene itself drew."""
 
+import importlib
 import json
 from dataclasses import replace
 
@@ -138,6 +139,12 @@ def test_an_unknown_split_is_refused_naming_those_there_are(world, tmp_path):
         evaluated(only_training)
 
 
+def open_as(run, monkeypatch):
+    """Let the verb open this run."""
+    importlib.import_module("neeco.viewer.export")  # which keeps the `load_run` of its first import
+    monkeypatch.setattr("neeco.training.run.load_run", lambda path, device, **_: run)
+
+
 def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_path, monkeypatch):
     seen = {}
 
@@ -156,7 +163,7 @@ def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_p
         monkeypatch.setattr(evaluate, "draw", noting("draw", evaluate.draw))
         monkeypatch.setattr(image_metrics, "relu", noting("lpips", image_metrics.relu))
         run = make_run(world, tmp_path)
-        monkeypatch.setattr("neeco.training.run.load_run", lambda path, device, **_: run)
+        open_as(run, monkeypatch)
         assert main(["evaluate", str(run.path), "--splits", "test"]) == 0
         assert (seen, torch.get_num_threads()) == ({"draw": 1, "lpips": 3}, 3)
     finally:
@@ -176,7 +183,7 @@ def test_numbers_that_could_not_be_written_are_told_before_scoring(world, tmp_pa
     run = make_run(world, tmp_path / "run")
     (tmp_path / "taken").write_text("a file, not a folder")
     (tmp_path / "folder").mkdir()
-    monkeypatch.setattr("neeco.training.run.load_run", lambda path, device, **_: run)
+    open_as(run, monkeypatch)
     monkeypatch.setattr("neeco.evaluation.evaluate.evaluate_run", lambda *_, **__: pytest.fail("scored"))
     assert main(["evaluate", str(run.path), "--json", str(tmp_path / place)]) == 1
     told = capsys.readouterr()
@@ -186,7 +193,7 @@ def test_numbers_that_could_not_be_written_are_told_before_scoring(world, tmp_pa
 
 def test_numbers_are_also_written_where_asked(world, tmp_path, monkeypatch):
     run = make_run(world, tmp_path / "run")
-    monkeypatch.setattr("neeco.training.run.load_run", lambda path, device, **_: run)
+    open_as(run, monkeypatch)
     assert main(["evaluate", str(run.path), "--json", str(tmp_path / "new" / "scores.json")]) == 0
     assert (tmp_path / "new" / "scores.json").read_text() == (run.path / "evaluation.json").read_text()
     assert "images it never saw. " in (run.path / "report.html").read_text()

@@ -8,8 +8,8 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.capture.checks.truth import USUAL_NAMES
 from neeco.evaluation.mask_folders import truth_file
-from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, pairs_of, to_truth_ids
-from neeco.labels.labellers import composited_parts
+from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, pairs_of, truth_table
+from neeco.labels.labellers import composited_labels
 from neeco.raster.types import Rendering
 
 
@@ -52,8 +52,8 @@ def test_frames_without_a_part_do_not_count_for_it():
 
 
 def test_part_ids_become_the_truths_numbers_and_unknown_parts_tissue():
-    names = (("a", "jaw_right"), ("a", "shaft"), ("b", "hook"))
-    assert to_truth_ids(torch.tensor([[0, 1, 2, 3]]), names, USUAL_NAMES).tolist() == [[0, 4, 1, 0]]
+    assert truth_table({1: "jaw_right", 2: "shaft", 3: "hook"}, USUAL_NAMES)[:4].tolist() == [0, 4, 1, 0]
+    assert truth_table({1: "shaft"}, {5: "shaft", 7: "shaft"})[1] == 5
 
 
 def rendering(channels):
@@ -63,10 +63,10 @@ def rendering(channels):
 
 def test_a_pixel_is_instrument_where_its_columns_together_pass_the_threshold():
     channels = torch.tensor([[[0.3, 0.4], [0.5, 0.1], [0.9, 0.05]]])
-    assert composited_parts(rendering(channels), 0.65).tolist() == [[2, 0, 1]]
-    assert composited_parts(rendering(torch.zeros(1, 3, 0)), 0.65).tolist() == [[0, 0, 0]]
+    assert composited_labels(rendering(channels), 0.65)[0].tolist() == [[2, 0, 1]]
+    assert composited_labels(rendering(torch.zeros(1, 3, 0)), 0.65)[0].tolist() == [[0, 0, 0]]
     with pytest.raises(NeecoError, match="label channels"):
-        composited_parts(rendering(None), 0.65)
+        composited_labels(rendering(None), 0.65)
 
 
 def test_the_mean_leaves_out_what_is_not_known():

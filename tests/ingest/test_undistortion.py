@@ -162,9 +162,9 @@ def test_frames_without_an_image_are_left_out_with_their_count(tmp_path):
     [
         (
             {"camera_model": "EQUIRECTANGULAR"},
-            "camera_model: is 'EQUIRECTANGULAR'; this lens model cannot be undistorted",
+            "camera_model: is 'EQUIRECTANGULAR': this lens model cannot be undistorted",
         ),
-        ({"ftheta_p0": 0.1}, "ftheta_p0: is 0.1; this lens model cannot be undistorted"),
+        ({"ftheta_p0": 0.1}, "ftheta_p0: is 0.1: this lens model cannot be undistorted"),
         ({"distortion_params": [0.1, 0.2, 0.3]}, "distortion_params: expected 4, 5, 6 or 8 coefficients"),
         ({"distortion_params": [0.1, 0, 0, 0], "k1": 0.2}, "k1: is 0.2, but distortion_params.0. differs"),
         ({"k1": float("nan")}, "k1: is nan, not a finite number"),

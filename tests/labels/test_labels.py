@@ -103,8 +103,10 @@ def test_an_instrument_that_shows_sides_no_frame_saw_is_refused_when_too_much_of
         scene.canonical = plain
 
 
-def test_an_instrument_behind_the_tissue_is_not_seen_at_all(scene, state, camera):
-    _, label = labelled(scene, state(z=130.0), camera)
+def test_an_instrument_behind_the_tissue_is_not_seen_at_all_and_has_no_share(scene, state, camera):
+    drawing, label = labelled(scene, state(z=130.0), camera)
+    assert drawing.share.max() < 0.05
+    assert not drawing.ignored.any()
     assert label.shape is None
     assert label.visibility == 0
     assert {point.visibility for name, point in label.keypoints.items() if name != "shaft_far"} == {1}
@@ -166,11 +168,6 @@ def test_threshold_labels_separate_what_moved_from_what_did_not(scene, state, ca
     assert (one & other).sum() / (one | other).sum() > 0.7
 
 
-def test_thresholds_given_are_used(scene, state):
-    labeller = ThresholdLabels(scene, DeltaThresholds(means=1e6, quats=None, scales=None))
-    assert (labeller.owners(state(), scene.at(state())) == -1).all()
-
-
 def test_otsu_falls_between_two_clusters_orders_of_magnitude_apart():
     rng = np.random.default_rng(0)
     low, high = (torch.from_numpy(x) for x in (1e-3 * rng.lognormal(0, 0.5, 900), 5.0 * rng.lognormal(0, 0.3, 100)))
@@ -193,6 +190,7 @@ def test_a_scene_that_does_not_move_cannot_be_labelled_by_threshold(scene, monke
 
 def test_no_gaussian_over_the_thresholds_means_an_empty_mask(scene, state, camera):
     labeller = ThresholdLabels(scene, DeltaThresholds(means=1e6, quats=None, scales=None))
+    assert (labeller.owners(state(), scene.at(state())) == -1).all()
     drawing, label = labelled(scene, state(), camera, labeller)
     assert not drawing.parts.any()
     assert label.shape is None
@@ -206,12 +204,6 @@ def test_the_share_is_the_sum_of_the_label_channels_and_the_mask_is_where_it_exc
         channels = rasterize(scene.at(state()), camera, channels=scene.label_channels()).channels
         assert (drawing.share == channels.sum(dim=-1).clamp(0, 1)).all()
         assert ((drawing.parts > 0) == (drawing.share > threshold)).all()
-
-
-def test_what_the_tissue_hides_has_no_share(scene, state, camera):
-    drawing, _ = labelled(scene, state(z=130.0), camera)
-    assert drawing.share.max() < 0.05
-    assert not drawing.ignored.any()
 
 
 def test_a_dropped_component_is_in_neither_parts_nor_share_nor_band(scene, state, camera):

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parent))
-from scene_worlds import GRASPER, SMALL, TISSUE, grasper_state, make_scene, pose_of, random_canonical, rounding
+from scene_worlds import SMALL, grasper_state, make_scene, pose_of, random_canonical, rounding
 
 from neeco.base.errors import NeecoError
 from neeco.capture.model import State
 from neeco.methods.hexplane import HexPlane, HexPlaneSettings
 from neeco.methods.time_mlp import NoisyTime, TimeMLP, TimeMLPSettings, octaves
 from neeco.scene import GaussianScene
-from neeco.scene.deformation import UNPERTURBED, Deformation, Perturbation, mark_moving
+from neeco.scene.deformation import UNPERTURBED, Deformation, Perturbation
 from neeco.scene.method_registry import make_deformation, method_settings
 
 METHODS = ("deformable-3dgs", "4dgs")
@@ -169,27 +169,6 @@ def test_every_gaussian_has_a_place_a_turn_and_a_size(method, tissue, instrument
         assert bool(torch.isfinite(tensor).all())
     assert bool((posed.scales >= 0).all())
     assert deformation.label_channels(canonical).shape == (count, 0)
-
-
-def test_what_moves_with_time_is_the_instrument() -> None:
-    deformation = make_deformation("4dgs", (GRASPER,), method_settings("4dgs", SMALL["4dgs"]))
-    canonical = random_canonical(torch.Generator().manual_seed(0))
-    states = [grasper_state(pose_of(0, 0, 0, 0, 0, 0), time=0.1 * k) for k in range(6)]
-    deformation.fit_ranges(states, canonical.means)
-    plain = deformation.deltas
-
-    def moving(given, state):
-        deltas = plain(given, state)
-        reach = torch.full((len(given), 1), 1e-3)
-        reach[TISSUE:] = 1.0
-        deltas.means.copy_((reach * (1 + 0.1 * torch.arange(len(given))[:, None] % 1)) * (1 + state.time))
-        return deltas
-
-    deformation.deltas = moving
-    labels = deformation.label_channels(mark_moving(deformation, canonical, states))
-    assert labels.shape == (len(canonical), 1)
-    assert bool((labels[:TISSUE] == 0).all())
-    assert bool((labels[TISSUE:] == 1).all())
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene import GaussianScene
 from neeco.synthesis import camera_effects
+from neeco.synthesis.backgrounds import Appearance
 from neeco.synthesis.camera_effects import (
     EFFECTS,
     CameraEffects,
@@ -274,12 +275,14 @@ def test_motion_blur_is_the_integral_over_the_exposure(speed, seen, moving, tmp_
     motion = Motion({"rod": np.array([0, 0, 0.5, speed, 0, 0])}, {"rod": {"jaw_angle": 2.0}}, np.zeros(6))
     generator = replace(generator, motion=lambda state, rng: motion)  # type: ignore[arg-type]
     sharp = draw_layers(moving, generator.labeller, rod_state(), CAMERA, 0.0)
-    made = generator._through_camera(sharp, {"shutter_s": 0.05}, np.random.default_rng(0))
+    made = generator._through_camera(sharp, {"shutter_s": 0.05}, np.random.default_rng(0), Appearance())
     exact = blurred(moving, rod_state(), motion, 0.05, 64)
     assert float((made.image - exact).abs().max()) < 0.03
     assert float((sharp.image - exact).abs().max()) > seen
     assert torch.equal(made.parts, sharp.parts)  # of the middle of the exposure
     assert float((made.share - sharp.share).abs().max()) > seen
     assert float(made.share.sum()) == pytest.approx(float(sharp.share.sum()), rel=0.05)
-    cut = generator._through_camera(sharp, {"shutter_s": 0.05, "field_of_view": 0.3}, np.random.default_rng(0))
+    cut = generator._through_camera(
+        sharp, {"shutter_s": 0.05, "field_of_view": 0.3}, np.random.default_rng(0), Appearance()
+    )
     assert not bool(cut.share[torch.from_numpy(image_circle(48, 64, 0.3) <= 0.5)].any())

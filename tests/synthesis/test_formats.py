@@ -7,6 +7,7 @@ import io
 import json
 import shutil
 import tarfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -220,24 +221,13 @@ def test_names_of_classes_that_fit_no_instrument_are_refused(names, runs, tmp_pa
     assert not (tmp_path / "set").exists()
 
 
-def test_a_value_that_is_no_number_is_refused_by_the_name_of_its_option() -> None:
-    with pytest.raises(NeecoError, match=r"--min-share: inf is not a finite number"):
-        Settings.from_values("synthesize", count=1, min_share=float("inf"))
-
-
-def test_a_larger_data_set_is_larger_in_every_format_it_was_begun_in(runs: list[FakeRun], tmp_path: Path) -> None:
-    for count, formats in ((1, ("coco",)), (2, ("imagefolder",))):
-        settings = Settings(count=count, tissue_tolerance_mm=2.0)
-        synthesize(runs[0], tmp_path / "set", settings, formats, resume=count > 1, instrument_runs=runs[1:])  # type: ignore[arg-type]
-    assert len(json.loads((tmp_path / "set/coco/instances.json").read_text())["images"]) == 2
-
-
-def test_a_format_can_be_added_later(made: Path, runs: list[FakeRun], tmp_path: Path) -> None:
-    output = tmp_path / "set"
-    settings = Settings(count=COUNT, tissue_tolerance_mm=2.0)
-    synthesize(runs[0], output, settings, ("coco",), instrument_runs=runs[1:])  # type: ignore[arg-type]
-    again = synthesize(runs[0], output, settings, FORMATS, resume=True, instrument_runs=runs[1:])  # type: ignore[arg-type]
-    assert again.made_now == 0
+def test_formats_and_images_can_be_added_later_and_reach_every_format_begun(made, runs, tmp_path):
+    output, settings = tmp_path / "set", Settings(count=COUNT, tissue_tolerance_mm=2.0)
+    synthesize(runs[0], output, replace(settings, count=2), ("coco",), instrument_runs=runs[1:])
+    again = synthesize(runs[0], output, settings, FORMATS[:3], resume=True, instrument_runs=runs[1:])
+    assert again.made_now == COUNT - 2
+    assert len(json.loads((output / "coco/instances.json").read_text())["images"]) == COUNT
+    assert synthesize(runs[0], output, settings, FORMATS, resume=True, instrument_runs=runs[1:]).made_now == 0
     assert json.loads((output / "dataset.json").read_text())["formats"] == list(FORMATS)
     for name in FORMATS:
         files = [path.relative_to(made) for path in (made / name).rglob("*") if path.is_file()]

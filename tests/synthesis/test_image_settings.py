@@ -53,11 +53,19 @@ def lens_scene(scene):
         (SizeSettings(scale=1e30), "--scale: .* is more than"),
         (ImageSettings(quality=0), "--quality must be 1 to 100 .got 0."),
         (ImageSettings(quality=50), "--quality: applies to JPEG only, and images would be PNG"),
+        (Settings(count=0), "--count: 0 is out of range"),
+        (Settings(count=1, seed=-1), "--seed: -1 is out of range"),
+        (Settings(count=1, max_attempts=0), "--max-attempts: 0 is out of range"),
     ],
 )
-def test_sizes_that_make_no_sense_are_refused_by_name(size, words):
+def test_settings_that_make_no_sense_are_refused_by_name(size, words):
     with pytest.raises(NeecoError, match=words):
         (size.check(), size.of(64, 48))
+
+
+def test_a_value_that_is_no_number_is_refused_by_the_name_of_its_option():
+    with pytest.raises(NeecoError, match=r"--min-share: inf is not a finite number"):
+        Settings.from_values("synthesize", count=1, min_share=float("inf"))
 
 
 def test_a_size_keeps_the_shape_of_the_recorded_images():

@@ -22,18 +22,25 @@ def pixels(path: Path) -> np.ndarray:
         return np.array(image)
 
 
-@pytest.mark.parametrize(
-    ("name", "ids"), [("endovis2017-parts", (10, 30)), ("endovis2018", (1, 2)), ("sar-rarp50", (3, 1))]
-)
-def test_label_images_have_the_class_ids_of_public_sets(name, ids, run, tmp_path):
-    synthesize(run, tmp_path / "set", Settings(count=COUNT, tissue_tolerance_mm=2.0), [name])
-    files = sorted((tmp_path / "set" / name).glob("*/labels/*.png"))
+IDS = {"endovis2017-parts": (10, 30), "endovis2018": (1, 2), "sar-rarp50": (3, 1)}  # of shaft and jaw
+
+
+@pytest.fixture(scope="module")
+def made(run, tmp_path_factory) -> Path:
+    output = tmp_path_factory.mktemp("made") / "set"
+    synthesize(run, output, Settings(count=COUNT, tissue_tolerance_mm=2.0), [*IDS])
+    return output
+
+
+@pytest.mark.parametrize(("name", "ids"), IDS.items())
+def test_label_images_have_the_class_ids_of_public_sets(name, ids, made):
+    files = sorted((made / name).glob("*/labels/*.png"))
     assert len(files) == COUNT
     for file in files:
-        parts, labels = pixels(tmp_path / "set" / "parts" / file.name), pixels(file)
+        parts, labels = pixels(made / "parts" / file.name), pixels(file)
         assert np.array_equal(labels, np.array([0, *ids], np.uint8)[parts])
         assert file.parents[1].joinpath("images", file.name).is_file()
-    classes = json.loads((tmp_path / "set" / name / "classes.json").read_text())
+    classes = json.loads((made / name / "classes.json").read_text())
     assert set(classes) >= {"0", *map(str, ids)}
     if name == "endovis2018":  # as its own files, in colours
         colors, labels = np.array(Image.open(files[0]).convert("RGB")), pixels(files[0])

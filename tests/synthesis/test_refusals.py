@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,14 @@ from neeco.synthesis.generator import Acceptance, SampleGenerator
 from neeco.synthesis.settings import Settings
 
 SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0, max_attempts=3)
+
+
+@pytest.fixture(scope="module")
+def whole(run, tmp_path_factory):
+    """The data set of SETTINGS."""
+    output = tmp_path_factory.mktemp("whole") / "dataset"
+    synthesize(run, output, SETTINGS)
+    return output
 
 
 def refusing(reasons, monkeypatch) -> None:
@@ -56,9 +65,8 @@ def test_a_refused_data_set_leaves_the_disk_as_it_was(there, states, told, run, 
         assert not output.parent.exists()
 
 
-def test_images_drawn_before_a_refusal_are_kept_indexed_and_gone_on_from(run, tmp_path, monkeypatch):
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
-    synthesize(run, whole, SETTINGS)
+def test_images_drawn_before_a_refusal_are_kept_indexed_and_gone_on_from(run, whole, tmp_path, monkeypatch):
+    cut = tmp_path / "cut"
     with monkeypatch.context() as patched:
         refusing([None, None, *["leaves the image"] * 3], patched)
         with pytest.raises(NeecoError, match=r"image 2: no acceptable state"):
@@ -97,9 +105,8 @@ def test_ctrl_c_is_told_with_the_way_to_go_on(run, tmp_path, monkeypatch, capsys
     assert "4 images" in capsys.readouterr().out
 
 
-def test_a_refused_resume_changes_nothing(run, tmp_path):
-    output = tmp_path / "dataset"
-    synthesize(run, output, SETTINGS)
+def test_a_refused_resume_changes_nothing(run, whole, tmp_path):
+    output = shutil.copytree(whole, tmp_path / "dataset")
     before = contents(output)
     for settings, told in (
         (replace(SETTINGS, seed=4), "settings.seed: begun with 3, now 4"),
@@ -111,21 +118,19 @@ def test_a_refused_resume_changes_nothing(run, tmp_path):
         assert contents(output) == before
 
 
-def test_an_interrupted_resume_forgets_no_image(run, tmp_path):
+def test_an_interrupted_resume_forgets_no_image(run, whole, tmp_path):
     def interrupt(done):
         raise KeyboardInterrupt
 
-    output = tmp_path / "dataset"
-    synthesize(run, output, SETTINGS)
+    output = shutil.copytree(whole, tmp_path / "dataset")
     with pytest.raises(KeyboardInterrupt):
         synthesize(run, output, replace(SETTINGS, count=6), resume=True, on_progress=interrupt)
     assert json.loads((output / "dataset.json").read_text())["images"] == 4
     assert len((output / "states.jsonl").read_text().splitlines()) == 4
 
 
-def test_a_full_disk_is_told_with_the_file_and_gone_on_from(run, tmp_path, monkeypatch):
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
-    synthesize(run, whole, SETTINGS)
+def test_a_full_disk_is_told_with_the_file_and_gone_on_from(run, whole, tmp_path, monkeypatch):
+    cut = tmp_path / "cut"
     with monkeypatch.context() as patched:
         real = os.replace
         left = iter(range(11))  # dataset.json, one image's seven files and record, and two of the next's

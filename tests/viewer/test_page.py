@@ -19,7 +19,7 @@ from wristed_world import make_driver
 from neeco.capture.model import State
 from neeco.evaluation.image_metrics import psnr
 from neeco.geometry.camera import Camera
-from neeco.labels.labellers import composited_parts, threshold_of
+from neeco.labels.labellers import composited_labels, threshold_of
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
@@ -137,7 +137,7 @@ def decibels(image: np.ndarray, truth: np.ndarray, where: np.ndarray | None = No
 def agree(page: Page, scene: GaussianScene, state: State, camera: Camera, frame: float | None) -> None:
     """What the page shows is what the scene draws: 50 dB, label ids in 99.9 % of pixels, depth within quantisation."""
     truth = scene.render(state, camera, labels=True)
-    parts = composited_parts(truth, threshold_of(scene)).numpy()
+    parts = composited_labels(truth, threshold_of(scene))[0].numpy()
     shown = truth.color.clamp(0, 1).numpy()
     assert (parts > 0).sum() > 50
     image, _, depths = page.drawn(frame)
@@ -361,7 +361,7 @@ def test_saved_image_and_mask_are_of_the_recorded_size(page: Page, scene: Gaussi
             page.page.get_by_role("button", name=f"save {name}").click()
         waiting.value.save_as(tmp_path / f"{name}.png")
     truth = scene.render(scene.recorded.states[0], scene.recorded.cameras[0], labels=True)
-    parts = composited_parts(truth, threshold_of(scene)).numpy()
+    parts = composited_labels(truth, threshold_of(scene))[0].numpy()
     image = np.asarray(Image.open(tmp_path / "image.png").convert("RGB")) / 255
     assert decibels(image, truth.color.clamp(0, 1).numpy()) > 50
     mask = np.asarray(Image.open(tmp_path / "mask.png").convert("L"))

@@ -50,11 +50,17 @@ def naming_arguments() -> Iterator[None]:
     """Name arguments of Python in the messages of errors raised in the block, or in the function so decorated:
     `max_attempts` for `--max-attempts`, `density__min_opacity` for `--set density.min_opacity`. Commands quoted in
     backticks stay."""
+
+    def argument(option: re.Match[str]) -> str:
+        setting, off, name = option.groups()
+        word: str = setting.replace(".", "__") if setting else name.replace("-", "_")
+        return f"{word}=False" if off else word
+
     try:
         yield
     except NeecoError as error:
         words = str(error).split("`")
-        words[::2] = [OPTION.sub(_argument, text) for text in words[::2]]
+        words[::2] = [OPTION.sub(argument, text) for text in words[::2]]
         error.command_line = error.command_line or str(error)
         error.args = ("`".join(words),)
         raise
@@ -70,12 +76,6 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
     from difflib import get_close_matches  # slow to import
 
     return next(iter(get_close_matches(name, list(names), n=1)), None)
-
-
-def _argument(option: re.Match[str]) -> str:
-    setting, off, name = option.groups()
-    argument = setting.replace(".", "__") if setting else name.replace("-", "_")
-    return f"{argument}=False" if off else argument
 
 
 def memory_failure(error: BaseException) -> str | None:

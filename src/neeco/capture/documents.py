@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NoReturn, Self
+from typing import Any, Literal, NoReturn, Self, TypeVar
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from neeco.base.settings import Fault, Place, printable
 from neeco.base.settings import key_name as key_name
 from neeco.geometry.rotations import rigid_fault
 
+T = TypeVar("T")
+U = TypeVar("U")
 MIN_CONDENSED = 3  # problems similar to another one, from which they are counted instead of listed
 VARYING = re.compile(
     r"'(?:[^'\\]|\\.)*'|\S+\.(?:png|jpe?g)\b|[-+]?\d[\d.]*(?:e[-+]?\d+)?|\b(?:nan|inf)\b", re.IGNORECASE
@@ -79,21 +82,6 @@ class ProblemReport:
         raise NeecoError(f"{place}{errors[0]}{more}")
 
 
-class RaisingReport(ProblemReport):
-    """Raises the first error as NeecoError in one line: for files that are read as a whole or not at all."""
-
-    def error(self, file: str, field: str, message: str, remedy: str = "") -> NoReturn:
-        problem = Problem("error", file, field, message, remedy)
-        raise NeecoError(str(problem))
-
-
-class FaultReport(ProblemReport):
-    """Raises the first error as a Fault, for whoever knows the file."""
-
-    def error(self, file: str, field: str, message: str, remedy: str = "") -> NoReturn:
-        raise Fault(field, f"{message}; {remedy}" if remedy else message)
-
-
 def as_float(value: Any) -> float | None:
     """A JSON number as float (may be NaN or infinite), None for anything else; true and false are not numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -106,23 +94,37 @@ def as_float(value: Any) -> float | None:
 
 @dataclass(frozen=True)
 class Node(Place):
-    """A value of a JSON or YAML file and its place. A reading that fails reports one error and returns None.
+    """A value of a JSON or YAML file and its place. A reading that fails raises Fault, or, by `tried`, is reported."""
 
-    Whether that ends the reading is the report's choice: `ProblemReport` collects; `RaisingReport` raises, as does
-    `FaultReport`, for `neeco.base.settings.read`.
-    """
+    report: ProblemReport = field(default_factory=ProblemReport)
 
-    report: ProblemReport = field(default_factory=FaultReport)
+    def fail(self, message: str, remedy: str = "") -> NoReturn:
+        """Raise Fault of this place."""
+        raise Fault(self.field, f"{message}; {remedy}" if remedy else message)
+
+    @contextmanager
+    def blamed(self) -> Iterator[None]:
+        """Raise the block's NeecoError, which does not say where, as Fault of this place."""
+        try:
+            yield
+        except NeecoError as error:
+            raise Fault(self.field, str(error)) from None
+
+    def tried(self, read: Callable[..., T], *arguments: Any) -> T | None:
+        """Return `read(self, *arguments)`; where that fails, report the first fault and return None."""
+        try:
+            with self.blamed():
+                return read(self, *arguments)
+        except Fault as fault:
+            self.at(None, fault.field).error(*str(fault).split("; ", 1))
+            return None
 
     def error(self, message: str, remedy: str = "") -> None:
+        """Report an error of this place."""
         self.report.error(self.file, self.field, message, remedy)
 
-    def error_from(self, error: NeecoError) -> None:
-        """Report an exception of the form "what is wrong; what to do" that does not say where."""
-        message, _, remedy = str(error).partition("; ")
-        self.error(message, remedy)
-
     def warning(self, message: str, remedy: str = "", contradicted: bool = False) -> None:
+        """Report a warning of this place."""
         self.report.warning(self.file, self.field, message, remedy, contradicted)
 
     @property
@@ -137,83 +139,72 @@ class Node(Place):
     def at(self, value: Any, field: str) -> Self:
         return type(self)(value, self.file, field, self.report)
 
-    def items(self) -> Iterator[Node]:
-        """The elements of a list; reports an error and yields nothing when this is not a list."""
+    def items(self) -> list[Node]:
+        """The elements of a list."""
         if not isinstance(self.value, list):
-            self.error(f"expected a list, found {printable(self.value)}")
-            return
-        for index in range(len(self.value)):
-            yield self.item(index)
+            self.fail(f"expected a list, found {printable(self.value)}")
+        return [self.item(index) for index in range(len(self.value))]
 
-    def is_object(self) -> bool:
-        """Return True if this is an object; report an error otherwise."""
-        if isinstance(self.value, dict):
-            return True
-        self.error(f"expected an object, found {printable(self.value)}")
-        return False
+    def members(self, *, optional: bool = False) -> dict[str, Node]:
+        """The values of an object, by name. optional: none where there is nothing."""
+        if optional and self.value is None:
+            return {}
+        if not isinstance(self.value, dict):
+            self.fail(f"expected an object, found {printable(self.value)}")
+        return {name: self.child(name) for name in self.value}
 
-    def flag(self, default: bool) -> bool | None:
-        """True or false; `default` where nothing is stated."""
-        if self.value is not None and not isinstance(self.value, bool):
-            self.error(f"expected true or false, found {printable(self.value)}", "correct it")
-            return None
-        return default if self.value is None else self.value
+    def given(self, key: str, read: Callable[[Node], T], default: U) -> T | U:
+        """Return `read` of the value under `key`; `default` where there is none, or null."""
+        return read(self.child(key)) if self.has(key) else default
 
-    def text(self, remedy: str = "") -> str | None:
+    def flag(self) -> bool:
+        """True or false."""
+        if not isinstance(self.value, bool):
+            self.fail(f"expected true or false, found {printable(self.value)}", "correct it")
+        return self.value
+
+    def text(self, remedy: str = "") -> str:
         """A non-empty string."""
         if isinstance(self.value, str) and self.value.strip():
             return self.value
-        self.error(f"expected text, found {printable(self.value)}" if self.value != "" else "is empty", remedy)
-        return None
+        self.fail(f"expected text, found {printable(self.value)}" if self.value != "" else "is empty", remedy)
 
-    def number(
-        self, above: float | None = None, least: float | None = None, below: float | None = None
-    ) -> float | None:
+    def number(self, above: float | None = None, least: float | None = None, below: float | None = None) -> float:
         """A finite number, within the bounds given."""
         value = as_float(self.value)
         if value is None:
-            self.error(f"expected a number, found {printable(self.value)}", "correct it")
-            return None
+            self.fail(f"expected a number, found {printable(self.value)}", "correct it")
         if not math.isfinite(value):
-            self.error(f"is {printable(self.value)}, not a finite number", "correct it")
-            return None
+            self.fail(f"is {printable(self.value)}, not a finite number", "correct it")
         wrong = []
         wrong += [f"above {above:g}"] if above is not None and value <= above else []
         wrong += [f"{least:g} or more"] if least is not None and value < least else []
         wrong += [f"below {below:g}"] if below is not None and value >= below else []
         if wrong:
-            self.error(f"{value:g} is out of range", f"give a number {wrong[0]}")
-            return None
+            self.fail(f"{value:g} is out of range", f"give a number {wrong[0]}")
         return value
 
-    def integer(self, least: int) -> int | None:
+    def integer(self, least: int) -> int:
         """A whole number."""
         value = self.number()
-        if value is not None and (value != int(value) or value < least):
-            self.error(f"{value:g} is out of range", f"give a whole number, {least} or more")
-            return None
-        return None if value is None else int(value)
+        if value != int(value) or value < least:
+            self.fail(f"{value:g} is out of range", f"give a whole number, {least} or more")
+        return int(value)
 
-    def numbers(self, count: int, what: str, least: float | None = None) -> list[float] | None:
+    def numbers(self, count: int, what: str, least: float | None = None) -> tuple[float, ...]:
         """A list of so many finite numbers, none below `least`."""
         if not isinstance(self.value, list) or len(self.value) != count:
-            self.error(f"expected {count} numbers ({what}), found {printable(self.value)}", "correct it")
-            return None
-        values = [number for item in self.items() if (number := item.number(least=least)) is not None]
-        return values if len(values) == count else None
+            self.fail(f"expected {count} numbers ({what}), found {printable(self.value)}", "correct it")
+        return tuple(item.number(least=least) for item in self.items())
 
-    def range(self, unit: str) -> tuple[float, float] | None:
+    def range(self, unit: str) -> tuple[float, float]:
         """A range: two numbers, the least first."""
-        ends = self.numbers(2, f"least and greatest, {unit}")
-        if ends is None:
-            return None
-        low, high = ends
+        low, high = self.numbers(2, f"least and greatest, {unit}")
         if low >= high:
-            self.error(f"{low:g} is not below {high:g}", f"give the least first, in {unit}")
-            return None
+            self.fail(f"{low:g} is not below {high:g}", f"give the least first, in {unit}")
         return low, high
 
-    def rigid(self) -> np.ndarray | None:
+    def rigid(self) -> np.ndarray:
         """A rigid transform [4, 4] float64: a rotation in its corner and the row 0 0 0 1, which may be left out."""
         rows, wrong = self.value, ""
         if rows is None:
@@ -225,11 +216,9 @@ class Node(Place):
         elif any(as_float(entry) is None for row in rows for entry in row):
             wrong = "expected a 4x4 matrix, found an entry that is not a number"
         if wrong:
-            self.error(wrong, "give four rows of four numbers")
-            return None
+            self.fail(wrong, "give four rows of four numbers")
         numbers = [[as_float(entry) for entry in row] for row in rows]
         matrix = np.array([*numbers, [0.0, 0.0, 0.0, 1.0]][:4], dtype=np.float64)
-        fault = rigid_fault(matrix)
-        if fault is not None:
-            self.error(*fault)
-        return matrix if fault is None else None
+        if (fault := rigid_fault(matrix)) is not None:
+            self.fail(*fault)
+        return matrix

@@ -76,12 +76,7 @@ def byte_pixels(pixels: np.ndarray) -> np.ndarray:
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     """A loss mask as bool [H, W]: False where the stored image is black (darker than half). Raises NeecoError."""
-    return torch.from_numpy(read_mask_pixels(path, size))
-
-
-def read_mask_pixels(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """`read_mask` as an array."""
-    return np.asarray(_to_rgb(open_image(path, size), background=0.0).mean(axis=2) >= 0.5)
+    return torch.from_numpy(_to_rgb(open_image(path, size), background=0.0).mean(axis=2) >= 0.5)
 
 
 def read_labels(path: Path, size: tuple[int, int] | None = None) -> Tensor:
@@ -126,12 +121,7 @@ def write_labels(path: Path, labels: Tensor) -> None:
     """Write part ids (or a 0/255 mask), uint8 [H, W], as grey PNG, atomically. Raises NeecoError."""
     if labels.dtype != torch.uint8 or labels.ndim != 2:
         raise ValueError(f"labels must be uint8 [H, W], got {labels.dtype} {tuple(labels.shape)}")
-    write_png(path, labels.detach().cpu().numpy())
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write uint8 [H, W, 3] (BGR), or uint8 or uint16 [H, W], as PNG, atomically. Raises NeecoError."""
-    _write(path, encoded_png(pixels))
+    _write(path, encoded_png(labels.detach().cpu().numpy()))
 
 
 def encoded_image(image: Tensor, quality: int | None = None) -> bytes:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.base.plausible import Fault, joint_fault
-from neeco.capture.images import area_averaged_bytes, byte_pixels, read_mask_pixels, read_pixels
+from neeco.capture.images import area_averaged_bytes, byte_pixels, read_mask, read_pixels
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.points import PointCloud
 from neeco.geometry.camera import Camera
@@ -248,17 +248,12 @@ class Frame:
 
     def load_mask(self) -> Tensor | None:
         """bool [H, W], True where the loss counts, or None when the frame has no mask. Raises NeecoError."""
-        mask = self.load_mask_pixels()
-        return None if mask is None else torch.from_numpy(mask)
-
-    def load_mask_pixels(self) -> np.ndarray | None:
-        """`load_mask` as an array."""
         if self.mask_path is None:
             return None
-        mask = read_mask_pixels(self.mask_path, self._stored_size)
+        mask = read_mask(self.mask_path, self._stored_size)
         if self.stored_size is None:
             return mask
-        return area_averaged_bytes(mask.astype(np.uint8) * 255, self.camera) == 255
+        return torch.from_numpy(area_averaged_bytes(mask.numpy().astype(np.uint8) * 255, self.camera) == 255)
 
     @property
     def _stored_size(self) -> tuple[int, int]:

@@ -66,14 +66,16 @@ def read_ply(path: Path) -> PointCloud:
     """
     path = Path(path)
     content = read_bytes(path, "a point cloud as PLY")
-    encoding, count, properties, body = _parse_header(path, content)
-    vertices = _vertices(path, encoding, count, properties, body)
+    vertices = _vertices(path, content)
     if not {"x", "y", "z"} <= vertices.keys():
         raise NeecoError(f"{path}: vertex: has no x, y, z; write a point cloud with positions")
     positions = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
     for names in _COLORS:
         if set(names) <= vertices.keys():
-            return PointCloud(positions, np.stack([_unit(vertices[name]) for name in names], axis=1))
+            channels = np.stack([vertices[name] for name in names], axis=1)
+            if channels.dtype.kind == "u":
+                return PointCloud(positions, (channels / np.iinfo(channels.dtype).max).astype(np.float32))
+            return PointCloud(positions, np.clip(np.nan_to_num(channels), 0, 1).astype(np.float32))
     return PointCloud(positions)
 
 
@@ -142,10 +144,9 @@ def _parse_header(path: Path, content: bytes) -> tuple[str, int, list[tuple[str,
     return encoding, count, properties, content[line_end + 1 :]
 
 
-def _vertices(
-    path: Path, encoding: str, count: int, properties: list[tuple[str, str]], body: bytes
-) -> dict[str, np.ndarray]:
+def _vertices(path: Path, content: bytes) -> dict[str, np.ndarray]:
     """Each vertex property as an array [count]."""
+    encoding, count, properties, body = _parse_header(path, content)
     short = NeecoError(f"{path}: holds fewer than the {count} vertices its header promises; it is truncated")
     if encoding == "ascii":
         # every value needs a digit and a separator, so this bounds what a wrong header can make us allocate
@@ -163,10 +164,3 @@ def _vertices(
         raise short
     vertices = np.frombuffer(body, dtype=dtype, count=count)
     return {name: vertices[name] for name, _ in properties}
-
-
-def _unit(channel: np.ndarray) -> np.ndarray:
-    """A colour channel as float32 in [0, 1]."""
-    if channel.dtype.kind == "u":
-        return (channel / np.iinfo(channel.dtype).max).astype(np.float32)
-    return np.clip(np.nan_to_num(channel), 0, 1).astype(np.float32)

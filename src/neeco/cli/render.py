@@ -75,8 +75,8 @@ def run(arguments: Arguments) -> int:
                 print(f"{len(views)} images in {arguments.video}")
                 return 0
             assert arguments.output is not None
-            rendered = render(trained.scene, views, arguments.output / folder, advance, arguments.images)
-    print(f"{rendered.images} images in {rendered.folder}")
-    if not rendered.labelled:
+            render(trained.scene, views, arguments.output / folder, advance, arguments.images)
+    print(f"{len(views)} images in {arguments.output / folder}")
+    if not trained.scene.label_names:
         print(f"no part ids and masks: method {trained.scene.method!r} learns no labels")
     return 0

@@ -14,7 +14,7 @@ from neeco.capture.model import Frame, evenly_spaced
 from neeco.evaluation.image_metrics import resize_mask
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import pixel_centers, project, unproject_world
-from neeco.labels.labellers import composited_parts, threshold_of
+from neeco.labels.labellers import composited_labels, threshold_of
 from neeco.raster.types import Rendering
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def unobserved_tissue(coverage: Coverage, scene: DrawableScene, frame: Frame) ->
     rendering = scene.render(frame.state, camera, labels=True)
     tissue = torch.ones(camera.height, camera.width, dtype=torch.bool)
     if rendering.channels is not None:
-        tissue = composited_parts(rendering, threshold_of(scene)).cpu() == 0
+        tissue = composited_labels(rendering, threshold_of(scene))[0].cpu() == 0
     centers = pixel_centers(camera.height, camera.width)
     points = unproject_world(centers, _filled(rendering), camera)  # [h, w, 3]
     unobserved = torch.zeros_like(tissue)

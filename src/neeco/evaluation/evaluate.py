@@ -30,7 +30,7 @@ from neeco.evaluation.mask_metrics import (
     pairs_of,
     part_scores,
     precision,
-    to_truth_ids,
+    truth_table,
 )
 from neeco.evidence.foreground import Comparison, Foreground
 from neeco.evidence.label_quality import label_counts, learned_foreground, quality_of
@@ -267,7 +267,8 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
             if shadow is not None:
                 scores["shadow_labelled"] = labelled_shadow(label, reference.mask, shadow, counted)
             if reference.parts is not None:
-                ours = to_truth_ids(drawing.parts, scene.label_names, tally.parts.names)
+                names = {number: part for number, (_, part) in enumerate(scene.label_names, 1)}
+                ours = torch.from_numpy(truth_table(names, tally.parts.names)[drawing.parts.numpy()])
                 tally.parts.add(ours, reference.parts, mask)
         scores["psnr_covered"] = psnr(image, target, counted & ~unobserved)
         scores["psnr_uncovered"] = psnr(image, target, counted & unobserved)

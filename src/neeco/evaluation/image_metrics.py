@@ -10,6 +10,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -42,10 +43,6 @@ class ComparisonSettings:
 
 
 COMPARISON = ComparisonSettings()
-# black - violet - red - yellow - white: dark is right, bright is wrong; lightness rises evenly, for grey print
-_COLORS = np.array(
-    [[0, 0, 4], [60, 15, 110], [150, 38, 103], [221, 81, 58], [251, 165, 10], [252, 255, 200]], np.float64
-)
 # of part ids 1, 2, ..., on every page and picture (Okabe and Ito, "Color universal design", 2008: colour-blind readers
 # can distinguish them; the last is grey); `native/web/viewer.cpp` and `viewer/page/panel.js` have the same
 PART_COLORS = np.array(
@@ -260,10 +257,8 @@ def outline(mask: np.ndarray) -> np.ndarray:
 
 
 def _colored(fraction: np.ndarray) -> Pixels:
-    """Return the colours of values [H, W], which are clipped to [0, 1]."""
-    position = np.clip(fraction, 0, 1)
-    stops = np.linspace(0, 1, len(_COLORS))
-    return to_uint8(np.stack([np.interp(position, stops, _COLORS[:, channel]) for channel in range(3)], axis=-1))
+    """Return the colours of values [H, W], which are clipped to [0, 1]: dark is right, bright is wrong."""
+    return np.ascontiguousarray(cv2.applyColorMap(to_uint8(fraction * 255), cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8)
 
 
 def _legend(width: int, full_scale: float) -> Pixels:

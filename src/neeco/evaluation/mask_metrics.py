@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
-import torch
 from scipy import ndimage
 from torch import Tensor
 
@@ -46,14 +45,14 @@ def _overlap(mask: Pixels, truth: Pixels, counted: Pixels | None) -> tuple[int, 
     return int((mask & truth).sum()), int((mask | truth).sum())
 
 
-def to_truth_ids(parts: Tensor, label_names: Sequence[tuple[str, str]], names: Mapping[int, str]) -> Tensor:
-    """Renumber part ids [H, W] (column index + 1) to the truth's, part by id in `names`; parts that the truth does not
-    name become 0."""
-    numbers = {part: number for number, part in names.items()}
-    table = torch.zeros(len(label_names) + 1, dtype=torch.uint8, device=parts.device)
-    for index, (_, part) in enumerate(label_names):
-        table[index + 1] = numbers.get(part, 0)
-    return table[parts.long()]
+def truth_table(names: Mapping[int, str], truth: Mapping[int, str]) -> np.ndarray:
+    """Return uint8 [256]: the truth's id, of several of a part the first, of the part that each id names; 0 where it
+    has none. names, truth: part by id."""
+    numbers = {part: number for number, part in reversed([*truth.items()])}
+    table = np.zeros(256, np.uint8)
+    for number, part in names.items():
+        table[number] = numbers.get(part, 0)
+    return table
 
 
 def pairs_of(parts: Iterable[str]) -> dict[str, tuple[str, str]]:

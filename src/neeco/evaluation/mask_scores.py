@@ -14,7 +14,7 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import finite
 from neeco.capture.model import Capture
 from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, read_truth
-from neeco.evaluation.mask_metrics import PartTally, boundary_f, dice, iou, mean_of, pairs_of, part_scores
+from neeco.evaluation.mask_metrics import PartTally, boundary_f, dice, iou, mean_of, pairs_of, part_scores, truth_table
 
 SCHEMA = "neeco-mask-scores/2"
 SCORES: dict[str, Callable[..., float]] = {"iou": iou, "dice": dice, "boundary_f": boundary_f}
@@ -53,7 +53,7 @@ def score_masks(
     numbers: dict[str, int] = {}  # of several ids of a part the first
     for number, part in theirs.items():
         numbers.setdefault(part, number)
-    tables = [_table(names, numbers) for names in (ours, theirs)]
+    tables = [truth_table(names, theirs) for names in (ours, theirs)]
     whole = PartTally({1: "instrument"}, tuple(SCORES.values()))
     parts = PartTally({number: part for part, number in numbers.items()}, tuple(SCORES.values()))
     wholes, visible = list[list[str]](), list[list[str]]()  # of each image: whether its truth has the whole, the parts
@@ -125,14 +125,6 @@ def _shared_classes(predicted: Masks, truth: Masks) -> tuple[tuple[dict[int, str
         named = [", ".join(dict.fromkeys(names.values())) for names in (ours, theirs)]
         return ({}, {}), [f"parts: null, the prediction names {named[0]}, the truth {named[1]}"]
     return (ours, theirs), []
-
-
-def _table(names: Mapping[int, str], numbers: Mapping[str, int]) -> np.ndarray:
-    """Return uint8 [256]: the truth's number of the part that each id names, 0 where it has none."""
-    table = np.zeros(256, np.uint8)
-    for number, part in names.items():
-        table[number] = numbers.get(part, 0)
-    return table
 
 
 def _means(tally: PartTally, ours: str, theirs: str) -> dict[str, Any]:

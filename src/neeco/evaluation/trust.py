@@ -104,15 +104,12 @@ def estimate_trust(
     against = errors.label & ((errors.whole > errors.tissue) | unexplained)
     missed = errors.nearby & (errors.whole > typical.nearby)
     size = max(1, int(errors.label.sum()))
-    n_against, n_missed = (_count_without_single_pixels(votes) for votes in (against, missed))
-    return Trust((int(errors.label.sum()) - n_against) / (size + n_missed), n_against / size, n_missed / size)
-
-
-def _count_without_single_pixels(votes: np.ndarray) -> int:
-    """Return the number of pixels that a mask bool [H, W] has once it is opened by a cross of three by three pixels."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    eroded = cv2.erode(votes.astype(np.uint8), cross, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return cv2.countNonZero(cv2.dilate(eroded, cross))
+    opened = (
+        cv2.erode(v.astype(np.uint8), cross, borderType=cv2.BORDER_CONSTANT, borderValue=0) for v in (against, missed)
+    )
+    n_against, n_missed = (cv2.countNonZero(cv2.dilate(votes, cross)) for votes in opened)  # without single pixels
+    return Trust((int(errors.label.sum()) - n_against) / (size + n_missed), n_against / size, n_missed / size)
 
 
 def _errors(

@@ -77,9 +77,9 @@ def _inverted_masks(capture: Capture) -> list[str]:
     masked = [frame for frame in capture.frames if frame.mask_path is not None]
     points, hidden = measured_sample(capture.points), []
     for index in evenly_spaced(len(masked), BORDERS.max_frames, floor=True):
-        frame, mask = masked[index], masked[index].load_mask_pixels()
+        frame, mask = masked[index], masked[index].load_mask()
         assert mask is not None
-        hidden.append(measure_hidden(frame.load_pixels(), mask, frame.camera, points))
+        hidden.append(measure_hidden(frame.load_pixels(), mask.numpy(), frame.camera, points))
     fault = masks_fault(hidden)
     return [] if fault is None else [f"Warning: {fault[0]} {fault[1]}."]
 

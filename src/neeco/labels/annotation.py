@@ -167,12 +167,6 @@ def keypoint_names(scene: GaussianScene) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for points in keypoints for name in points))
 
 
-@torch.no_grad()
-def working_ends(scene: GaussianScene, state: State) -> dict[str, list[np.ndarray]]:
-    """Return pivots and tips [3] mm of every instrument for which the scene has any."""
-    return working_ends_of(keypoint_arrays(scene, state))
-
-
 def working_ends_of(keypoints: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, list[np.ndarray]]:
     """Return the pivots and tips [3] mm among keypoints, of every instrument that has any."""
     ends = {
@@ -183,8 +177,8 @@ def working_ends_of(keypoints: Mapping[str, Mapping[str, np.ndarray]]) -> dict[s
 
 
 def working_ends_or_origins(scene: GaussianScene, state: State) -> dict[str, list[np.ndarray]]:
-    """Return the `working_ends`; without any, every instrument's origin [3] mm."""
-    return working_ends(scene, state) or {
+    """Return the `working_ends_of` a scene; without any, every instrument's origin [3] mm."""
+    return working_ends_of(keypoint_arrays(scene, state)) or {
         name: [to_numpy(item.pose[:3, 3])] for name, item in scene.registered(state).instruments.items()
     }
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.geometry.camera import Camera
-from neeco.labels.labellers import Labeller, composited_parts, instruments_of, threshold_of
+from neeco.labels.labellers import Labeller, composited_labels, instruments_of, threshold_of
 from neeco.labels.settings import LABELS
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians, Layer, Rendering
@@ -71,7 +71,7 @@ class LayeredDrawing(Drawing):
 def draw(scene: DrawableScene, state: State, camera: Camera) -> Drawing:
     """Render `state` for a `camera` of any size and lens, with the scene's own labels where it has any."""
     rendering = scene.render(state, scene.recorded.as_learned(camera), labels=True)
-    parts = None if rendering.channels is None else composited_parts(rendering, threshold_of(scene)).cpu()
+    parts = None if rendering.channels is None else composited_labels(rendering, threshold_of(scene))[0].cpu()
     return Drawing(rendering.color.clamp(0, 1).cpu(), parts)
 
 
@@ -144,6 +144,7 @@ def surface_depth(rendering: Rendering | Layer) -> np.ndarray:
     return to_numpy(rendering.depth * (rendering.alpha > LABELS.surface_alpha))
 
 
+@torch.no_grad()
 def keypoint_arrays(scene: GaussianScene, state: State) -> dict[str, dict[str, np.ndarray]]:
     """Return the keypoints [3] mm, world frame, by instrument and name."""
     return {

@@ -39,11 +39,6 @@ def instruments_of(names: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(instrument for instrument, _ in names))
 
 
-def composited_parts(rendering: Rendering, threshold: float) -> Tensor:
-    """Return the part ids of `composited_labels`."""
-    return composited_labels(rendering, threshold)[0]
-
-
 def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, Tensor]:
     """Return part ids (uint8 [H, W]) and share of instrument ([H, W]) of an image rendered with label channels.
 
@@ -56,21 +51,14 @@ def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, T
             "labels: the image was rendered without label channels; render it with channels=scene.label_channels()"
         )
     channels = channels.detach()
-    share = _sum_of_columns(channels)
+    # PyTorch takes four times as long for a pixel's few numbers as for whole columns; up to 4 its order is the same
+    few = 0 < channels.shape[-1] <= 4
+    share = sum(channels.unbind(-1)[1:], start=channels[..., 0].clone()) if few else channels.sum(dim=-1)
     parts = torch.zeros(share.shape, dtype=torch.uint8, device=share.device)
     if channels.shape[-1] > 0:
         chosen = (share > threshold).flatten().nonzero()[:, 0]  # argmax is slow: of few pixels
         parts.view(-1)[chosen] = (channels.flatten(0, 1)[chosen].argmax(dim=-1) + 1).to(torch.uint8)
     return parts, share
-
-
-def _sum_of_columns(channels: Tensor) -> Tensor:
-    """Return the sum [H, W] of channels [H, W, L]. PyTorch takes four times as long for a pixel's few numbers as for
-    whole columns; up to 4 columns its order is the same."""
-    if not 0 < channels.shape[-1] <= 4:
-        return channels.sum(dim=-1)
-    first, *others = channels.unbind(-1)
-    return sum(others, start=first.clone())
 
 
 class CompositedLabels:

@@ -16,8 +16,8 @@ from torch import Tensor
 from neeco import __version__
 from neeco.base.errors import NeecoError
 from neeco.base.files import HALVES, finite, require_content, require_like, write_atomically
-from neeco.base.settings import plain
-from neeco.capture.documents import Node, RaisingReport
+from neeco.base.settings import faults_in, plain
+from neeco.capture.documents import Node
 from neeco.capture.model import SEPARATE_TISSUES, Camera, Instrument, InstrumentState, State, share_lamps
 from neeco.capture.readers import kinematics_of
 from neeco.capture.readers.cameras import parse_lens
@@ -29,10 +29,7 @@ from neeco.scene.method import Stored
 from neeco.scene.method_registry import current_name, method_class, method_settings, without_removed
 
 SCHEMA = "neeco-scene/2"
-OLD_SCHEMA = "neeco-scene/1"  # read as scenes without shadows, with readings relative to zero
 INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height", "near")  # of a recorded camera, in the order of the file
-# tensors of modules that OLD_SCHEMA lacks
-ADDED = {"shadow_offsets", "shadow_strengths", "shadow_width", "middle", "closed", "radius", "tips"}
 ADDED_SINCE = {"base_corrections", "anchors", "weights", "lengths"}  # that files of SCHEMA may lack: zero
 FORMER_ERROR_SCALE = "scale_of_state_errors"  # where diagnostics of version 0.3 have what is `error_scale` now
 MAX_REASON = 200  # characters of an error's message
@@ -84,7 +81,7 @@ def load_scene(path: Path) -> DrawableScene:
         raise NeecoError(f"{path}: not a readable neeco scene ({reason}); train again") from None
     if not isinstance(header, dict):
         raise NeecoError(f"{path}: not a readable neeco scene (its header is no object); train again")
-    if header.get("schema") not in (SCHEMA, OLD_SCHEMA):
+    if header.get("schema") != SCHEMA:
         raise NeecoError(f"{path}: schema {header.get('schema')!r}, this version reads {SCHEMA!r}; train again")
     if isinstance(tissues := header.get("tissues"), list) and len(tissues) > 1:
         raise NeecoError(f"{path}: tissues: a scene has one tissue, and this {len(tissues)}; {SEPARATE_TISSUES}")
@@ -163,8 +160,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Drawable
     )
     scene.diagnostics = header["diagnostics"]
     module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
-    may_lack = ADDED_SINCE | (ADDED if header.get("schema") == OLD_SCHEMA else set())
-    module = {n: t for n, t in scene.state_dict().items() if n.rsplit(".", 1)[-1] in may_lack} | module
+    module = {n: t for n, t in scene.state_dict().items() if n.rsplit(".", 1)[-1] in ADDED_SINCE} | module
     scene.load_state_dict(module)
     json.dumps(header, allow_nan=False)  # raises ValueError for NaN and infinity
     scene.requires_grad_(False)
@@ -199,7 +195,8 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
         pose = _pose(tensors["recorded.cameras"][index], f"camera in frame {index}")
         cameras.append(_camera(pose, dict(zip(INTRINSICS, map(_number, entry["intrinsics"]), strict=True))))
     names, splits = (tuple(entry[key] for entry in header["recorded"]) for key in ("name", "split"))
-    lens = None if "lens" not in header else parse_lens(Node(header["lens"], "header", "lens", RaisingReport()))
+    with faults_in("header"):
+        lens = parse_lens(Node(header["lens"], "header", "lens")) if "lens" in header else None
     scale = _number(header.get("scale", 1.0))
     if not 0 < scale <= 1:
         raise ValueError(f"its scale is {scale}, not a share of the images' size")

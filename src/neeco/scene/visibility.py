@@ -151,71 +151,41 @@ def outside_all_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
 def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> CanonicalGaussians:
     """Return canonical Gaussians with tissue (body 0) extrapolated by `max_distance` beyond the border of what
     `cameras` observed, in the mean depth and colour of its neighbourhood; unchanged without observed tissue."""
-    grid = _Grid(_middle_camera(cameras))
+    camera = _middle_camera(cameras)
+    cell = SETTINGS.cell * camera.width  # side of a cell, px; cells lie in its image and `grid_margin` to each side
+    extended = (1 + 2 * SETTINGS.grid_margin) / cell
+    shape = round(extended * camera.height), round(extended * camera.width)  # rows, columns
+    corner = canonical.means.new_tensor([camera.width, camera.height]) * -SETTINGS.grid_margin  # px
     rows = canonical.body(0)
     means, colors = canonical.means[rows], canonical.sh_dc[rows][:, 0]  # [T, 3] both
-    cells, depths = grid.cells(means)
-    weights = torch.sigmoid(canonical.opacity_logits[rows]).double() * grid.holds(cells)
-    weights *= (depths > grid.camera.near) & (count_views(means, cameras) >= SETTINGS.min_frame_share * len(cameras))
-    sums = grid.sums(cells, weights, torch.cat([1 / depths[:, None], colors], 1).double())  # [rows, columns, 1 + 4]
+    pixels, depths = project_world(means, camera)
+    cells = ((pixels - corner) / cell).floor().flip(1)  # [T, 2] row and column, also outside the grid
+    weights = torch.sigmoid(canonical.opacity_logits[rows]).double()
+    weights = weights * ((cells >= 0) & (cells < cells.new_tensor(shape))).all(1)
+    weights *= (depths > camera.near) & (count_views(means, cameras) >= SETTINGS.min_frame_share * len(cameras))
+    values = torch.cat([torch.ones_like(depths)[:, None], 1 / depths[:, None], colors], 1).double()  # [T, 1 + 4]
+    chosen = weights > 0
+    index = (cells[chosen] @ cells.new_tensor([shape[1], 1.0])).long()
+    weighted = weights[chosen, None] * values[chosen]
+    total = weighted.new_zeros(shape[0] * shape[1], values.shape[1]).index_add(0, index, weighted)
+    sums = total.reshape(*shape, -1).cpu().numpy()  # of weights and weighted values, by cell
     if not sums[..., 0].any():
         return canonical
     filled = torch.from_numpy(_filled(sums)).to(means)  # [rows, columns, 4] inverse depth, colour
-    positions = grid.positions(1 / filled[..., 0])  # [rows, columns, 3]
-    outside = outside_all_views(positions.reshape(-1, 3), cameras).reshape(positions.shape[:2]).cpu()
-    distance = distance_transform_edt(outside.numpy()) * grid.cell
-    chosen = outside & torch.from_numpy(distance < SETTINGS.max_distance * grid.camera.width)
-    points, colors = positions[chosen], filled[chosen][:, 1:]
-    added = seed_gaussians(points, colors, grid.spacing(points), opacity=SETTINGS.opacity)
-    return _append_tissue(canonical, replace(added, sh_dc=colors[:, None].clone()))
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """Cells of the middle camera's image, extended by `grid_margin` to each side."""
-
-    camera: Camera
-
-    @property
-    def cell(self) -> float:
-        """Side of a cell, px."""
-        return SETTINGS.cell * self.camera.width
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Number of rows and columns."""
-        extended = (1 + 2 * SETTINGS.grid_margin) / self.cell
-        return round(extended * self.camera.height), round(extended * self.camera.width)
-
-    def _corner(self, like: Tensor) -> Tensor:
-        return like.new_tensor([self.camera.width, self.camera.height]) * -SETTINGS.grid_margin
-
-    def cells(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (row, column) [P, 2] and depth [P] mm of points [P, 3] mm of the world, also outside the grid."""
-        pixels, depths = project_world(points, self.camera)
-        return ((pixels - self._corner(pixels)) / self.cell).floor().flip(1), depths
-
-    def holds(self, cells: Tensor) -> Tensor:
-        """Return which of the cells [P, 2] lie in the grid, [P] bool."""
-        return ((cells >= 0) & (cells < cells.new_tensor(self.shape))).all(1)
-
-    def sums(self, cells: Tensor, weights: Tensor, values: Tensor) -> np.ndarray:
-        """Return the sums of weights [P] and of weighted values [P, V] per cell, [rows, columns, 1 + V] float64."""
-        rows, columns = self.shape
-        chosen = weights > 0
-        index = (cells[chosen] @ cells.new_tensor([columns, 1.0])).long()
-        weighted = weights[chosen, None] * torch.cat([torch.ones_like(values[:, :1]), values], 1)[chosen]
-        total = weighted.new_zeros(rows * columns, weighted.shape[1]).index_add(0, index, weighted)
-        return total.reshape(rows, columns, -1).cpu().numpy()
-
-    def positions(self, depths: Tensor) -> Tensor:
-        """Return points [rows, columns, 3] mm of the world behind the cells' centres, at depths [rows, columns] mm."""
-        pixels = pixel_centers(*self.shape).to(depths) * self.cell + self._corner(depths)
-        return unproject_world(pixels, SETTINGS.depth_factor * depths, self.camera)
-
-    def spacing(self, points: Tensor) -> Tensor:
-        """Return the standard deviation [P] mm of Gaussians at points [P, 3] mm of the world that fill their cells."""
-        return SETTINGS.cell_sd * self.cell * project_world(points, self.camera)[1] / self.camera.fx
+    centers = pixel_centers(*shape).to(filled) * cell + corner
+    positions = unproject_world(centers, SETTINGS.depth_factor * (1 / filled[..., 0]), camera)  # [rows, columns, 3]
+    outside = outside_all_views(positions.reshape(-1, 3), cameras).reshape(shape).cpu()
+    distance = distance_transform_edt(outside.numpy()) * cell
+    added_cells = outside & torch.from_numpy(distance < SETTINGS.max_distance * camera.width)
+    points, colors = positions[added_cells], filled[added_cells][:, 1:]
+    spacing = SETTINGS.cell_sd * cell * project_world(points, camera)[1] / camera.fx  # mm, which fills the cells
+    added = replace(seed_gaussians(points, colors, spacing, opacity=SETTINGS.opacity), sh_dc=colors[:, None].clone())
+    marked = canonical.with_extras(**{EXTRAPOLATED: canonical.means.new_zeros(len(canonical))})
+    blank = {name: tensor.new_zeros(len(added), *tensor.shape[1:]) for name, tensor in marked.extras.items()}
+    added = added.with_extras(**(blank | {EXTRAPOLATED: added.means.new_ones(len(added))}))
+    split, new = canonical.counts[0], added.tensors()  # at the end of body 0
+    joined = {n: torch.cat([tensor[:split], new[n], tensor[split:]]) for n, tensor in marked.tensors().items()}
+    return CanonicalGaussians.from_tensors(joined, (split + len(added), *canonical.counts[1:]))
 
 
 def _middle_camera(cameras: Sequence[Camera]) -> Camera:
@@ -242,13 +212,3 @@ def _filled(sums: np.ndarray) -> np.ndarray:
     mean = sums.sum((0, 1))
     means[left] = mean[1:] / mean[0]
     return gaussian_filter(means, (2.0, 2.0, 0), mode="nearest")
-
-
-def _append_tissue(canonical: CanonicalGaussians, added: CanonicalGaussians) -> CanonicalGaussians:
-    """Return `canonical` with `added` at the end of body 0, marked as extrapolated."""
-    marked = canonical.with_extras(**{EXTRAPOLATED: canonical.means.new_zeros(len(canonical))})
-    blank = {name: tensor.new_zeros(len(added), *tensor.shape[1:]) for name, tensor in marked.extras.items()}
-    added = added.with_extras(**(blank | {EXTRAPOLATED: added.means.new_ones(len(added))}))
-    split, new = canonical.counts[0], added.tensors()
-    joined = {n: torch.cat([tensor[:split], new[n], tensor[split:]]) for n, tensor in marked.tensors().items()}
-    return CanonicalGaussians.from_tensors(joined, (split + len(added), *canonical.counts[1:]))

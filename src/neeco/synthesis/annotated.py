@@ -24,7 +24,7 @@ from neeco.evaluation.trust import Trust, TypicalErrors, estimate_trust, typical
 from neeco.evidence.foreground import Comparison, Foreground
 from neeco.evidence.label_quality import QUALITY, label_counts, learned_foreground, quality_of
 from neeco.geometry.distortion import field_pinhole
-from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
+from neeco.labels.annotation import OUTSIDE, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, Labeller, instruments_of
 from neeco.raster.resampling import of_rendered_size, resampled
@@ -87,7 +87,12 @@ def annotate_capture(
     trained_on = run.capture()
     source = scene.recorded.completed(capture, scene.instruments) if capture else scene.recorded.as_fitted(trained_on)
     capture = trained_on if capture is None else source
-    _check_instruments(scene, capture)
+    place, joints = f"{capture.root}: instruments", {item.name: set(item.joints) for item in capture.instruments}
+    for name, learned in ((item.name, set(item.joints)) for item in scene.instruments):
+        if name not in joints:
+            raise NeecoError(f"{place}: the scene learned {name!r}, here are: {', '.join(joints) or 'none'}")
+        if missing := learned - joints[name]:
+            raise NeecoError(f"{place}: {name}: no joint {min(missing)!r}, which the scene learned")
     settings = {"annotates": os.path.abspath(capture.root), "frames": len(capture.frames), "min_trust": min_trust}
     settings["captures_sha256"] = [fingerprint(recorded) for recorded in (capture, trained_on)]
     check_formats(formats, images)
@@ -108,8 +113,13 @@ def annotate_capture(
         class_names=parse_class_names(class_names, instruments_of(labeller.names)),
     )
     with folder.being_written() as records:
-        typical = typical_errors(scene, labeller, trained_on)
-        foreground = learned_foreground(scene, trained_on.split("train"))
+        train, drawings = trained_on.split("train"), []
+        for k in range(min(N_REFERENCE_FRAMES, len(train))):
+            frame = train[round(k * (len(train) - 1) / (N_REFERENCE_FRAMES - 1))]
+            shown = frame.load_image()
+            drawings.append((fitted(scene, labeller, frame, shown, None)[1], shown, frame.load_mask()))
+        typical = typical_errors_of(drawings)
+        foreground = learned_foreground(scene, train)
         info["usual_errors"] = asdict(typical)
         annotator = _Annotator(folder, typical, foreground, min_trust, images, cameras)
         start: Tensor | None = None  # each fit starts from that of the frame before it in time
@@ -159,8 +169,13 @@ class _Annotator:
             return skipped_sample(index, {NOT_TRUSTED: 1}, facts).write(output)
         drawing, missing = self._as_written(drawing, image)
         labels = annotate(scene, drawing, names)
-        if missing is not None:
-            labels = [_without_keypoints_in(missing, label) for label in labels]
+        if missing is not None:  # no keypoint is in pixels that show nothing
+            for k, label in enumerate(labels):
+                points = {
+                    name: Keypoint(0.0, 0.0, OUTSIDE) if p.visibility and missing[int(p.y), int(p.x)] else p
+                    for name, p in label.keypoints.items()
+                }
+                labels[k] = replace(label, keypoints=points)
         plain, quality = labels_of(scene, drawing, labels), self.images.jpeg_quality
         return encoded_sample(index, drawing, plain, facts=facts, quality=quality).write(output)
 
@@ -205,15 +220,6 @@ class _Annotator:
         return fit, drawing, trust
 
 
-def _without_keypoints_in(missing: Tensor, label: InstrumentLabel) -> InstrumentLabel:
-    """The label without the keypoints in pixels that show nothing, bool [H, W]."""
-    keypoints = {
-        name: Keypoint(0.0, 0.0, OUTSIDE) if point.visibility and missing[int(point.y), int(point.x)] else point
-        for name, point in label.keypoints.items()
-    }
-    return replace(label, keypoints=keypoints)
-
-
 def fitted(
     scene: GaussianScene, labeller: Labeller, frame: Frame, image: Tensor, start: Tensor | None
 ) -> tuple[AlignedFrame, LayeredDrawing]:
@@ -222,24 +228,3 @@ def fitted(
     near = start is not None and not scene.recorded.error_scale  # errors as large differ between neighbours
     fit = align_frame(scene, frame, image, start, FROM_NEIGHBOUR if near else None)
     return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.min_component, tissue_image=True)
-
-
-def typical_errors(scene: GaussianScene, labeller: Labeller, trained_on: Capture) -> TypicalErrors:
-    """The scene's errors on the frames that it was trained on."""
-    frames = trained_on.split("train")
-    drawings = []
-    for k in range(min(N_REFERENCE_FRAMES, len(frames))):
-        frame = frames[round(k * (len(frames) - 1) / (N_REFERENCE_FRAMES - 1))]
-        image = frame.load_image()
-        drawings.append((fitted(scene, labeller, frame, image, None)[1], image, frame.load_mask()))
-    return typical_errors_of(drawings)
-
-
-def _check_instruments(scene: GaussianScene, capture: Capture) -> None:
-    """Raises NeecoError unless every frame states the poses and joints of the scene's instruments."""
-    place, joints = f"{capture.root}: instruments", {item.name: set(item.joints) for item in capture.instruments}
-    for name, learned in ((item.name, set(item.joints)) for item in scene.instruments):
-        if name not in joints:
-            raise NeecoError(f"{place}: the scene learned {name!r}, here are: {', '.join(joints) or 'none'}")
-        if missing := learned - joints[name]:
-            raise NeecoError(f"{place}: {name}: no joint {min(missing)!r}, which the scene learned")

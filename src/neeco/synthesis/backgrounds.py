@@ -145,9 +145,6 @@ class Appearance:
         return replace(layers, instruments=torch.from_numpy((alone * share).astype(np.float32))).over(self.background)
 
 
-AS_RECORDED = Appearance()
-
-
 @dataclass(frozen=True)
 class Appearances:
     """The appearances of a data set."""

@@ -20,12 +20,13 @@ from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import parse_yaml, read_text
-from neeco.capture.documents import as_float
+from neeco.base.settings import faults_in
+from neeco.capture.documents import Node, as_float
 from neeco.capture.model import InstrumentState, State
 from neeco.geometry.camera import Camera
 from neeco.geometry.rotations import rigid
-from neeco.labels.annotation import place_in_image, working_ends
-from neeco.labels.drawing import LayeredDrawing, to_numpy
+from neeco.labels.annotation import place_in_image, working_ends_of
+from neeco.labels.drawing import LayeredDrawing, keypoint_arrays, to_numpy
 from neeco.scene import GaussianScene, Recorded
 from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
 
@@ -119,29 +120,29 @@ def read_effects(path: Path) -> CameraEffects:
     soft = lines.pop(SOFT_MASKS, "mid")
     if soft not in ("mid", "mean"):
         raise NeecoError(f"{path}: {SOFT_MASKS}: {soft!r} is neither mid nor mean")
-    unknown = sorted(set(map(str, lines)) - set(EFFECTS))
-    if unknown:
+    if unknown := sorted(set(map(str, lines)) - set(EFFECTS)):
         raise NeecoError(f"{path}: {unknown[0]}: no such effect; there are {', '.join([*EFFECTS, SOFT_MASKS])}")
-    return CameraEffects({name: _range(value, EFFECTS[name], f"{path}: {name}") for name, value in lines.items()}, soft)
+    with faults_in(path):
+        return CameraEffects(
+            {name: _range(Node(value, field=name), EFFECTS[name]) for name, value in lines.items()}, soft
+        )
 
 
-def _range(value: Any, effect: Effect, where: str) -> Range:
-    share: Any = 1.0
+def _range(node: Node, effect: Effect) -> Range:
+    value, share = node.value, 1.0
     if isinstance(value, dict):
         if not set(value) <= {"range", "share"} or "range" not in value:
-            raise NeecoError(f"{where}: give a number, [LOW, HIGH], or {{range: [LOW, HIGH], share: S}}")
-        value, share = value["range"], value.get("share", 1.0)
-    ends = value if isinstance(value, list) else [value, value]
-    numbers = [number for number in map(as_float, (*ends, share)) if number is not None]
-    if len(ends) != 2 or len(numbers) != 3:
-        raise NeecoError(f"{where}: {value!r} is no range; give a number or [LOW, HIGH]")
-    low, high, share = numbers
-    if not effect.lowest <= low <= high <= effect.highest:
+            node.fail("give a number, [LOW, HIGH], or {range: [LOW, HIGH], share: S}")
+        value, share = value["range"], node.given("share", Node.number, 1.0)
+    ends = [as_float(end) for end in (value if isinstance(value, list) else [value, value])]
+    if len(ends) != 2 or ends[0] is None or ends[1] is None:
+        node.fail(f"{value!r} is no range; give a number or [LOW, HIGH]")
+    if not effect.lowest <= ends[0] <= ends[1] <= effect.highest:
         limits = f"{effect.lowest:g} to {effect.highest:g} ({effect.meaning})"
-        raise NeecoError(f"{where}: {value} is out of range; give LOW <= HIGH within {limits}")
+        node.fail(f"{value} is out of range; give LOW <= HIGH within {limits}")
     if not 0 <= share <= 1:
-        raise NeecoError(f"{where}: share: {share:g} is not a share of the images; give 0 to 1")
-    return Range(low, high, share)
+        node.fail(f"share: {share:g} is not a share of the images; give 0 to 1")
+    return Range(ends[0], ends[1], share)
 
 
 def srgb_to_linear(image: np.ndarray) -> np.ndarray:
@@ -171,7 +172,12 @@ def apply_effects(image: np.ndarray, depth: np.ndarray, values: Mapping[str, flo
     if not set(values) - {"shutter_s", "smoke_grey"}:
         return image
     height, width = depth.shape
-    light = _smoked(srgb_to_linear(image), depth, values)
+    light = srgb_to_linear(image)
+    if (density := values.get("smoke", 0.0)) > 0:  # homogeneous (Beer-Lambert): it attenuates light, and has its own
+        far = np.where(depth > 0, depth, depth.max(initial=SMOKE_MM))
+        transmission = ((1 - density) ** (far / SMOKE_MM)).astype(np.float32)[..., None]
+        smoke = srgb_to_linear(np.full(3, values.get("smoke_grey", SETTINGS.smoke_grey)))
+        light = light * transmission + smoke * (1 - transmission)
     if values.get("lens_blur_px", 0) > 0:
         light = cv2.GaussianBlur(light, (0, 0), values["lens_blur_px"])
     if values.get("vignette", 0) > 0:
@@ -180,8 +186,18 @@ def apply_effects(image: np.ndarray, depth: np.ndarray, values: Mapping[str, flo
         light = light * image_circle(height, width, values["field_of_view"])[..., None]
     gains = [values.get("red_gain", 1.0), 1.0, values.get("blue_gain", 1.0)]
     light = light * np.float32(2 ** values.get("exposure_stops", 0.0) * np.array(gains))
-    stored = linear_to_srgb(_noisy(light, values, rng)) ** np.float32(values.get("gamma", 1.0))
-    return _jpeg_compressed(stored, values["jpeg_quality"]) if "jpeg_quality" in values else stored
+    shot, read = values.get("shot_noise", 0.0), values.get("read_noise", 0.0)
+    if shot or read:  # both normally distributed (Poisson-Gaussian noise of many photons)
+        deviation = np.sqrt(shot**2 * np.clip(light, 0, 1) + read**2)
+        light = light + (deviation * rng.standard_normal(light.shape)).astype(np.float32)
+    stored = linear_to_srgb(light) ** np.float32(values.get("gamma", 1.0))
+    if "jpeg_quality" not in values:
+        return stored
+    pixels = np.round(stored[..., ::-1] * 255).astype(np.uint8)
+    code = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, round(values["jpeg_quality"])])[1]
+    decoded = cv2.imdecode(code, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return decoded[..., ::-1].astype(np.float32) / 255
 
 
 def image_circle(height: int, width: int, radius: float) -> np.ndarray:
@@ -194,34 +210,6 @@ def _distance_from_centre(height: int, width: int) -> np.ndarray:
     """[H, W] distance from the image's centre, 1 in the corners."""
     y, x = np.mgrid[0:height, 0:width].astype(np.float32) + np.float32(0.5)
     return np.hypot(x - width / 2, y - height / 2) / (np.hypot(height, width) / 2)
-
-
-def _smoked(light: np.ndarray, depth: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
-    """Homogeneous smoke (Beer-Lambert): light from far away is attenuated and replaced by the smoke's own."""
-    density = values.get("smoke", 0.0)
-    if density <= 0:
-        return light
-    far = np.where(depth > 0, depth, depth.max(initial=SMOKE_MM))
-    transmission = ((1 - density) ** (far / SMOKE_MM)).astype(np.float32)[..., None]
-    grey = srgb_to_linear(np.full(3, values.get("smoke_grey", SETTINGS.smoke_grey)))
-    return light * transmission + grey * (1 - transmission)
-
-
-def _noisy(light: np.ndarray, values: Mapping[str, float], rng: Generator) -> np.ndarray:
-    """Shot and read noise, both normally distributed (Poisson-Gaussian noise of many photons)."""
-    shot, read = values.get("shot_noise", 0.0), values.get("read_noise", 0.0)
-    if shot == read == 0:
-        return light
-    deviation = np.sqrt(shot**2 * np.clip(light, 0, 1) + read**2)
-    return light + (deviation * rng.standard_normal(light.shape)).astype(np.float32)
-
-
-def _jpeg_compressed(stored: np.ndarray, quality: float) -> np.ndarray:
-    pixels = np.round(stored[..., ::-1] * 255).astype(np.uint8)
-    _, code = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, round(quality)])
-    decoded = cv2.imdecode(code, cv2.IMREAD_COLOR)
-    assert decoded is not None
-    return decoded[..., ::-1].astype(np.float32) / 255
 
 
 @dataclass(frozen=True)
@@ -287,7 +275,7 @@ def subframes(
     places = []  # where working ends and places on the tissue are in the image, at the start and at the end
     for side in (-1, 1):
         state, camera = motion.advanced(drawing.state, drawing.camera, side * shutter_s / 2)
-        points = [point for ends in working_ends(scene, state).values() for point in ends]
+        points = [point for ends in working_ends_of(keypoint_arrays(scene, state)).values() for point in ends]
         points += list(surface_points(drawing.tissue_depth, drawing.camera, SETTINGS.tissue_step_px))
         places.append([place_in_image(point, camera) for point in points])
     moved = [np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in zip(*places, strict=True) if a and b]

@@ -5,19 +5,24 @@ from __future__ import annotations
 
 import math
 import shlex
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import cv2
+import matplotlib
 import numpy as np
 import yaml
-from PIL import Image, ImageDraw, ImageFont
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Polygon, Rectangle
 
 from neeco.base.files import write_atomically, write_text
 from neeco.capture.images import open_image
 from neeco.capture.model import evenly_spaced
-from neeco.evaluation.image_metrics import PART_COLORS, outline, part_color
+from neeco.evaluation.image_metrics import overlay_parts, part_color
 from neeco.labels.annotation import OCCLUDED
 from neeco.synthesis.settings import ImageSettings, Settings
 from neeco.synthesis.writers.folder import Record, split_of, stem
@@ -157,122 +162,85 @@ def _command(info: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class PreviewSettings:
-    """Layout of preview.png: sizes in px, colours of 255."""
+    """Layout of preview.png, px, and colours of labels over its images."""
 
-    tiles: int = 8
+    images: int = 8
     columns: int = 2
-    tile_width: int = 360
-    gap: int = 14
-    caption_line: int = 17
-    caption_fonts: tuple[int, int] = (13, 12)  # px
-    label_column: int = 210
-    tint: float = 0.42  # opacity of a part's colour over the image
-    paper: tuple[int, int, int] = (250, 250, 248)
-    ink: tuple[int, int, int] = (30, 32, 36)
-    faint: tuple[int, int, int] = (120, 124, 130)
-    box: tuple[int, int, int] = (255, 255, 255)
-    rectangle: tuple[int, int, int] = (255, 209, 70)
-    bone: tuple[int, int, int] = (20, 22, 26)
-    hidden: tuple[int, int, int] = (150, 150, 150)
-
-    @property
-    def pair_width(self) -> int:
-        """Width of the plain image and the same with its labels."""
-        return 2 * self.tile_width + 4
+    width: int = 360  # of an image
+    gap: int = 6
+    line: int = 13  # height of a caption's line
+    characters: int = 60  # of a line
+    legend: int = 64  # height
+    dpi: int = 100
+    font: int = 7  # points
+    box: str = "white"
+    rectangle: str = "gold"
+    bone: str = "black"
+    hidden: str = "silver"
 
 
 PREVIEW = PreviewSettings()
-Color = str | tuple[int, int, int]
 Pairs = Sequence[tuple[str, str]]  # instrument and part by part id, from 1; keypoints that a bone joins
 
 
 def write_preview(root: Path, records: Sequence[Record], names: Pairs, bones: Pairs) -> None:
-    """Write preview.png: up to 8 images spread over the data set, each plain and with parts, boxes and keypoints."""
-    tiles = [draw_tile(root, records[k], bones) for k in evenly_spaced(len(records), PREVIEW.tiles, floor=True)]
-    columns = min(PREVIEW.columns, len(tiles))
-    rows = -(-len(tiles) // columns)
-    height = max(tile.height for tile in tiles)
-    gap, wide = PREVIEW.gap, PREVIEW.pair_width + PREVIEW.gap
-    legend_rows = -(-(len(names) + 3) // max(columns * wide // PREVIEW.label_column, 1))
-    header = 26 * legend_rows + gap
-    sheet = Image.new("RGB", (gap + columns * wide, header + gap + rows * (height + gap)), PREVIEW.paper)
-    _legend(ImageDraw.Draw(sheet), names, sheet.width)
-    for k, tile in enumerate(tiles):
+    """Write preview.png: `preview_figure` of images spread over the data set."""
+    chosen = [records[k] for k in evenly_spaced(len(records), PREVIEW.images, floor=True)]
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        figure = preview_figure(root, chosen, names, bones)
+        how: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 1}}
+        write_atomically(root / "preview.png", lambda temporary: figure.savefig(temporary, **how))
+
+
+def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: Pairs = ()) -> Figure:
+    """Draw images, each plain and with parts, boxes and keypoints, which `bones` join."""
+    captions = [[textwrap.wrap(text, PREVIEW.characters) for text in _captions(record)] for record in records]
+    columns, wide = min(PREVIEW.columns, len(records)), PREVIEW.width
+    high = round(wide * records[0]["height"] / records[0]["width"])
+    above = PREVIEW.line * max(len(lines) for pair in captions for lines in pair) + PREVIEW.gap
+    rows = -(-len(records) // columns)
+    sheet = np.full((PREVIEW.legend + rows * (above + high), 2 * columns * (wide + PREVIEW.gap), 3), 255, np.uint8)
+    figure = Figure((sheet.shape[1] / PREVIEW.dpi, sheet.shape[0] / PREVIEW.dpi), dpi=PREVIEW.dpi)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.axis("off")
+    for k, record in enumerate(records):
         row, column = divmod(k, columns)
-        sheet.paste(tile, (gap + column * wide, header + gap + row * (height + gap)))
-    write_atomically(root / "preview.png", lambda temporary: sheet.save(temporary, format="PNG", compress_level=1))
+        pixels = np.asarray(open_image(root / record["image"]).convert("RGB"))
+        parts = np.asarray(open_image(root / "parts" / f"{stem(record['index'])}.png"))
+        y = PREVIEW.legend + row * (above + high) + above
+        for side, image in enumerate((pixels, overlay_parts(pixels / 255, parts))):
+            x = (2 * column + side) * (wide + PREVIEW.gap)
+            sheet[y : y + high, x : x + wide] = cv2.resize(image, (wide, high), interpolation=cv2.INTER_AREA)
+            axes.text(x, y - 4, "\n".join(captions[k][side]), fontsize=PREVIEW.font)
+        for label in record["labels"]:
+            _draw_label(axes, label, bones, np.array([x, y]), wide / record["width"])
+    axes.imshow(sheet)
+    keys = [Patch(color=part_color(number), label=" ".join(name)) for number, name in enumerate(names, 1)]
+    keys += [Patch(fill=False, color=PREVIEW.rectangle, label="minimum-area box")]
+    keys += [Patch(color=PREVIEW.hidden, label="keypoint occluded")]
+    axes.legend(handles=keys, loc="upper left", ncols=4, fontsize=PREVIEW.font)
+    return figure
 
 
-def draw_tile(root: Path, record: Record, bones: Pairs = ()) -> Image.Image:
-    """Return one image, beside it the same with its labels, and a caption below; `bones` join keypoints."""
-    pixels = np.asarray(open_image(root / record["image"]).convert("RGB"), dtype=float)
-    parts = np.asarray(open_image(root / "parts" / f"{stem(record['index'])}.png"))
-    scale = PREVIEW.tile_width / pixels.shape[1]
-    size = (PREVIEW.tile_width, round(pixels.shape[0] * scale))
-    image = np.asarray(Image.fromarray(pixels.astype(np.uint8)).resize(size, Image.Resampling.LANCZOS), dtype=float)
-    ids = np.asarray(Image.fromarray(parts).resize(size, Image.Resampling.NEAREST))
-    tinted = Image.fromarray(_tinted(image, ids).round().astype(np.uint8))
-    canvas = ImageDraw.Draw(tinted)
-    for label in record["labels"]:
-        _draw_label(canvas, label, bones, scale)
-    fonts, width = PREVIEW.caption_fonts, PREVIEW.pair_width
-    first, second = (wrap(items, width, font) for items, font in zip(_caption(record), fonts, strict=True))
-    height = size[1] + 6 + PREVIEW.caption_line * (len(first) + len(second))
-    tile = Image.new("RGB", (width, height), PREVIEW.paper)
-    tile.paste(Image.fromarray(image.astype(np.uint8)))
-    tile.paste(tinted, (width - size[0], 0))
-    text = ImageDraw.Draw(tile)
-    lines = [(line, PREVIEW.ink, fonts[0]) for line in first] + [(line, PREVIEW.faint, fonts[1]) for line in second]
-    for k, (line, color, font) in enumerate(lines):
-        text.text((0, size[1] + 5 + PREVIEW.caption_line * k), line, color, ImageFont.load_default(font))
-    return tile
-
-
-def wrap(items: Sequence[str], width: float, font: int) -> list[str]:
-    """`items` joined by dots, in as few lines of at most `width` px as their order allows; an item is never broken."""
-    lines: list[str] = []
-    for item in items:
-        longer = f"{lines[-1]} · {item}" if lines else item
-        if lines and ImageFont.load_default(font).getlength(longer) <= width:
-            lines[-1] = longer
-        else:
-            lines.append(item)
-    return lines
-
-
-def _tinted(image: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    colors = np.concatenate([np.zeros((1, 3)), PART_COLORS[np.arange(max(int(ids.max()), 1)) % len(PART_COLORS)]])[ids]
-    inside = ids > 0
-    tinted = np.where(inside[..., None], (1 - PREVIEW.tint) * image + PREVIEW.tint * colors, image)
-    return np.where(outline(inside)[..., None], colors, tinted)
-
-
-def _draw_label(canvas: ImageDraw.ImageDraw, label: dict[str, Any], bones: Pairs, scale: float) -> None:
+def _draw_label(axes: Axes, label: dict[str, Any], bones: Pairs, corner: np.ndarray, scale: float) -> None:
+    """Draw a label over its image, whose upper left corner [2] px is there, `scale` times its size."""
     if label["area"] > 0:
         x, y, width, height = (value * scale for value in label["box"])
-        canvas.rectangle((x, y, x + width - 1, y + height - 1), outline=PREVIEW.box)
-        corners = [(px * scale, py * scale) for px, py in label["rectangle"]]
-        canvas.line([*corners, corners[0]], fill=PREVIEW.rectangle, width=2)
-        draw_name(canvas, x, y, label["name"])
-    points = {name: (x * scale, y * scale, v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
-    for start, end in (bone for bone in bones if points.keys() >= {*bone}):
-        canvas.line([points[start][:2], points[end][:2]], fill=PREVIEW.bone, width=2)
-    for x, y, visibility in points.values():
-        fill = PREVIEW.hidden if visibility == OCCLUDED else PREVIEW.box
-        canvas.ellipse((x - 4, y - 4, x + 4, y + 4), fill=fill, outline=PREVIEW.bone, width=2)
+        x, y = x + corner[0], y + corner[1]
+        axes.add_patch(Rectangle((x, y), width, height, fill=False, color=PREVIEW.box))
+        axes.add_patch(Polygon(corner + scale * np.array(label["rectangle"]), fill=False, color=PREVIEW.rectangle))
+        axes.text(x, y, label["name"], fontsize=PREVIEW.font, backgroundcolor=PREVIEW.box)
+    points = {name: (corner + scale * np.array([x, y]), v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
+    for a, b in (bone for bone in bones if {*bone} <= points.keys()):
+        axes.plot(*np.stack([points[a][0], points[b][0]], 1), color=PREVIEW.bone)
+    for (x, y), visibility in points.values():
+        color = PREVIEW.hidden if visibility == OCCLUDED else PREVIEW.box
+        axes.plot(x, y, "o", color=color, markeredgecolor=PREVIEW.bone)
 
 
-def draw_name(canvas: ImageDraw.ImageDraw, x: float, y: float, text: str) -> None:
-    """Draw a name above its box, or inside it where there is no room above; never beyond the tile's right edge."""
-    font = ImageFont.load_default(11)
-    width = canvas.textlength(text, font=font) + 8
-    left, top = min(x, PREVIEW.tile_width - width), y - 16 if y >= 16 else y
-    canvas.rectangle((left, top, left + width, top + 15), fill=PREVIEW.box)
-    canvas.text((left + 4, top + 1), text, PREVIEW.ink, font)
-
-
-def _caption(record: Record) -> tuple[list[str], list[str]]:
-    """Return two lines: the image with its joint values, and the visible share of each instrument."""
+def _captions(record: Record) -> tuple[str, str]:
+    """Return those of the plain image, its joint values, and of the labelled one, the instruments' visible shares."""
     joints = [
         f"{joint.removesuffix('_mm')} {value:.1f} mm"
         if joint.endswith("_mm")
@@ -281,19 +249,4 @@ def _caption(record: Record) -> tuple[list[str], list[str]]:
         for joint, value in instrument["joints"].items()
     ]
     seen = [f"{label['name']} {label['visibility']:.0%} seen" for label in record["labels"]]
-    return [f"{record['index']:06d}", record["split"], *joints], seen
-
-
-def _legend(canvas: ImageDraw.ImageDraw, names: Pairs, width: int) -> None:
-    entries: list[tuple[str, Color]] = [(" ".join(name), part_color(number)) for number, name in enumerate(names, 1)]
-    entries += [("minimum-area box", PREVIEW.rectangle), ("keypoint seen", PREVIEW.box)]
-    entries += [("keypoint occluded", PREVIEW.hidden)]
-    columns = max((width - PREVIEW.gap) // PREVIEW.label_column, 1)
-    for k, (text, color) in enumerate(entries):
-        row, column = divmod(k, columns)
-        x, y = PREVIEW.gap + column * PREVIEW.label_column, PREVIEW.gap + 26 * row
-        if "keypoint" in text:
-            canvas.ellipse((x + 2, y + 2, x + 14, y + 14), fill=color, outline=PREVIEW.bone, width=2)
-        else:
-            canvas.rectangle((x, y, x + 16, y + 16), fill=color)
-        canvas.text((x + 24, y + 1), text, PREVIEW.ink, ImageFont.load_default(13))
+    return " · ".join([f"{record['index']:06d}", record["split"], *joints]), " · ".join(seen)

@@ -32,12 +32,11 @@ from neeco.synthesis.generator import (
     ENTERS_TISSUE,
     LEAVES_IMAGE,
     UNOBSERVED_TISSUE,
-    GeneratorSpec,
     SampleGenerator,
-    draw_to_folder,
+    draw_encoded,
     format_counts,
 )
-from neeco.synthesis.parallel import draw_in_workers
+from neeco.synthesis.parallel import GeneratorSpec, draw_in_workers
 from neeco.synthesis.samplers import SAMPLING, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
 from neeco.synthesis.writers import Writer, WrittenImages
@@ -138,13 +137,13 @@ def synthesize(
         missing, made = [k for k in range(settings.count) if k not in records], 0
         processes = min(workers, len(missing))
         if missing and (processes > 1 or address()):
-            scene_file, *others = (Path(each.path) / SCENE_FILE for each in runs)
+            scenes = tuple(Path(each.path) / SCENE_FILE for each in runs)
             # workers need not find the tolerance again
             resolved = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
-            spec = GeneratorSpec(scene_file, resolved, str(scene.center.device), tuple(others))
+            spec = GeneratorSpec(scenes, resolved, str(scene.center.device))
             rendered = draw_in_workers(spec, output, missing, processes)
         else:
-            rendered = (draw_to_folder(generator, output, index) for index in missing)
+            rendered = (draw_encoded(generator, index).write(output) for index in missing)
         for record in rendered:
             records[record["index"]] = record
             made += not record.get("skipped")
@@ -191,9 +190,8 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
     if not isinstance(begun.get("settings"), dict):
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
     settings = begun["settings"]
-    compared = [(key, begun.get(key), description[key]) for key in ("schema", "version", "scene_sha256")]
-    # a version that wrote neither of these folders named neither: all its images are rendered anew
-    compared += [(key, begun[key], description[key]) for key in ("soft", "ignore") if begun.get(key) is not None]
+    keys = ("schema", "version", "scene_sha256", "soft", "ignore")
+    compared = [(key, begun.get(key), description[key]) for key in keys]
     compared += [(f"settings.{key}", settings.get(key), value) for key, value in description["settings"].items()]
     require_same(str(output / INFO), compared)
     return True
@@ -243,23 +241,21 @@ class DataSetFolder:
     def _stored(self) -> dict[int, Record]:
         return {k: record for k in range(self.count) if (record := load_record(self.output, k)) is not None}
 
-    def _with_classes(self, record: Record) -> Record:
-        """The record with its labels named by class, and their instruments as `instrument`."""
-        names = ((label, label["name"]) for label in record["labels"])
-        labels = [label | {"name": self.class_names.get(name, name), "instrument": name} for label, name in names]
-        return record | {"labels": labels}
-
     def _write_indexes(self, records: list[Record], complete: bool) -> None:
         """(Re)write everything that is about the whole data set, from the records."""
         output, names, images = self.output, self.labeller.names, with_image(records)
         keypoints = keypoint_names(self.scene)
+
+        def with_class(label: dict[str, Any]) -> dict[str, Any]:
+            return label | {"name": self.class_names.get(label["name"], label["name"]), "instrument": label["name"]}
+
         write_states(output, images)
         # formats of earlier starts, too: their index files would else lack the images made now
         formats = [*self.formats, *(name for name in format_names() if name not in self.formats)]
         formats = [name for name in formats if name in self.formats or (output / name).is_dir()]
         written = WrittenImages(
             root=output,
-            records=[self._with_classes(record) for record in images],
+            records=[record | {"labels": [*map(with_class, record["labels"])]} for record in images],
             part_names=tuple(dict.fromkeys((self.class_names.get(owner, owner), part) for owner, part in names)),
             keypoint_names=keypoints,
             bones=self.scene.skeleton(),

@@ -25,10 +25,8 @@ from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, pla
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.labels.settings import LABELS
-from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.scene import GaussianScene
-from neeco.scene.io import load_gaussians
-from neeco.synthesis.backgrounds import ALL_AS_RECORDED, AS_RECORDED, Appearance, Appearances, split
+from neeco.synthesis.backgrounds import ALL_AS_RECORDED, Appearance, Appearances, split
 from neeco.synthesis.camera_effects import (
     CameraEffects,
     RecordedMotion,
@@ -42,9 +40,8 @@ from neeco.synthesis.contact import labels_of
 from neeco.synthesis.mixing import MixedSampler, Mixture
 from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.writers.folder import Encoded, Record, encoded_sample, skipped_sample
+from neeco.synthesis.writers.folder import Encoded, encoded_sample, skipped_sample
 
-VERB = "synthesize"
 # of an image's random numbers: camera effects and appearances do not change which state and view are sampled
 EFFECTS_STREAM, APPEARANCE_STREAM = 1, 2
 
@@ -119,8 +116,13 @@ class Acceptance:
         labelled = drawing.parts.numpy() > 0
         if labelled.any() and unobserved[labelled].mean(dtype=np.float32) > self.max_unobserved:
             return UNOBSERVED_SIDE
-        if any(_intersect(drawing, a, b) for a, b in combinations(self.recorded_together, 2)):
-            return ENTERS_ANOTHER
+        for some, others in combinations(self.recorded_together, 2):
+            for a, b in product(some & drawing.layers.keys(), others & drawing.layers.keys()):
+                first, second = drawing.layers[a], drawing.layers[b]
+                both = first.mask & second.mask & (first.depth > 0) & (second.depth > 0)
+                near = np.abs(first.depth - second.depth)[both] < ACCEPTED.min_gap_mm
+                if int(near.sum()) >= ACCEPTED.min_crossing_px:  # in this camera, they must intersect
+                    return ENTERS_ANOTHER
         return None
 
 
@@ -196,7 +198,11 @@ class SampleGenerator:
         drawing, refused = self._first_acceptable(index, effects)
         height, width = drawing.depth.shape
         appearance = self.appearances.draw(self._rng(index, APPEARANCE_STREAM), width, height)
-        drawing = self._with(drawing, appearance)
+        image = self._image(drawing.state, drawing.camera, drawing.image, drawing.share, appearance)
+        drawing = replace(drawing, image=image)
+        if appearance.background is not None:  # whose depth is unknown
+            depth = np.where(drawing.parts.numpy() > 0, drawing.depth, 0.0)
+            drawing = replace(drawing, depth=depth, unobserved=drawing.unobserved * drawing.share)
         labels = annotate(self.scene, drawing, self.labeller.names)
         facts: dict[str, Any] = {} if self.effects is None else {"camera_effects": effects}
         if self.appearances.backgrounds is not None:
@@ -227,14 +233,6 @@ class SampleGenerator:
     def _rng(self, *numbers: int) -> Generator:
         return np.random.default_rng(np.random.SeedSequence([self.settings.seed, *numbers]))
 
-    def _with(self, drawing: LayeredDrawing, appearance: Appearance) -> LayeredDrawing:
-        """Return the rendering in another appearance; the depth of a background is unknown."""
-        image = self._image(drawing.state, drawing.camera, drawing.image, drawing.share, appearance)
-        if appearance.background is None:
-            return replace(drawing, image=image)
-        depth = np.where(drawing.parts.numpy() > 0, drawing.depth, 0.0)
-        return replace(drawing, image=image, depth=depth, unobserved=drawing.unobserved * drawing.share)
-
     @torch.no_grad()
     def _image(self, state: State, camera: Camera, image: Tensor, share: Tensor, appearance: Appearance) -> Tensor:
         """The rendered `image` of a state, with its share of instruments, in an appearance."""
@@ -245,64 +243,29 @@ class SampleGenerator:
         colors = appearance.colors
         return image if colors is None else torch.from_numpy(colors.given_to(image.numpy()))
 
+    @torch.no_grad()
     def _through_camera(
-        self,
-        drawing: LayeredDrawing,
-        effects: Mapping[str, float],
-        rng: Generator,
-        appearance: Appearance = AS_RECORDED,
+        self, drawing: LayeredDrawing, effects: Mapping[str, float], rng: Generator, appearance: Appearance
     ) -> LayeredDrawing:
         """Apply the camera effects; labels stay those of the middle of the exposure."""
         if not effects:
             return drawing
-        drawing = self._motion_blurred(drawing, appearance, effects.get("shutter_s", 0.0), rng)
+        if self.effects is not None and self.motion is not None and (shutter_s := effects.get("shutter_s", 0.0)) > 0:
+            images, shares = [], []
+            for state, camera in subframes(self.scene, drawing, self.motion(drawing.state, rng), shutter_s):
+                gaussians = self.scene.at(state)
+                rendering, _, share = self.labeller.draw(gaussians, camera, self.labeller.owners(state, gaussians))
+                shares.append(share.clamp(0, 1).cpu())
+                image = rendering.color.clamp(0, 1).cpu()
+                image = self._image(state, camera, image, shares[-1], appearance)  # a background stands still
+                images.append(image.numpy())
+            drawing = replace(drawing, image=torch.from_numpy(average_exposure(images)))
+            if self.effects.soft_masks == "mean":
+                drawing = replace(drawing, share=torch.stack(shares).mean(0))
         if "field_of_view" in effects:
             drawing = _within_circle(drawing, effects["field_of_view"])
-        image = apply_effects(drawing.image.numpy(), drawing.depth, effects, rng)
-        return replace(drawing, image=torch.from_numpy(np.ascontiguousarray(image)))
-
-    @torch.no_grad()
-    def _motion_blurred(
-        self, drawing: LayeredDrawing, appearance: Appearance, shutter_s: float, rng: Generator
-    ) -> LayeredDrawing:
-        if self.motion is None or shutter_s <= 0:
-            return drawing
-        assert self.effects is not None
-        images, shares = [], []
-        for state, camera in subframes(self.scene, drawing, self.motion(drawing.state, rng), shutter_s):
-            gaussians = self.scene.at(state)
-            rendering, _, share = self.labeller.draw(gaussians, camera, self.labeller.owners(state, gaussians))
-            shares.append(share.clamp(0, 1).cpu())
-            image = rendering.color.clamp(0, 1).cpu()
-            image = self._image(state, camera, image, shares[-1], appearance)  # a background stands still
-            images.append(image.numpy())
-        drawing = replace(drawing, image=torch.from_numpy(average_exposure(images)))
-        return drawing if self.effects.soft_masks == "mid" else replace(drawing, share=torch.stack(shares).mean(0))
-
-
-@dataclass(frozen=True)
-class GeneratorSpec:
-    """Scene files and settings: small enough to be sent to another process. `instrument_scenes`: those whose
-    instruments are rendered over the tissue of `scene`, instead of its own."""
-
-    scene: Path
-    settings: Settings
-    device: str = "cpu"
-    instrument_scenes: tuple[Path, ...] = ()
-
-    def open(self) -> SampleGenerator:
-        """The generator. Raises NeecoError where a file cannot be read or does not fit."""
-        device = torch.device(self.device)
-        paths = (self.scene, *self.instrument_scenes)
-        scene, *others = (load_gaussians(path, VERB, device) for path in paths)
-        return SampleGenerator.of(scene, self.settings, others)
-
-
-def limit_threads(threads: int) -> None:
-    """Set up a worker process: kernels use `threads` threads, torch one; freed memory is kept for the next sample."""
-    set_threads(threads)
-    torch.set_num_threads(1)
-    keep_freed_memory()
+        seen = apply_effects(drawing.image.numpy(), drawing.depth, effects, rng)
+        return replace(drawing, image=torch.from_numpy(np.ascontiguousarray(seen)))
 
 
 def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
@@ -316,16 +279,6 @@ def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
         raise
     how: dict[str, Any] = {"refused": sample.refused, "facts": sample.facts, "quality": generator.settings.jpeg_quality}
     return encoded_sample(index, sample.drawing, labels_of(generator.scene, sample.drawing, sample.labels), **how)
-
-
-def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:
-    """Render sample `index` and write it to `output`; returns its record. Raises NeecoError where no random state was
-    acceptable, or the files cannot be written."""
-    try:
-        encoded = draw_encoded(generator, index)
-    except StatesRefused as error:
-        raise NeecoError(f"{output}: {error}") from None
-    return encoded.write(output)
 
 
 def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
@@ -368,17 +321,6 @@ def buried_depth(drawing: LayeredDrawing) -> float:
 def format_counts(refused: Mapping[str, int]) -> str:
     """`leaves the image: 3, enters the tissue: 1`."""
     return ", ".join(f"{reason}: {count}" for reason, count in refused.items())
-
-
-def _intersect(drawing: LayeredDrawing, some: frozenset[str], others: frozenset[str]) -> bool:
-    """Return whether any of `some` instruments is so near one of the `others`, in this camera, that they must
-    intersect."""
-    for a, b in product(sorted(some & drawing.layers.keys()), sorted(others & drawing.layers.keys())):
-        first, second = drawing.layers[a], drawing.layers[b]
-        both = first.mask & second.mask & (first.depth > 0) & (second.depth > 0)
-        if int((np.abs(first.depth - second.depth)[both] < ACCEPTED.min_gap_mm).sum()) >= ACCEPTED.min_crossing_px:
-            return True
-    return False
 
 
 def _within_circle(drawing: LayeredDrawing, radius: float) -> LayeredDrawing:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,13 +76,27 @@ class Mixture:
             raise NeecoError("--instruments: none of the runs has an instrument; train on captures that record them")
         if any(not scene.recorded.states for scene in (tissue, *instrument_scenes)):
             raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
-        gains = tuple(_gain(tissue, scene) for scene in instrument_scenes)
+        gains: list[tuple[float, float, float]] = []
+        for scene in instrument_scenes:  # 1 where there is no instrument to compare with, or it is the same run
+            gain = torch.ones(3)
+            if tissue is not scene and tissue.instruments:  # shafts are of a similar grey in both
+                ratio = _shaft_color(tissue) / _shaft_color(scene).clamp_min(1e-3)
+                gain = ratio.clamp(*MIXING.gain_range)
+            gains.append((float(gain[0]), float(gain[1]), float(gain[2])))
+        depths = []
+        for recorded, scene in ((scene.recorded, scene) for scene in instrument_scenes):
+            pairs = zip(recorded.states, recorded.cameras, strict=True)
+            depths.append(min(float(_working_end(scene, state, camera)[2]) for state, camera in pairs))
         mixture = cls(
             scene=merged_scene(tissue, instrument_scenes, gains),
             tissue=tissue,
             instrument_scenes=tuple(instrument_scenes),
-            gains=gains,
-            min_depth={item.name: _min_depth(scene) for scene in instrument_scenes for item in scene.instruments},
+            gains=tuple(gains),
+            min_depth={
+                item.name: depth
+                for scene, depth in zip(instrument_scenes, depths, strict=True)
+                for item in scene.instruments
+            },
             tissue_alone=tissue_gaussians(tissue),
             own_tissue_alone=tuple(tissue_gaussians(scene) for scene in instrument_scenes),
         )
@@ -169,13 +184,6 @@ def _working_end(scene: GaussianScene, state: State, camera: Camera) -> np.ndarr
     return camera_from_world[:3, :3] @ np.mean(ends, axis=0) + camera_from_world[:3, 3]
 
 
-def _min_depth(scene: GaussianScene) -> float:
-    """Depth mm of the working ends in the recorded frame where they were nearest to the lens."""
-    recorded = scene.recorded
-    pairs = zip(recorded.states, recorded.cameras, strict=True)
-    return min((float(_working_end(scene, state, camera)[2]) for state, camera in pairs), default=0.0)
-
-
 @torch.no_grad()
 def tissue_gaussians(scene: GaussianScene) -> Gaussians:
     """The scene's tissue alone, which stands still; for its depth, so without its light."""
@@ -210,7 +218,10 @@ def merged_scene(
     deformation = combined([scene.deformation for scene in instrument_scenes])
     bodies = [_body(tissue, 0, deformation)]
     for scene, gain in zip(instrument_scenes, gains or [(1.0, 1.0, 1.0)] * len(instrument_scenes), strict=True):
-        bodies += [_brightened(_body(scene, k + 1, deformation), gain) for k in range(len(scene.instruments))]
+        for body in (_body(scene, k + 1, deformation) for k in range(len(scene.instruments))):
+            factor = body.sh_dc.new_tensor(gain)
+            changed: dict[str, Any] = {"sh_dc": brightened(body.sh_dc, factor), "sh_rest": body.sh_rest * factor}
+            bodies.append(dataclasses.replace(body, **changed))
     mixed = GaussianScene(
         method, join_bodies(bodies), deformation, instruments, tissue.recorded, tissue.center.detach().clone()
     ).to(tissue.center.device)
@@ -232,23 +243,6 @@ def _body(scene: GaussianScene, index: int, deformation: Deformation) -> Canonic
     stored = {name: tensor[rows] for name, tensor in canonical.extras.items()}
     extras = deformation.fit_extras(deformation.initial_extras(alone) | stored)
     return alone.with_extras(**extras, **{VISIBILITY: seen})
-
-
-def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> CanonicalGaussians:
-    """The same Gaussians, their colours multiplied."""
-    factor = body.sh_dc.new_tensor(gain)
-    return dataclasses.replace(body, sh_dc=brightened(body.sh_dc, factor), sh_rest=body.sh_rest * factor)
-
-
-def _gain(tissue: GaussianScene, instruments: GaussianScene) -> tuple[float, float, float]:
-    """Estimate the colour gains that make `instruments` look as under the light of `tissue`'s capture, from the shafts,
-    which are of a similar grey in both. 1 where the tissue's run has no instrument to compare with, or it is the
-    same run."""
-    if tissue is instruments or not tissue.instruments:
-        return 1.0, 1.0, 1.0
-    ratio = _shaft_color(tissue) / _shaft_color(instruments).clamp_min(1e-3)
-    red, green, blue = (float(value) for value in ratio.clamp(*MIXING.gain_range))
-    return red, green, blue
 
 
 def _shaft_color(scene: GaussianScene) -> Tensor:

@@ -11,71 +11,89 @@ import contextlib
 import hashlib
 import tempfile
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes, sweep_unfinished
 from neeco.base.workers import Workers, address, run_tasks
 from neeco.raster.devices import readable_failures
-from neeco.raster.native import threads
+from neeco.raster.native import keep_freed_memory, set_threads, threads
+from neeco.scene.io import load_gaussians
 from neeco.synthesis.backgrounds import ImageFolder
-from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_encoded, draw_to_folder, limit_threads
+from neeco.synthesis.generator import SampleGenerator, draw_encoded
 from neeco.synthesis.samplers import states_file
-from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS
+from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Settings
 from neeco.synthesis.writers.folder import Encoded, Record
 
 TASK_SIZE = 8  # images of a cluster's task
 
 
 @dataclass(frozen=True)
-class PackedSpec:
-    """A generator's spec with the content of its files, by name. Equal, by its key, where the content is equal."""
+class GeneratorSpec:
+    """Scene files and settings, small enough to be sent to another process, or `packed`, with all files' content."""
 
-    spec: GeneratorSpec = field(compare=False)
-    files: Mapping[str, bytes] = field(compare=False)
-    key: str
+    scenes: tuple[Path, ...]  # of the tissue, then of the instruments that are rendered over it instead of its own
+    settings: Settings
+    device: str = "cpu"
+    files: Mapping[str, bytes] = field(default_factory=dict, compare=False)  # by path; packed: paths are relative
+    digest: str = ""  # of `files`
 
-    @classmethod
-    def of(cls, spec: GeneratorSpec) -> PackedSpec:
-        """Raises NeecoError where a file cannot be read."""
-        paths = {f"scene{k}.safetensors": path for k, path in enumerate((spec.scene, *spec.instrument_scenes))}
-        if spec.settings.camera_effects is not None:
-            paths["effects.yaml"] = Path(spec.settings.camera_effects)
-        if spec.settings.states not in SAMPLERS:
-            paths["states.jsonl"] = states_file(spec.settings.states)
-        for name, images in spec.settings.image_folders().items():
-            for file in ImageFolder.of(images, name).files:
-                paths[f"{name}/{file.name}"] = file
-        files = {name: read_bytes(path, "a scene or settings file") for name, path in paths.items()}
-        content = b"".join(hashlib.sha256(files[name]).digest() for name in sorted(files))
-        return cls(spec, files, hashlib.sha256(content + repr(spec.settings).encode()).hexdigest())
+    def packed(self) -> GeneratorSpec:
+        """The same with the content of its files. Raises NeecoError where one cannot be read."""
+        files = {}
+
+        def pack(name: str, path: Path) -> Path:
+            if path.is_dir():
+                files.update(
+                    {f"{name}/{file.name}": read_bytes(file, "an image") for file in ImageFolder.of(path, name).files}
+                )
+            else:
+                files[name] = read_bytes(path, "a scene or settings file")
+            return Path(name)
+
+        spec, digest = self._moved(pack), hashlib.sha256()
+        for name in sorted(files):
+            digest.update(f"{name} {hashlib.sha256(files[name]).hexdigest()}".encode())
+        return replace(spec, files=files, digest=digest.hexdigest())
 
     def open(self) -> SampleGenerator:
-        """The generator, from the files' content."""
+        """The generator. Raises NeecoError where a file cannot be read or does not fit."""
+        if not self.files:
+            scene, *others = (load_gaussians(path, "synthesize", torch.device(self.device)) for path in self.scenes)
+            return SampleGenerator.of(scene, self.settings, others)
         folder = tempfile.TemporaryDirectory()
-        generator = self._unpacked(Path(folder.name)).open()
+        for name, content in self.files.items():
+            file = Path(folder.name) / name
+            file.parent.mkdir(exist_ok=True)
+            file.write_bytes(content)
+        spec = replace(self, files={})._moved(lambda _, path: Path(folder.name) / path)
+        generator = spec.open()
         weakref.finalize(generator, folder.cleanup)  # backgrounds are read when they are needed
         return generator
 
-    def _unpacked(self, folder: Path) -> GeneratorSpec:
-        """The same spec, its files in `folder`."""
-        for name, content in self.files.items():
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).write_bytes(content)
-        settings = self.spec.settings
-        if "effects.yaml" in self.files:
-            settings = replace(settings, camera_effects=str(folder / "effects.yaml"))
-        moved: dict[str, Any] = {name: str(folder / name) for name in settings.image_folders()}
-        settings = replace(settings, **moved)
-        if "states.jsonl" in self.files:
+    def _moved(self, move: Callable[[str, Path], Path]) -> GeneratorSpec:
+        """The same with other paths of files, by `move` of a name and a path."""
+        settings = self.settings
+        named = {"camera_effects": settings.camera_effects} | settings.image_folders()
+        moved: dict[str, Any] = {name: str(move(name, Path(path))) for name, path in named.items() if path is not None}
+        if settings.states not in SAMPLERS:
             prefix = PATH_PREFIX if settings.states.startswith(PATH_PREFIX) else ""
-            settings = replace(settings, states=f"{prefix}{folder / 'states.jsonl'}")
-        scene, *others = (folder / f"scene{k}.safetensors" for k in range(1 + len(self.spec.instrument_scenes)))
-        return replace(self.spec, scene=scene, instrument_scenes=tuple(others), settings=settings)
+            moved["states"] = f"{prefix}{move('states.jsonl', states_file(settings.states))}"
+        scenes = tuple(move(f"scene{k}.safetensors", path) for k, path in enumerate(self.scenes))
+        return replace(self, scenes=scenes, settings=replace(settings, **moved))
+
+
+def limit_threads(threads: int) -> None:
+    """Set up a worker process: kernels use `threads` threads, torch one; freed memory is kept for the next sample."""
+    set_threads(threads)
+    torch.set_num_threads(1)
+    keep_freed_memory()
 
 
 def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], workers: int) -> Iterator[Record]:
@@ -83,10 +101,10 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
 
     Raises NeecoError with what a worker met, and where workers are killed repeatedly.
     """
-    shared: tuple[GeneratorSpec | PackedSpec, Path | None] = (spec, output)
+    shared: tuple[GeneratorSpec, Path | None] = (spec, output)
     size, each = 1, max(1, threads() // workers)
     if address():
-        shared, size, each = (PackedSpec.of(spec), None), TASK_SIZE, 1
+        shared, size, each = (spec.packed(), None), TASK_SIZE, 1
     tasks = [tuple(indices[k : k + size]) for k in range(0, len(indices), size)]
     try:
         with contextlib.closing(run_tasks(_draw, shared, tasks, Workers(count=workers, threads=each))) as events:
@@ -103,19 +121,18 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
 
 
 def _draw(
-    shared: tuple[GeneratorSpec | PackedSpec, Path | None], indices: tuple[int, ...], threads: int
+    shared: tuple[GeneratorSpec, Path | None], indices: tuple[int, ...], threads: int
 ) -> list[Record] | list[Encoded]:
     """Render these images in a worker; return their records where it can write to the output, else all of them."""
     spec, output = shared
     with readable_failures():
         generator = _opened(spec, threads)
-        if output is None:
-            return [draw_encoded(generator, index) for index in indices]
-        return [draw_to_folder(generator, output, index) for index in indices]
+        encoded = (draw_encoded(generator, index) for index in indices)
+        return list(encoded) if output is None else [image.write(output) for image in encoded]
 
 
 @lru_cache(maxsize=1)
-def _opened(spec: GeneratorSpec | PackedSpec, threads: int) -> SampleGenerator:
+def _opened(spec: GeneratorSpec, threads: int) -> SampleGenerator:
     """The generator, opened once in a worker, whatever number of tasks it gets."""
     limit_threads(threads)
     return spec.open()

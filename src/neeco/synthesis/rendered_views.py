@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,15 +30,6 @@ from neeco.training.run import TrainedRun
 STATES_FOLDER = "states"
 FPS = 25  # of a video
 QUALITY = {"crf": "18"}  # of x264: visually lossless
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """The rendered images: their folder and number."""
-
-    folder: Path
-    images: int
-    labelled: bool  # False: the scene's method learns no labels, so there are no part ids and masks
 
 
 class View(NamedTuple):
@@ -84,7 +74,7 @@ def render(
     folder: Path,
     on_progress: Callable[[int], None] = lambda done: None,
     images: ImageSettings = AS_RECORDED,
-) -> Rendered:
+) -> None:
     """Write NAME.png (or .jpg), NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json:
     what the ids mean. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError."""
     cameras = DrawnCameras.of(images, scene.recorded, (view.camera for view in views))
@@ -97,7 +87,6 @@ def render(
         on_progress(done)
     if scene.label_names:
         write_json(folder / PARTS_FILE, {"ids": part_ids(scene.label_names)})
-    return Rendered(folder, len(views), bool(scene.label_names))
 
 
 def require_pyav() -> None:

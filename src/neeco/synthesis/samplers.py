@@ -33,10 +33,8 @@ from neeco.synthesis.states import (
     ExtrapolatedStates,
     GridStates,
     InterpolatedStates,
-    ListedStates,
     PathStates,
     Shaft,
-    StateSampler,
     turn_about,
 )
 
@@ -54,6 +52,7 @@ class SamplerSettings:
 
 SAMPLING = SamplerSettings()
 
+StateSampler = Callable[[int, Generator], State]  # (index, its random numbers) -> state
 # Draws a camera for a state; intrinsics and image size are always those of a recorded camera.
 ViewSampler = Callable[[State, Generator], Camera]
 
@@ -144,11 +143,7 @@ class Sampler:
     states: StateSampler
     views: ViewSampler
     cameras: tuple[Camera | None, ...] = (None,)  # given with the states, in turn; None: the view sampler decides
-
-    @property
-    def prescribed(self) -> bool:
-        """Return whether the state of an index is given rather than random."""
-        return self.states.prescribed
+    prescribed: bool = False  # whether the state of an index is given rather than random
 
     def fixed(self, index: int) -> bool:
         """Return whether both state and camera of image `index` are given: another sample would be the same."""
@@ -176,30 +171,35 @@ class Sampler:
 def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views, count: int) -> Sampler:
     """The sampler named by `states` (interpolate, extrapolate, grid, path:FILE or FILE) and `views`. Raises
     NeecoError."""
-    view_sampler = _view_sampler(scene, views)
+    recorded = RecordedViews(scene.recorded.cameras, scene.recorded.states)
+    view_sampler: ViewSampler = recorded
+    still = scene.recorded.still
+    if views == "perturbed":
+        view_sampler = PerturbedViews(recorded, *((SAMPLING.still_degrees, SAMPLING.still_mm) if still else ()))
+    if views == "orbit":
+        if still:
+            raise NeecoError("--views orbit: the scope stood still, which shows no side; use recorded or perturbed")
+        chosen = evenly_spaced(len(scene.recorded.cameras), SAMPLING.n_surface_views, floor=True)
+        with torch.no_grad():
+            seen = [(scene.at(scene.recorded.states[k]), scene.recorded.cameras[k]) for k in chosen]
+            points = [surface_points(surface_depth(rasterize(*view)), view[1]) for view in seen]
+        if not sum(map(len, points)):
+            raise NeecoError("--views orbit: the scene shows no surface to orbit about; use --views recorded")
+        view_sampler = OrbitViews(recorded, np.median(np.concatenate(points), axis=0))
     if states == "interpolate":
         return Sampler(scene, InterpolatedStates(scene.recorded.states), view_sampler)
     if states == "extrapolate":
         return Sampler(scene, ExtrapolatedStates(scene.recorded.states, scene.instruments, margin), view_sampler)
     if states == "grid":
-        return Sampler(scene, GridStates(scene.recorded.states, shafts_of(scene)), view_sampler)
+        return Sampler(scene, GridStates(scene.recorded.states, shafts_of(scene)), view_sampler, prescribed=True)
     lines = read_states(states_file(states), scene.recorded.with_limits(scene.instruments))
     if states.startswith(PATH_PREFIX):
-        return Sampler(scene, PathStates([line.state for line in lines], count), view_sampler)
+        return Sampler(scene, PathStates([line.state for line in lines], count), view_sampler, prescribed=True)
     intrinsics = scene.recorded.cameras[0]
     poses = [line.world_from_camera for line in lines]
     cameras = tuple(None if pose is None else moved_camera(intrinsics, pose) for pose in poses)
-    return Sampler(scene, ListedStates([line.state for line in lines]), view_sampler, cameras)
-
-
-def _view_sampler(scene: GaussianScene, views: Views) -> ViewSampler:
-    recorded = RecordedViews(scene.recorded.cameras, scene.recorded.states)
-    still = scene.recorded.still
-    if views == "perturbed":
-        return PerturbedViews(recorded, *((SAMPLING.still_degrees, SAMPLING.still_mm) if still else ()))
-    if views == "orbit" and still:
-        raise NeecoError("--views orbit: the scope stood still, which shows no side; use recorded or perturbed")
-    return OrbitViews(recorded, surface_centre(scene)) if views == "orbit" else recorded
+    # from the start again when more images than states are requested
+    return Sampler(scene, lambda index, _: lines[index % len(lines)].state, view_sampler, cameras, prescribed=True)
 
 
 def states_file(states: str) -> Path:
@@ -252,18 +252,6 @@ def surface_points(depth: np.ndarray, camera: Camera, step: int = 4) -> np.ndarr
         across, down = rays_of_pixels(pixels.reshape(-1, 2), camera).reshape(pixels.shape).transpose(2, 0, 1)
     points = np.stack([across * z, down * z, z, np.ones_like(z)], -1)[z > 0]
     return (points @ to_numpy(camera.world_from_camera).T)[:, :3]
-
-
-@torch.no_grad()
-def surface_centre(scene: GaussianScene) -> np.ndarray:
-    """The median [3] mm of the surface points that recorded cameras see."""
-    recorded = scene.recorded
-    chosen = evenly_spaced(len(recorded.cameras), SAMPLING.n_surface_views, floor=True)
-    views = [(scene.at(recorded.states[k]), recorded.cameras[k]) for k in chosen]
-    seen = np.concatenate([surface_points(surface_depth(rasterize(*view)), view[1]) for view in views])
-    if len(seen) == 0:
-        raise NeecoError("--views orbit: the scene shows no surface to orbit about; use --views recorded")
-    return np.median(seen, axis=0)
 
 
 @dataclass(frozen=True)

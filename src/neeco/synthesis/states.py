@@ -114,8 +114,6 @@ class InterpolatedStates:
     uniform over their recorded range.
     """
 
-    prescribed = False
-
     def __init__(self, states: Sequence[State]) -> None:
         self.states = _with_instruments(states)
         self.ranges = joint_ranges(self.states)
@@ -183,8 +181,6 @@ class GridStates:
     rolled about its shaft by -30 to 30 degrees. Each full round of cells stands on another recorded pose.
     """
 
-    prescribed = True
-
     def __init__(
         self, states: Sequence[State], shafts: Mapping[str, Shaft], joint_values: int = 5, rolls: int = 5
     ) -> None:
@@ -208,8 +204,6 @@ class GridStates:
 class PathStates:
     """`count` states evenly spread along key states, first and last included."""
 
-    prescribed = True
-
     def __init__(self, keys: Sequence[State], count: int) -> None:
         if len(keys) < 2:
             raise NeecoError(f"--states path: {len(keys)} key state(s); a path needs at least two")
@@ -224,21 +218,6 @@ class PathStates:
     def __call__(self, index: int, rng: Generator) -> State:
         segment, weight = self.place(index)
         return interpolate_state(self.keys[segment], self.keys[segment + 1], weight)
-
-
-class ListedStates:
-    """The given states in order; from the start again when more images than states are requested."""
-
-    prescribed = True
-
-    def __init__(self, states: Sequence[State]) -> None:
-        self.states = list(states)
-
-    def __call__(self, index: int, rng: Generator) -> State:
-        return self.states[index % len(self.states)]
-
-
-StateSampler = InterpolatedStates | GridStates | PathStates | ListedStates
 
 
 def with_poses(state: State, moved: Callable[[str, np.ndarray], np.ndarray]) -> State:

@@ -45,8 +45,8 @@ from neeco.labels.labellers import instruments_of
 from neeco.raster.native import torch_threads
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import load_gaussians, save_scene
-from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, limit_threads
-from neeco.synthesis.parallel import PackedSpec
+from neeco.synthesis.generator import SampleGenerator
+from neeco.synthesis.parallel import GeneratorSpec, limit_threads
 from neeco.synthesis.samplers import make_sampler
 from neeco.synthesis.settings import LabelWay, Settings, Views
 from neeco.training.run import SCENE_FILE, load_run
@@ -144,7 +144,7 @@ class LabelledImages(Dataset[Sample]):
         self.classes = instruments_of(self.part_names)
         self.keypoint_names = keypoint_names(generator.scene)
         self._generator: SampleGenerator | None = generator
-        self._spec: GeneratorSpec | PackedSpec | None = None  # opened for the first sample of another process
+        self._spec: GeneratorSpec | None = None  # opened for the first sample of another process
 
     def __getstate__(self) -> dict[str, Any]:
         spec = self._spec or _spec(self._opened, self._settings)
@@ -197,14 +197,14 @@ def _opened(source: SceneLike) -> tuple[GaussianScene, Path | None]:
     return gaussians, None if folder is None else Path(folder) / SCENE_FILE
 
 
-def _spec(opened: Sequence[tuple[GaussianScene, Path | None]], settings: Settings) -> GeneratorSpec | PackedSpec:
+def _spec(opened: Sequence[tuple[GaussianScene, Path | None]], settings: Settings) -> GeneratorSpec:
     """The generator of these scenes, for another process."""
     device = str(opened[0][0].center.device)
     paths = [path for _, path in opened if path is not None]
     if len(paths) == len(opened):
-        return GeneratorSpec(paths[0], settings, device, tuple(paths[1:]))
+        return GeneratorSpec(tuple(paths), settings, device)
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{k}.safetensors" for k in range(len(opened))]
         for (scene, _), path in zip(opened, paths, strict=True):
             save_scene(scene, path)
-        return PackedSpec.of(GeneratorSpec(paths[0], settings, device, tuple(paths[1:])))
+        return GeneratorSpec(tuple(paths), settings, device).packed()

@@ -12,7 +12,7 @@ from neeco.capture.model import State
 from neeco.evaluation.image_metrics import Pixels, difference_map, overlay_parts, to_uint8
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import surface_depth
-from neeco.labels.labellers import composited_parts, threshold_of
+from neeco.labels.labellers import composited_labels, threshold_of
 from neeco.raster import rasterize
 from neeco.raster.devices import readable_failures
 from neeco.raster.types import Rendering
@@ -59,7 +59,7 @@ def picture(scene: DrawableScene, state: State, camera: Camera, view: str, label
     rendering = _rendering(scene, state, camera, view, labels)
     color, depth = rendering.color.clamp(0, 1).cpu().numpy(), surface_depth(rendering)
     if view in LABELLED:
-        parts = composited_parts(rendering, threshold_of(scene)).cpu().numpy()
+        parts = composited_labels(rendering, threshold_of(scene))[0].cpu().numpy()
         if view == PARTS:
             return Picture(overlay_parts(np.zeros_like(color), parts, 1.0), depth)
         return Picture(overlay_parts(color, parts), depth)

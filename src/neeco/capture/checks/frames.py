@@ -115,8 +115,12 @@ def check_states(parsed: Parsed) -> None:
             _check_joint(parsed, instrument, joint)
         if instrument.kinematics is not None:
             _check_kinematics(parsed, instrument, instrument.kinematics)
+        stated = [state.uncertainty for _, state in parsed.states_of(instrument.name) if state.uncertainty is not None]
+        unknown = sum(uncertainty.rotation_deg[2] > SETTINGS.max_known_roll_deg for uncertainty in stated)
+        if 2 * unknown > len(stated):  # found in video, it cannot be learned
+            message = f"the roll of {name} is not known in {unknown} of {len(stated)} frames"
+            parsed.header("frames").warning(message, "log it, or pose frames by hand: neeco view CAPTURE --annotate")
     _check_changes(parsed)
-    _check_rolls(parsed)
 
 
 def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
@@ -175,16 +179,6 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
         if explained > SETTINGS.max_explained:
             message = f"joint {printable(joint)} of {name} follows from the others ({explained:.1%} of its variance)"
             place.warning(message, "also move joints one at a time, to separate their axes")
-
-
-def _check_rolls(parsed: Parsed) -> None:
-    """Warn of instruments found in video whose roll nobody logged or posed: they cannot be learned."""
-    for instrument in parsed.instruments:
-        stated = [state.uncertainty for _, state in parsed.states_of(instrument.name) if state.uncertainty is not None]
-        unknown = sum(uncertainty.rotation_deg[2] > SETTINGS.max_known_roll_deg for uncertainty in stated)
-        if 2 * unknown > len(stated):
-            message = f"the roll of {printable(instrument.name)} is not known in {unknown} of {len(stated)} frames"
-            parsed.header("frames").warning(message, "log it, or pose frames by hand: neeco view CAPTURE --annotate")
 
 
 def _check_changes(parsed: Parsed) -> None:

@@ -70,7 +70,8 @@ def _read(parsed: Parsed, compared: set[int], points: np.ndarray, row: int) -> P
     except NeecoError as error:
         picture.image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
     try:
-        mask = frame.load_mask_pixels()
+        counted = frame.load_mask()
+        mask = None if counted is None else counted.numpy()
         if mask is not None and not mask.any():
             picture.mask_error = "ignores every pixel; black is ignored: invert it, or write 255 instead of 1"
         elif mask is not None and pixels is not None:

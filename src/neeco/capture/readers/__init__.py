@@ -19,7 +19,7 @@ from neeco.capture.model import Capture, Instrument, State, share_lamps
 from neeco.capture.points import points_in_view
 from neeco.capture.readers._colmap import find_models, parse_colmap
 from neeco.capture.readers._states import StateLine, read_states
-from neeco.capture.readers._transforms import is_blender, load_document, parse_blender, parse_transforms
+from neeco.capture.readers._transforms import is_blender, load_document, parse_transforms
 from neeco.capture.readers.cameras import parse_lens
 from neeco.capture.readers.endonerf import is_endonerf_folder, parse_endonerf
 from neeco.capture.readers.kinematics import kinematics_of, parse_kinematics, read_dvrk_tool, read_urdf
@@ -74,10 +74,8 @@ def capture_of(parsed: Parsed) -> Capture:
     if parsed.still:
         lit = share_lamps([frame.camera for frame in frames])
         frames = tuple(replace(frame, camera=camera) for frame, camera in zip(frames, lit, strict=True))
-    if any(item.unrecorded for item in instruments):
-        frames = tuple(replace(frame, state=_with_unrecorded(frame.state, instruments)) for frame in frames)
-    if any(item.kinematics is not None and item.kinematics.pose_of is not None for item in instruments):
-        frames = tuple(replace(frame, state=_of_roots(frame.state, instruments, parsed)) for frame in frames)
+    if any(item.unrecorded or (item.kinematics and item.kinematics.pose_of) for item in instruments):
+        frames = tuple(replace(frame, state=_completed(frame.state, instruments, parsed)) for frame in frames)
         instruments = tuple(
             item if item.kinematics is None else replace(item, kinematics=replace(item.kinematics, pose_of=None))
             for item in instruments
@@ -94,31 +92,23 @@ def capture_of(parsed: Parsed) -> Capture:
     )
 
 
-def _with_unrecorded(state: State, instruments: Sequence[Instrument]) -> State:
-    """The state with every joint that nobody recorded half way between its limits."""
-    filled = dict(state.instruments)
-    for item in instruments:
-        if item.unrecorded and item.name in filled:
-            halfway = {joint: item.halfway(joint) for joint in item.unrecorded}
-            filled[item.name] = replace(filled[item.name], joints={**filled[item.name].joints, **halfway})
-    return replace(state, instruments=filled)
-
-
-def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -> State:
-    """The state with poses of any other link of an instrument made those of its root, by its kinematics as stated."""
-    moved = dict(state.instruments)
-    for item in instruments:
-        tree, recorded = item.kinematics, state.instruments.get(item.name)
-        if tree is None or tree.pose_of is None or recorded is None:
-            continue
-        if missing := [name for name in sorted(tree.readings_of(tree.pose_of)) if name not in recorded.joints]:
-            raise NeecoError(
-                f"{parsed.root}: kinematics of {item.name}: reading {missing[0]!r} is missing in a frame; run `neeco "
-                "check` on the capture"
-            )
-        root = tree.world_from_root(recorded.pose.double().numpy(), recorded.joints)
-        moved[item.name] = replace(recorded, pose=torch.from_numpy(root))
-    return replace(state, instruments=moved)
+def _completed(state: State, instruments: Sequence[Instrument], parsed: Parsed) -> State:
+    """The state with every joint that nobody recorded half way between its limits, and with poses of other links of an
+    instrument made those of its root, by its kinematics as stated."""
+    completed = dict(state.instruments)
+    for item in (item for item in instruments if item.name in completed):
+        recorded, tree = completed[item.name], item.kinematics
+        joints = {**recorded.joints, **{joint: item.halfway(joint) for joint in item.unrecorded}}
+        pose = recorded.pose
+        if tree is not None and tree.pose_of is not None:
+            if missing := [name for name in sorted(tree.readings_of(tree.pose_of)) if name not in joints]:
+                raise NeecoError(
+                    f"{parsed.root}: kinematics of {item.name}: reading {missing[0]!r} is missing in a frame; run "
+                    "`neeco check` on the capture"
+                )
+            pose = torch.from_numpy(tree.world_from_root(pose.double().numpy(), joints))
+        completed[item.name] = replace(recorded, pose=pose, joints=joints)
+    return replace(state, instruments=completed)
 
 
 def parse_capture(
@@ -132,20 +122,14 @@ def parse_capture(
     """Read as much of a capture as can be read; what is wrong with it goes to `report`. as_source: see `Parsed`. Raises
     NeecoError for a path that is not in UTF-8."""
     parsed = _parse(Path(path), report, transforms, background, as_source)
-    _warn_of_other_size(parsed)
-    return parsed
-
-
-def _warn_of_other_size(parsed: Parsed) -> None:
-    """Warn of intrinsics of another image size, of the lens or of most cameras."""
-    frames = parsed.with_cameras().frames
-    lenses = [Lens.of(frame.camera) for frame in frames]
+    lenses = [Lens.of(frame.camera) for frame in parsed.with_cameras().frames]
     if parsed.lens is not None:
         lenses = [parsed.lens]
     faults = [other_size_fault(lens.cx, lens.cy, *lens.size) for lens in lenses if lens.size is not None]
     wrong = [fault for fault in faults if fault is not None]
-    if len(wrong) > len(faults) / 2:
+    if parsed.frames and len(wrong) > len(faults) / 2:  # of the lens, or of most cameras
         parsed.header("cx, cy" if parsed.lens is None else "lens").warning(*wrong[0])
+    return parsed
 
 
 def _parse(path: Path, report: ProblemReport, transforms: str, background: float, as_source: bool) -> Parsed:
@@ -161,20 +145,19 @@ def _parse(path: Path, report: ProblemReport, transforms: str, background: float
     try:
         file = inside(path, path, transforms)
     except NeecoError as error:
-        Node(None, transforms, "", report).error_from(error)
+        Node(None, transforms, "", report).error(*str(error).split("; ", 1))
         return Parsed(path)
     if file.is_file():
         document = load_document(file, path, report)
-        if is_blender(document):
-            return parse_blender({file: document}, path, background, as_source=as_source)
-        return parse_transforms(document, file.parent, path, background, as_source=as_source)
+        blender = is_blender(document)
+        return parse_transforms({file: document}, path, background, blender=blender, as_source=as_source)
     if transforms != "transforms.json":
         report.error(transforms, "", "no such file", "name a transforms file of the capture")
         return Parsed(path)
     splits = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
     if blender_files := [file for file in splits if file.is_file()]:
         documents = {file: load_document(file, path, report) for file in blender_files}
-        return parse_blender(documents, path, background, as_source=as_source)
+        return parse_transforms(documents, path, background, blender=True, as_source=as_source)
     if models := find_models(path):
         return parse_colmap(models, path, report, as_source=as_source)
     if is_endonerf_folder(path):

@@ -9,10 +9,9 @@ import math
 import os
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import dropwhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,19 +19,11 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes
 from neeco.base.plausible import center_fault, focal_fault, size_fault
-from neeco.capture.documents import Node, Problem, ProblemReport, printable
+from neeco.capture.documents import Node, ProblemReport, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import TEST_EVERY, Frame, PointCloud, State
 from neeco.capture.readers.cameras import opencv_distortion
-from neeco.capture.readers.parsed import (
-    NOWHERE,
-    Parsed,
-    inside,
-    instants,
-    missing_file,
-    natural_order,
-    relative_name,
-)
+from neeco.capture.readers.parsed import Parsed, instants, named_image, natural_order, relative_name
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import COLMAP
 from neeco.geometry.rotations import quat_to_matrix, rigid
@@ -53,16 +44,14 @@ _COEFFICIENTS = {  # in a model's parameters, behind the focal lengths and the p
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Intrinsics:
+class _Intrinsics(NamedTuple):
     model: str
     width: int
     height: int
     params: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class _Image:
+class _Image(NamedTuple):
     name: str
     camera_id: int
     quaternion: tuple[float, ...]  # wxyz, camera_from_world
@@ -107,7 +96,16 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
     except NeecoError as error:
         report.error(relative_name(model, root), "", str(error).removeprefix(f"{model}/"))
         return parsed
-    _parse_points(model / f"points3D{suffix}", parse_points, parsed, report)
+    points_file = model / f"points3D{suffix}"
+    parsed.points_place = Node(None, relative_name(points_file, root), "", report)
+    try:
+        rows = np.array(_parse(points_file, parse_points), dtype=np.float64).reshape(-1, 6)
+        positions = rows[:, :3].astype(np.float32)
+        if not np.isfinite(positions).all():
+            raise NeecoError("holds points that are NaN or infinite; remove them")
+        parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
+    except NeecoError as error:
+        parsed.points_place.error(*str(error).removeprefix(f"{points_file}: ").split("; ", 1))
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
@@ -116,17 +114,9 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
     orders = instants([image.name for image in images], [image.camera_id for image in images])
     orders = orders or list(range(len(images)))
     for order, image in sorted(zip(orders, images, strict=True), key=lambda item: item[0]):
-        place = Node(None, file, printable(image.name), report)
-        try:
-            path = inside(root, root / "images", image.name)
-            camera = _camera(image, cameras, parsed)
-        except NeecoError as error:
-            place.error_from(error)
-            continue
-        if not path.is_file():
-            message, remedy = missing_file(root / "images", image.name)
-            fault = Problem("error", file, place.field, f"{message} in images/", remedy)
-            (parsed.absent if as_source and remedy == NOWHERE else report.problems).append(fault)
+        place = Node(image.name, file, printable(image.name), report)
+        path, camera = named_image(place, root / "images", parsed), place.tried(_camera, image, cameras, parsed)
+        if path is None or camera is None:
             continue
         split = "test" if order % TEST_EVERY == 0 else "train"
         parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
@@ -149,23 +139,7 @@ def _note_left_out(model: Path, others: Sequence[Path], images: Sequence[_Image]
         place.warning(message, "they are left out")
 
 
-def _parse_points(
-    path: Path, parse: Callable[[bytes], list[tuple[float, ...]]], parsed: Parsed, report: ProblemReport
-) -> None:
-    parsed.points_place = Node(None, relative_name(path, parsed.root), "", report)
-    try:
-        rows = np.array(_parse(path, parse), dtype=np.float64).reshape(-1, 6)
-    except NeecoError as error:
-        parsed.points_place.error(str(error).removeprefix(f"{path}: "))
-        return
-    positions = rows[:, :3].astype(np.float32)
-    if not np.isfinite(positions).all():
-        parsed.points_place.error("holds points that are NaN or infinite", "remove them")
-        return
-    parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
-
-
-def _camera(image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> Camera:
+def _camera(place: Node, image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> Camera:
     """Raises NeecoError, which does not name the image, for distorted images read in place, too."""
     if image.camera_id not in cameras:
         raise NeecoError(f"uses camera {image.camera_id}, which the model lacks; export it again")
@@ -188,18 +162,14 @@ def _camera(image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> C
             f"its camera model is {camera.model}: the images are distorted; undistort them: neeco ingest {parsed.root} "
             "--output CAPTURE (or `colmap image_undistorter`)"
         )
-    pose = torch.from_numpy(_world_from_camera(image)).float()
-    return Camera(pose, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
-
-
-def _world_from_camera(image: _Image) -> np.ndarray:
-    """[4, 4] from COLMAP's camera_from_world. Raises NeecoError when it is no rigid transform."""
     quaternion, translation = np.array(image.quaternion), np.array(image.translation)
     norm = np.linalg.norm(quaternion)
     if not (0.99 < norm < 1.01 and np.abs(translation).max() < 1e9):  # nor when NaN
         raise NeecoError("its pose is not a finite unit quaternion and translation; drop it")
     rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
-    return COLMAP.camera_to_opencv(rigid(rotation.T, -rotation.T @ translation))
+    world_from_camera = COLMAP.camera_to_opencv(rigid(rotation.T, -rotation.T @ translation))
+    pose = torch.from_numpy(world_from_camera).float()
+    return Camera(pose, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
 
 
 def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:

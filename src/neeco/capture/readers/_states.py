@@ -16,7 +16,8 @@ import torch
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import RepeatedKeyError, distinct_keys, read_text
-from neeco.capture.documents import Node, RaisingReport, printable
+from neeco.base.settings import faults_in
+from neeco.capture.documents import Node, printable
 from neeco.capture.model import BaseUncertainty, Frame, FromVideo, Instrument, InstrumentState, State, Uncertainty
 from neeco.capture.readers.kinematics import parse_kinematics
 from neeco.geometry.conventions import swap_camera_axes
@@ -49,34 +50,32 @@ def read_states(path: Path, instruments: Sequence[Instrument]) -> list[StateLine
 
 
 def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
-    """The instrument states of one frame ({} where it lists none), or None when one of them could not be read."""
+    """The instrument states of one frame ({} where it lists none); None, and reported, where one cannot be read."""
     if not frame.has("instruments"):
         return {}
     node = frame.child("instruments")
     states: dict[str, InstrumentState] = {}
-    good = isinstance(node.value, list)
-    for item in node.items():
-        if not item.is_object():
-            good = False
-            continue
-        name = item.child("name").text()
-        pose = item.child("pose").rigid()
-        nodes = _joint_nodes(item)
-        joints = {joint: child.number() for joint, child in (nodes or {}).items()}
-        valid = {joint: value for joint, value in joints.items() if value is not None}
-        trust = item.child("trust").number() if item.has("trust") else None
-        if trust is not None and not 0 <= trust <= 1:
-            item.child("trust").error(f"is {trust:g}, not a share", "give 0 to 1, or leave it out")
-            trust = None
-        uncertainty = parse_uncertainty(item.child("uncertainty"), valid) if item.has("uncertainty") else None
-        if name in states:
-            item.child("name").error(f"{printable(name)} comes twice here", "keep one state per instrument")
-            good = False
-        if name is None or pose is None or nodes is None or len(valid) < len(joints):
-            good = False
-            continue
-        states[name] = InstrumentState(torch.from_numpy(pose), valid, trust, uncertainty)
-    return states if good else None
+    items = node.tried(Node.items)
+    for item in items or ():
+        if (named := item.tried(_parse_state)) is not None:
+            name, state = named
+            if name in states:
+                item.child("name").error(f"{printable(name)} comes twice here", "keep one state per instrument")
+                return None
+            states[name] = state
+    return states if items is not None and len(states) == len(items) else None
+
+
+def _parse_state(item: Node) -> tuple[str, InstrumentState]:
+    """An instrument's name and state."""
+    item.members()
+    name, pose = item.child("name").text(), item.child("pose").rigid()
+    joints = {joint: node.number() for joint, node in item.child("joints").members(optional=True).items()}
+    trust = item.given("trust", Node.number, None)
+    if trust is not None and not 0 <= trust <= 1:
+        item.child("trust").fail(f"is {trust:g}, not a share", "give 0 to 1, or leave it out")
+    uncertainty = item.given("uncertainty", lambda node: _parse_uncertainty(node, joints), None)
+    return name, InstrumentState(torch.from_numpy(pose), joints, trust, uncertainty)
 
 
 def declared_instruments(document: Node) -> tuple[Instrument, ...]:
@@ -84,29 +83,32 @@ def declared_instruments(document: Node) -> tuple[Instrument, ...]:
     if not document.has("instruments"):
         return ()
     instruments: dict[str, Instrument] = {}
-    for item in document.child("instruments").items():
-        if not item.is_object():
+    for item in document.child("instruments").tried(Node.items) or ():
+        if (instrument := item.tried(_parse_declared)) is None:
             continue
-        name = item.child("name").text()
-        joints: dict[str, Limits] = {}
-        unrecorded = []
-        for joint, node in (_joint_nodes(item) or {}).items():
-            is_object = node.value is not None and node.is_object()
-            has_limits = is_object and node.has("limits")
-            joints[joint] = node.child("limits").range("rad") if has_limits else None
-            if is_object and node.child("recorded").flag(True) is False:
-                unrecorded.append(joint)
-                if not has_limits:
-                    node.child("limits").error("is missing", "state between which values to look for the joint")
-        if name is None:
-            continue
-        if name in instruments:
-            item.child("name").error(f"{printable(name)} is declared twice", "give every instrument its own name")
-        tree = parse_kinematics(item.child("kinematics")) if item.has("kinematics") else None
-        shaft = parse_from_video(item.child("from_video")) if item.has("from_video") else None
-        shared = parse_base_uncertainty(item.child("base_uncertainty")) if item.has("base_uncertainty") else None
-        instruments[name] = Instrument(name, joints, tree, tuple(unrecorded), shaft, base_uncertainty=shared)
+        if instrument.name in instruments:
+            message = f"{printable(instrument.name)} is declared twice"
+            item.child("name").error(message, "give every instrument its own name")
+        instruments[instrument.name] = instrument
     return tuple(instruments.values())
+
+
+def _parse_declared(item: Node) -> Instrument:
+    item.members()
+    name = item.child("name").text()
+    joints: dict[str, Limits] = {}
+    unrecorded = []
+    for joint, node in item.child("joints").members(optional=True).items():
+        node.members(optional=True)
+        joints[joint] = node.given("limits", lambda limits: limits.range("rad"), None)
+        if not node.given("recorded", Node.flag, True):
+            unrecorded.append(joint)
+            if joints[joint] is None:
+                node.child("limits").fail("is missing", "state between which values to look for the joint")
+    tree = item.given("kinematics", parse_kinematics, None)
+    shaft = item.given("from_video", _parse_from_video, None)
+    shared = item.given("base_uncertainty", _parse_base_uncertainty, None)
+    return Instrument(name, joints, tree, tuple(unrecorded), shaft, base_uncertainty=shared)
 
 
 def all_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -> tuple[Instrument, ...]:
@@ -124,63 +126,31 @@ def all_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -
     )
 
 
-def parse_from_video(node: Node) -> FromVideo | None:
-    """`{"shaft_diameter_mm", "working_length_mm"}`; None, and reported, where it is not that."""
-    if not node.is_object():
-        return None
-    diameter = node.child("shaft_diameter_mm").number(above=0)
-    working = node.child("working_length_mm").number(least=0)
-    return None if diameter is None or working is None else FromVideo(diameter, working)
+def _parse_from_video(node: Node) -> FromVideo:
+    """`{"shaft_diameter_mm", "working_length_mm"}`"""
+    return FromVideo(node.child("shaft_diameter_mm").number(above=0), node.child("working_length_mm").number(least=0))
 
 
-def parse_base_uncertainty(node: Node) -> BaseUncertainty | None:
-    """`{"center": [x, y, z], "covariance": 6x6}`; None, and reported, where it is not that."""
-    if not node.is_object():
-        return None
+def _parse_base_uncertainty(node: Node) -> BaseUncertainty:
+    """`{"center": [x, y, z], "covariance": 6x6}`"""
     center, covariance = node.child("center").numbers(3, "mm"), node.child("covariance")
-    rows = [row for item in covariance.items() if (row := item.numbers(6, "rad and mm")) is not None]
-    if center is None or not isinstance(covariance.value, list) or len(rows) < len(covariance.value):
-        return None
+    rows = tuple(row.numbers(6, "rad and mm") for row in covariance.items())
     matrix = np.array(rows)
     if matrix.shape != (6, 6) or not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix).min() <= 0:
-        covariance.error("is no covariance", "give 6 x 6 numbers, symmetric and positive definite")
-        return None
-    return BaseUncertainty(tuple(center), tuple(map(tuple, rows)))
+        covariance.fail("is no covariance", "give 6 x 6 numbers, symmetric and positive definite")
+    return BaseUncertainty(center, rows)
 
 
-def parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty | None:
-    """`{"translation_mm": [x, y, z], "rotation_deg": [x, y, z], "joints_deg": {name: sd}}`, of a state with `joints`;
-    None, and reported, where it is not that."""
-    if not node.is_object():
-        return None
-    translation = node.child("translation_mm").numbers(3, "standard deviations in the camera's axes, mm", least=0)
-    rotation = node.child("rotation_deg").numbers(3, "deviations about the instrument's x, y, z, degrees", least=0)
-    named: dict[str, float] = {}
-    good = translation is not None and rotation is not None
-    if node.has("joints_deg"):
-        deviations = node.child("joints_deg")
-        good &= deviations.is_object()
-        for name in deviations.value if isinstance(deviations.value, dict) else ():
-            deviation = deviations.child(name).number(least=0)
-            if name not in joints:
-                deviations.child(name).error("the state has no such joint", "leave it out")
-                good = False
-            elif deviation is None:
-                good = False
-            else:
-                named[name] = deviation
-    if not good or translation is None or rotation is None:
-        return None
-    (across, down, depth), (tilt, turn, roll) = translation, rotation
+def _parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty:
+    """`{"translation_mm": [x, y, z], "rotation_deg": [x, y, z], "joints_deg": {name: sd}}`, of a state with `joints`"""
+    across, down, depth = node.child("translation_mm").numbers(3, "deviations in the camera's axes, mm", least=0)
+    tilt, turn, roll = node.child("rotation_deg").numbers(3, "deviations about its x, y, z, degrees", least=0)
+    deviations = node.child("joints_deg").members(optional=True)
+    for name, deviation in deviations.items():
+        if name not in joints:
+            deviation.fail("the state has no such joint", "leave it out")
+    named = {name: deviation.number(least=0) for name, deviation in deviations.items()}
     return Uncertainty((across, down, depth), (tilt, turn, roll), named)
-
-
-def _joint_nodes(item: Node) -> dict[str, Node] | None:
-    """The values in `joints` by name ({} where there is none), or None when that is no object."""
-    if not item.has("joints"):
-        return {}
-    node = item.child("joints")
-    return {name: node.child(name) for name in node.value} if node.is_object() else None
 
 
 def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> StateLine:
@@ -191,24 +161,30 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
     except (ValueError, RecursionError) as error:  # RecursionError, ValueError: endless nesting and numbers
         reason = error.msg if isinstance(error, json.JSONDecodeError) else "a number or the nesting is too large"
         raise NeecoError(f"{where}: not valid JSON: {reason}; give one JSON object per line") from None
-    node = Node(value, where, "", RaisingReport())
-    if not isinstance(node.child("instruments").value, list):
-        node.child("instruments").error("missing", 'expected {"instruments": [{"name", "pose", "joints"}]}')
+    with faults_in(where):
+        return _parse_state_line(Node(value, where), instruments)
+
+
+def _parse_state_line(node: Node, instruments: Sequence[Instrument]) -> StateLine:
+    listed = node.child("instruments")
+    if not isinstance(listed.value, list):
+        listed.fail("missing", 'expected {"instruments": [{"name", "pose", "joints"}]}')
     by_name = {instrument.name: instrument for instrument in instruments}
-    names = [item.child("name") for item in node.child("instruments").items()]
-    for name in names:
+    parsed: dict[str, InstrumentState] = {}
+    for item in listed.items():
+        name = item.child("name")
         if not isinstance(name.value, str) or name.value not in by_name:
-            name.error(f"{name.value!r} is not in the scene", f"it has {', '.join(by_name) or 'no instruments'}")
-    if missing := [name for name in by_name if name not in [item.value for item in names]]:
-        node.child("instruments").error(f"{', '.join(missing)} missing", "give every instrument of the scene")
-    parsed = parse_instruments(node) or {}
-    for item, instrument in zip(node.child("instruments").items(), parsed, strict=True):
-        _check_joints(item, by_name[instrument])
-    time = node.child("time").number() if node.has("time") else None
+            name.fail(f"{name.value!r} is not in the scene", f"it has {', '.join(by_name) or 'no instruments'}")
+        if name.value in parsed:
+            name.fail(f"{printable(name.value)} comes twice here", "keep one state per instrument")
+        parsed[name.value] = _parse_state(item)[1]
+        _check_joints(item, by_name[name.value])
+    if missing := [name for name in by_name if name not in parsed]:
+        listed.fail(f"{', '.join(missing)} missing", "give every instrument of the scene")
     camera = node.child("camera")
     if isinstance(camera.value, dict):
         camera = camera.child("transform_matrix")
-    pose = None if camera.value is None else camera.rigid()
+    pose = None if camera.value is None else swap_camera_axes(camera.rigid())
     # in the scene's order, so that files list them in one order, without joints that the scene does not have
     states = {
         name: InstrumentState(
@@ -217,14 +193,14 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
         )
         for name, item in by_name.items()
     }
-    return StateLine(State(states, time or 0.0), None if pose is None else swap_camera_axes(pose))
+    return StateLine(State(states, node.given("time", Node.number, 0.0)), pose)
 
 
 def _check_joints(item: Node, instrument: Instrument) -> None:
     """Refuse a state without one of its instrument's joints, with one that it does not have, or an impossible value."""
     joints = item.child("joints")
     if not all(joints.has(joint) for joint in instrument.joints if joint not in instrument.unrecorded):
-        joints.error(f"expected these joints, in rad: {', '.join(instrument.joints)}")
+        joints.fail(f"expected these joints, in rad: {', '.join(instrument.joints)}")
     for joint, value in (joints.value or {}).items():
         if (fault := instrument.joint_fault(joint, value)) is not None:
-            joints.child(joint).error(*fault)
+            joints.child(joint).fail(*fault)

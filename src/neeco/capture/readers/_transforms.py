@@ -19,7 +19,7 @@ from neeco.capture.model import SCHEMA, SEPARATE_TISSUES, TEST_EVERY, Frame, Ins
 from neeco.capture.points import random_points, read_ply
 from neeco.capture.readers._states import all_instruments, declared_instruments, parse_instruments
 from neeco.capture.readers.cameras import CameraFields, parse_lens, placeholder_camera
-from neeco.capture.readers.parsed import NOWHERE, Parsed, inside, instants, missing_file, relative_name
+from neeco.capture.readers.parsed import Parsed, instants, named_file, named_image, relative_name
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
 
@@ -30,31 +30,55 @@ _MILLIMETRES = ("mm", "millimeter", "millimetre", "millimeters", "millimetres")
 
 def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
     """A JSON file as the node of its object. What cannot be parsed is reported and gives an empty object."""
-    name = relative_name(file, root)
-    value: Any = {}
+    node = Node({}, relative_name(file, root), "", report)
     try:
-        value = read_json(file)
+        node = node.at(read_json(file), "")
     except NeecoError as error:
-        report.error(name, "", str(error).removeprefix(f"{file}: "))
-    node = Node(value, name, "", report)
-    return node if node.is_object() else Node({}, name, "", report)
+        report.error(node.file, "", str(error).removeprefix(f"{file}: "))
+    return node if node.tried(Node.members) is not None else node.at({}, "")
+
+
+def is_blender(document: Node) -> bool:
+    """Return True if a transforms file has the field of view for intrinsics and no states, as Blender writes."""
+    value = document.value
+    states = "instruments" in value or any("instruments" in frame for frame in _frame_objects(document))
+    return "camera_angle_x" in value and "fl_x" not in value and not states
 
 
 def parse_transforms(
-    document: Node, folder: Path, root: Path, background: float = 1.0, *, as_source: bool = False
+    files: dict[Path, Node], root: Path, background: float = 1.0, *, blender: bool = False, as_source: bool = False
 ) -> Parsed:
-    """Read the transforms file in `folder` of the capture at `root`, given its content. Relative paths start at the
-    file. as_source: see `Parsed`."""
-    parsed = Parsed(root, as_source=as_source)
-    if document.has("tissues"):
-        document.child("tissues").error("a capture has one tissue", SEPARATE_TISSUES)
-        return parsed
-    _parse_header(document, parsed)
-    _parse_frames(document, folder, parsed, background)
-    parsed = _by_name(parsed)
-    _parse_points(document, folder, parsed)
-    parsed.instruments = all_instruments(parsed.frames, declared_instruments(document))
-    _warn_of_unread_states(document, parsed)
+    """Read the transforms file of the capture at `root`, or Blender's files of one split each, named by the file; all
+    given with their content. Relative paths start at the file. as_source: see `Parsed`.
+
+    Transparent pixels show `background`. Of Blender's without states, and without a point cloud, seeded random points
+    in a cube are used; where no frame at all has a time nothing moves (NeRF's synthetic scenes): every frame then has
+    time 0.
+    """
+    parsed, documents = Parsed(root, as_source=as_source), list(files.values())
+    declared: dict[str, Instrument] = {}
+    for file, document in files.items():
+        if document.has("tissues"):
+            document.child("tissues").error("a capture has one tissue", SEPARATE_TISSUES)
+            return parsed
+        suffix = file.stem.rpartition("_")[2]
+        split = suffix if blender and suffix in ("train", "val", "test") else None
+        _parse_header(document, parsed)
+        _parse_frames(document, file.parent, parsed, background, split, EXTENSIONS if blender else ())
+        if parsed.points is None:
+            _parse_points(document, file.parent, parsed)
+        declared = {item.name: item for item in declared_instruments(document)} | declared
+    parsed.instruments = all_instruments(parsed.frames, tuple(declared.values()))
+    for document in documents:
+        _warn_of_unread_states(document, parsed)
+    if not blender:
+        return _by_name(parsed)
+    if not parsed.instruments and not any("time" in frame for one in documents for frame in _frame_objects(one)):
+        parsed.frames = [replace(frame, state=replace(frame.state, time=0.0)) for frame in parsed.frames]
+        parsed.timed = True
+    if not parsed.instruments and parsed.points is None:
+        parsed.points = random_points(np.zeros(3), BLENDER_HALF_SIZE)
+        parsed.points_place = documents[0].child("ply_file_path")
     return parsed
 
 
@@ -70,44 +94,6 @@ def _by_name(parsed: Parsed) -> Parsed:
         for frame, rank in zip(ordered.frames, sorted(ranks), strict=True)
     ]
     return ordered
-
-
-def is_blender(document: Node) -> bool:
-    """Return True if a transforms file has the field of view for intrinsics and no states, as Blender writes."""
-    value = document.value
-    states = "instruments" in value or any("instruments" in frame for frame in _frame_objects(document))
-    return "camera_angle_x" in value and "fl_x" not in value and not states
-
-
-def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0, *, as_source: bool = False) -> Parsed:
-    """Read the files of a Blender capture, given with their content, one split each, named by the file.
-
-    Transparent pixels show `background`. Without a point cloud, and without states, seeded random ones in a cube are
-    used. Where no frame at all has a time and no state nothing moves (NeRF's synthetic scenes): every frame then has
-    time 0. as_source: see `Parsed`.
-    """
-    parsed = Parsed(root, as_source=as_source)
-    declared: dict[str, Instrument] = {}
-    for file, document in files.items():
-        suffix = file.stem.rpartition("_")[2]
-        split = suffix if suffix in ("train", "val", "test") else None
-        _parse_header(document, parsed)
-        _parse_frames(document, file.parent, parsed, background, split, EXTENSIONS)
-        if parsed.points is None:
-            _parse_points(document, file.parent, parsed)
-        declared = {item.name: item for item in declared_instruments(document)} | declared
-    parsed.instruments = all_instruments(parsed.frames, tuple(declared.values()))
-    for document in files.values():
-        _warn_of_unread_states(document, parsed)
-    if parsed.instruments:
-        return parsed
-    if not any("time" in frame for document in files.values() for frame in _frame_objects(document)):
-        parsed.frames = [replace(frame, state=replace(frame.state, time=0.0)) for frame in parsed.frames]
-        parsed.timed = True
-    if parsed.points is None:
-        parsed.points = random_points(np.zeros(3), BLENDER_HALF_SIZE)
-        parsed.points_place = next(iter(files.values())).child("ply_file_path")
-    return parsed
 
 
 def _frame_objects(document: Node) -> list[dict[str, Any]]:
@@ -130,24 +116,18 @@ def _parse_header(document: Node, parsed: Parsed) -> None:
     """Check what holds for the whole file: schema and units, and read `instrument_frame`, `camera_motion` and
     `lens`."""
     value = document.value
-    schema = value.get("schema", SCHEMA)
-    if schema != SCHEMA:
-        document.child("schema").error(
-            f"is {printable(schema)}, not {SCHEMA!r}", "use a version of neeco that knows it"
-        )
+    if (schema := value.get("schema", SCHEMA)) != SCHEMA:
+        message = f"is {printable(schema)}, not {SCHEMA!r}"
+        document.child("schema").error(message, "use a version of neeco that knows it")
     if value.get("units", "mm") not in _MILLIMETRES:
         message = f"is {printable(value['units'])}; lengths must be mm"
         document.child("units").error(message, "convert all poses and points")
-    registration = value.get("instrument_frame", "world")
-    if registration not in ("world", "unregistered"):
-        document.child("instrument_frame").error(f"is {printable(registration)}", "write 'world' or 'unregistered'")
-    parsed.registered = parsed.registered and registration != "unregistered"
-    motion = value.get("camera_motion", "moving")
-    if motion not in ("moving", "still"):
-        document.child("camera_motion").error(f"is {printable(motion)}", "write 'moving' or 'still'")
-    parsed.still = parsed.still or motion == "still"
-    if document.has("lens"):
-        parsed.lens = parse_lens(document.child("lens"))
+    for key, words in (("instrument_frame", ("world", "unregistered")), ("camera_motion", ("moving", "still"))):
+        if (stated := value.get(key, words[0])) not in words:
+            document.child(key).error(f"is {printable(stated)}", f"write {' or '.join(map(repr, words))}")
+    parsed.registered = parsed.registered and value.get("instrument_frame") != "unregistered"
+    parsed.still = parsed.still or value.get("camera_motion") == "still"
+    parsed.lens = document.given("lens", lambda node: node.tried(parse_lens), parsed.lens)
     parsed.says_units = parsed.says_units or value.get("units") is not None or value.get("schema") == SCHEMA
 
 
@@ -160,35 +140,25 @@ def _parse_frames(
     extensions: tuple[str, ...] = (),
 ) -> None:
     """Append the file's frames. `split` names them all where given; `extensions` are tried on paths without one."""
-    nodes = document.child("frames")
-    if nodes.value is None:
-        nodes.error("is missing", "list the images and their cameras there")
+    frames = document.child("frames")
+    if not frames.value:
+        frames.error("is missing" if frames.value is None else "is empty", "list the images and their cameras there")
         return
-    if not isinstance(nodes.value, list):
-        nodes.error(f"expected a list, found {printable(nodes.value)}")
-        return
-    splits, header = _Splits(document, split), _HeaderReport(document, len(nodes.value))
-    timed = 0
-    for index, node in enumerate(nodes.items()):
-        if not node.is_object():
+    nodes = frames.tried(Node.items) or []
+    splits, first, timed = _Splits(document, split), len(document.report.problems), 0
+    for index, node in enumerate(nodes):
+        if node.tried(Node.members) is None:
             continue
-        image_path = None
-        if (file := node.child("file_path")).value is None:
-            file.error("is missing", "name the frame's image")
-        else:
-            image_path = _image(file, folder, parsed, extensions)
+        image_path = named_image(node.child("file_path"), folder, parsed, extensions)
         name = splits.of(node, index)
-        pose = node.child("transform_matrix").rigid()
-        mask_path = _file(node.child("mask_path"), folder, parsed.root) if node.has("mask_path") else None
-        time = node.child("time").number() if node.has("time") else float(index)
-        if time is not None and (fault := time_fault(time)) is not None:
-            node.child("time").error(*fault)
-            time = None
+        pose = node.child("transform_matrix").tried(Node.rigid)
+        mask_path = node.given("mask_path", lambda mask: mask.tried(named_file, folder, parsed.root), None)
+        time = node.given("time", lambda stated: stated.tried(_time), float(index))
         timed += node.has("time")
         instruments = parse_instruments(node)
         if image_path is None:
             continue
-        camera = CameraFields(node, header.document, image_path, parsed).camera()
+        camera = CameraFields(node, document, image_path, parsed).camera()
         if name is None or time is None or instruments is None:
             continue
         if pose is None or camera is None:
@@ -199,20 +169,38 @@ def _parse_frames(
             camera = replace(camera, world_from_camera=opencv)
         parsed.frames.append(Frame(image_path, camera, State(instruments, time), name, mask_path, background))
         parsed.places.append(node)
-    header.pass_on()
-    if nodes.value == []:
-        nodes.error("is empty", "list the images and their cameras there")
-    elif timed < len(nodes.value):  # where not every frame has a time, the order stands in for all: no mix of units
+    _count_shared(document.report, first, len(nodes))
+    if timed < len(nodes):  # where not every frame has a time, the order stands in for all: no mix of units
         parsed.timed = False
         for order, frame in enumerate(parsed.frames):
             parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
 
 
+def _count_shared(report: ProblemReport, first: int, frames: int) -> None:
+    """Merge problems, from the `first` on, of the camera at the file's top level: each once, before those of frames,
+    with the number of frames it concerns."""
+    found = report.problems[first:]
+    shared = Counter(problem for problem in found if not problem.field.startswith("frames["))
+    merged = []
+    for problem, count in shared.items():
+        concerned = "" if frames == 1 else f", for {count} of {frames} frames"
+        merged.append(replace(problem, message=problem.message + concerned))
+    report.problems[first:] = [*merged, *(problem for problem in found if problem not in shared)]
+
+
+def _time(node: Node) -> float:
+    time = node.number()
+    if (fault := time_fault(time)) is not None:
+        node.fail(*fault)
+    return time
+
+
 def _parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
     """Read the point cloud that `ply_file_path` names, if it names one."""
     parsed.points_place = document.child("ply_file_path")
-    path = _file(parsed.points_place, folder, parsed.root) if document.has("ply_file_path") else None
-    if path is None:
+    if (
+        path := document.given("ply_file_path", lambda node: node.tried(named_file, folder, parsed.root), None)
+    ) is None:
         return
     name = relative_name(path, parsed.root)
     parsed.points_place = Node(None, name, "vertex", document.report)
@@ -236,16 +224,16 @@ class _Splits:
         if any(node.value is not None for _, node in lists):
             self.listed = {}
             for name, node in lists:
-                for item in node.items() if node.value is not None else ():
-                    text = item.text()
-                    self.listed.update({} if text is None else {text: name})
+                for item in (node.tried(Node.items) if node.value is not None else None) or ():
+                    if (text := item.tried(Node.text)) is not None:
+                        self.listed[text] = name
         self.some_say = any(frame.get("split") is not None for frame in _frame_objects(document))
 
     def of(self, frame: Node, index: int) -> str | None:
         if self.fixed is not None:
             return self.fixed
         if frame.has("split"):
-            return frame.child("split").text()
+            return frame.child("split").tried(Node.text)
         if self.listed is not None:
             name = self.listed.get(str(frame.value.get("file_path")))
             if name is None:
@@ -255,50 +243,3 @@ class _Splits:
             frame.child("split").error("is missing while other frames have one", "name the frame's split")
             return None
         return "test" if index % TEST_EVERY == 0 else "train"
-
-
-def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path | None:
-    """The existing file inside the capture that a node names; `extensions` are tried on paths without one."""
-    text = node.text()
-    if text is None:
-        return None
-    try:
-        candidates = [inside(root, folder, text + extension) for extension in ("", *extensions)]
-    except NeecoError as error:
-        node.error_from(error)
-        return None
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    node.error(*missing_file(folder, text))
-    return None
-
-
-def _image(node: Node, folder: Path, parsed: Parsed, extensions: tuple[str, ...]) -> Path | None:
-    """`_file` of a frame's image. Of a source, one that is nowhere is counted, and no error."""
-    before = len(node.report.problems)
-    path = _file(node, folder, parsed.root, extensions)
-    problems = node.report.problems
-    if parsed.as_source and len(problems) > before and problems[-1].remedy == NOWHERE:
-        parsed.absent.append(problems.pop())
-    return path
-
-
-class _HeaderReport(ProblemReport):
-    """Problems of the camera at the file's top level, each reported once with the number of frames it concerns.
-
-    A number that neither a frame nor the top level gives counts as the top level's.
-    """
-
-    def __init__(self, document: Node, frames: int) -> None:
-        super().__init__()
-        self.document = Node(document.value, document.file, document.field, self)
-        self.report, self.first, self.frames = document.report, len(document.report.problems), frames
-
-    def pass_on(self) -> None:
-        """Pass the problems on, each once, before those of the frames."""
-        merged = []
-        for problem, count in Counter(self.problems).items():
-            concerned = "" if self.frames == 1 else f", for {count} of {self.frames} frames"
-            merged.append(replace(problem, message=problem.message + concerned))
-        self.report.problems[self.first : self.first] = merged

@@ -47,21 +47,17 @@ class StatedDistortion:
     place: Node | None  # where it is stated: a fisheye model or the first coefficient; None: there is no distortion
 
 
-def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion | None:
-    """Read a lens's distortion as nerfstudio and instant-ngp write it; `node_of` gives the value of a key.
-
-    None, and reported, where it cannot be read.
-    """
+def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion:
+    """Read a lens's distortion as nerfstudio and instant-ngp write it; `node_of` gives the value of a key. Raises Fault
+    where it cannot be read."""
     named = node_of("camera_model")
     model = str(named.value or "PINHOLE").upper()
     if node_of("is_fisheye").value is True:
         model = "OPENCV_FISHEYE"
     wrong = [node for key in NOT_READ if (node := node_of(key)).value]
-    wrong += [named] if model not in MODELS else []
-    if wrong:
-        message = f"is {printable(wrong[0].value)}; this lens model cannot be undistorted"
-        wrong[0].error(message, "undistort the images first, and write PINHOLE")
-        return None
+    for node in wrong + ([named] if model not in MODELS else []):
+        message = f"is {printable(node.value)}: this lens model cannot be undistorted"
+        node.fail(message, "undistort the images first, and write PINHOLE")
     nodes: dict[str, Node] = {}
     for key in LISTS:
         node = node_of(key)
@@ -70,21 +66,16 @@ def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion | None
             continue
         names = LISTED.get(len(node.value)) if isinstance(node.value, list) else None
         if names is None:
-            node.error(f"expected 4, 5, 6 or 8 coefficients, found {printable(node.value)}", "correct it")
-            return None
+            node.fail(f"expected 4, 5, 6 or 8 coefficients, found {printable(node.value)}", "correct it")
         nodes |= dict(zip(NAMES[:4] if model in FISHEYE and len(names) == 4 else names, node.items(), strict=True))
     for name in NAMES:
         node = node_of(name)
         if node.value is None or (as_float(node.value) == 0 and name in nodes):
             continue
         if name in nodes and nodes[name].value != node.value:
-            node.error(f"is {printable(node.value)}, but {nodes[name].field} differs", "state each once")
-            return None
+            node.fail(f"is {printable(node.value)}, but {nodes[name].field} differs", "state each once")
         nodes.setdefault(name, node)
-    numbers = {name: node.number() for name, node in nodes.items()}
-    coefficients = {name: number for name, number in numbers.items() if number}
-    if None in numbers.values():
-        return None
+    coefficients = {name: number for name, node in nodes.items() if (number := node.number())}
     if model in FISHEYE:
         return StatedDistortion(model, coefficients, named if named.value else node_of("is_fisheye"))
     return StatedDistortion(model, coefficients, nodes[min(coefficients, key=NAMES.index)] if coefficients else None)
@@ -164,52 +155,33 @@ def _polynomial(squares: np.ndarray, coefficients: tuple[float, ...]) -> np.ndar
     return np.asarray(np.polynomial.polynomial.polyval(squares, (1.0, *coefficients)))
 
 
-def parse_lens(node: Node) -> Lens | None:
-    """The lens that a node describes; None, and reported, where that is none."""
-    if not node.is_object():
-        return None
-    size = [node.child(key).integer(least=1) for key in ("w", "h")]
-    focal = [node.child(key).number(above=0, below=MAX_PX) for key in INTRINSICS[:2]]
-    center = [node.child(key).number(above=-MAX_PX, below=MAX_PX) for key in INTRINSICS[2:]]
-    border = _border(node.child("border")) if node.has("border") else None
-    distortion = _distortion(node)
-    width, height = size
-    fl_x, fl_y, cx, cy = *focal, *center
-    if width is None or height is None or fl_x is None or fl_y is None or cx is None or cy is None:
-        return None
-    if distortion is None or (border is None and node.has("border")):
-        return None
+def parse_lens(node: Node) -> Lens:
+    """The lens that a node describes. Raises Fault where that is none."""
+    stated = node.members()
+    width, height = (node.child(key).integer(least=1) for key in ("w", "h"))
+    fl_x, fl_y = (node.child(key).number(above=0, below=MAX_PX) for key in INTRINSICS[:2])
+    cx, cy = (node.child(key).number(above=-MAX_PX, below=MAX_PX) for key in INTRINSICS[2:])
+    # the coefficients up to the last that is given, as many as one of OpenCV's models has
+    last = max((k for k, name in enumerate(COEFFICIENT_NAMES, 1) if node.has(name)), default=0)
+    names = COEFFICIENT_NAMES[: min(count for count in COEFFICIENT_COUNTS if count >= last)]
+    distortion = tuple(
+        stated[name].number(above=-MAX_COEFFICIENT, below=MAX_COEFFICIENT) if node.has(name) else 0.0 for name in names
+    )
+    border = node.given("border", _border, None)
     if (fault := size_fault(width, height) or focal_fault(fl_x, fl_y, width, height)) is not None:
-        node.error(*fault)
-        return None
+        node.fail(*fault)
     lens = Lens(fl_x, fl_y, cx, cy, distortion, (width, height), border=border)
     try:
         lens.pinhole((width, height))
     except NeecoError as error:
-        node.error_from(NeecoError(str(error).removeprefix("lens: ")))
-        return None
+        node.fail(str(error).removeprefix("lens: "))
     return lens
 
 
-def _distortion(node: Node) -> tuple[float, ...] | None:
-    """The coefficients up to the last that is given, as many as one of OpenCV's models has."""
-    stated = [node.has(name) for name in COEFFICIENT_NAMES]
-    last = len(stated) - stated[::-1].index(True) if any(stated) else 0
-    names = COEFFICIENT_NAMES[: min(count for count in COEFFICIENT_COUNTS if count >= last)]
-    read = [
-        node.child(name).number(above=-MAX_COEFFICIENT, below=MAX_COEFFICIENT) if node.has(name) else 0.0
-        for name in names
-    ]
-    values = tuple(value for value in read if value is not None)
-    return values if len(values) == len(read) else None
-
-
-def _border(node: Node) -> Border | None:
-    if not node.is_object():
-        return None
+def _border(node: Node) -> Border:
+    node.members()
     x, y = (node.child(key).number(above=-MAX_PX, below=MAX_PX) for key in BORDER[:2])
-    radius = node.child(BORDER[2]).number(above=1, below=MAX_PX)
-    return None if x is None or y is None or radius is None else (x, y, radius)
+    return x, y, node.child(BORDER[2]).number(above=1, below=MAX_PX)
 
 
 def placeholder_camera(image_path: Path) -> Camera:
@@ -226,28 +198,30 @@ def _size_or_largest(image_path: Path) -> tuple[int, int]:
 
 
 class CameraFields:
-    """Looks a camera's numbers up in the frame first, then at the top level, and checks them."""
+    """Looks a camera's numbers up in the frame first, then at the top level, and checks them; every fault is
+    reported."""
 
     def __init__(self, frame: Node, document: Node, image_path: Path, parsed: Parsed) -> None:
         self.frame, self.document, self.image_path, self.parsed = frame, document, image_path, parsed
 
     def camera(self) -> Camera | None:
         """The frame's camera at the origin; None, and reported, where its numbers are wrong."""
-        stated = self._distortion()
-        size = self._size()
+        stated = self._node("camera_model").tried(lambda _: self._distortion())
+        size = self.frame.child("file_path").tried(lambda _: self._size())
         width, height = size or _size_or_largest(self.image_path)
-        fx = self._focal("fl_x", "camera_angle_x", width)
-        fy = self._focal("fl_y", "camera_angle_y", height) if self._has("fl_y", "camera_angle_y") else fx
-        cx, cy = self._center("cx", width), self._center("cy", height)
+        has_fy = self._has("fl_y", "camera_angle_y")
+        fx = self._node("fl_x").tried(self._focal, "camera_angle_x", width)
+        fy = self._node("fl_y").tried(self._focal, "camera_angle_y", height) if has_fy else fx
+        cx, cy = (self._node(key).tried(_center, side) for key, side in (("cx", width), ("cy", height)))
         if size is None or fx is None or fy is None or cx is None or cy is None or stated is None:
             return None
         if (fault := focal_fault(fx, fy, width, height)) is not None:
             self._node("fl_x" if self._has("fl_x") else "camera_angle_x").error(*fault)
             return None
-        try:
-            distortion = opencv_distortion(stated.model, stated.coefficients, (fx, fy, cx, cy), size)
-        except NeecoError as error:
-            (stated.place or self._node("camera_model")).error_from(error)
+        distortion = (stated.place or self._node("camera_model")).tried(
+            lambda _: opencv_distortion(stated.model, stated.coefficients, (fx, fy, cx, cy), size)
+        )
+        if distortion is None:
             return None
         return Camera(torch.eye(4), fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
 
@@ -257,59 +231,48 @@ class CameraFields:
     def _node(self, key: str) -> Node:
         return (self.frame if self.frame.has(key) else self.document).child(key)
 
-    def _distortion(self) -> StatedDistortion | None:
-        """None, and reported, where it cannot be read, and for distorted images that are read in place."""
+    def _distortion(self) -> StatedDistortion:
+        """Raises Fault where it cannot be read, and for distorted images that are read in place."""
         stated = stated_distortion(self._node)
-        if stated is None or stated.place is None or self.parsed.as_source:
-            return stated
-        message = f"is {printable(stated.place.value)}: cameras must be PINHOLE, and the images are distorted"
-        stated.place.error(message, f"undistort them: neeco ingest {self.parsed.root} --output CAPTURE")
-        return None
+        if stated.place is not None and not self.parsed.as_source:
+            message = f"is {printable(stated.place.value)}: cameras must be PINHOLE, and the images are distorted"
+            stated.place.fail(message, f"undistort them: neeco ingest {self.parsed.root} --output CAPTURE")
+        return stated
 
-    def _size(self) -> tuple[int, int] | None:
+    def _size(self) -> tuple[int, int]:
         """(width, height), from the image itself where not stated."""
         if not self._has("w", "h"):
             try:
                 return image_size(self.image_path)
             except NeecoError as error:
-                message = str(error).removeprefix(f"{self.image_path}: ")
-                self.frame.child("file_path").error(f"{printable(self.image_path.name)}: {message}")
-                return None
-        width, height = (self._positive(key) for key in ("w", "h"))
-        if width is None or height is None:
-            return None
+                raise NeecoError(str(error).replace(str(self.image_path), printable(self.image_path.name))) from None
+        width, height = (_positive(self._node(key)) for key in ("w", "h"))
         if (fault := size_fault(width, height)) is not None:
-            self._node("w").error(*fault)
-            return None
+            self._node("w").fail(*fault)
         return int(width), int(height)
 
-    def _focal(self, key: str, angle_key: str, extent: int) -> float | None:
+    def _focal(self, node: Node, angle_key: str, extent: int) -> float:
         """Focal length in px, from the field of view where only that is given."""
-        if self._has(key) or not self._has(angle_key):
-            return self._positive(key)
-        angle = self._positive(angle_key)
-        if angle is not None and angle >= math.pi:
-            self._node(angle_key).error(f"is {angle:g} rad, not below pi", "give the field of view in radians")
-            return None
-        return None if angle is None else 0.5 * extent / math.tan(0.5 * angle)
+        if node.value is not None or not self._has(angle_key):
+            return _positive(node)
+        angle = _positive(self._node(angle_key))
+        if angle >= math.pi:
+            self._node(angle_key).fail(f"is {angle:g} rad, not below pi", "give the field of view in radians")
+        return 0.5 * extent / math.tan(0.5 * angle)
 
-    def _center(self, key: str, extent: int) -> float | None:
-        """Principal point in px: inside the image, its middle where not stated."""
-        if not self._has(key):
-            return extent / 2
-        value = self._node(key).number()
-        if value is not None and not 0 < value < extent:
-            self._node(key).error(f"is {value:g}, outside the image (0 .. {extent})", "give it in pixels of this image")
-            return None
-        return value
 
-    def _positive(self, key: str) -> float | None:
-        node = self._node(key)
-        if node.value is None:
-            node.error("is missing", "give the camera's intrinsics at the top level or in every frame")
-            return None
-        value = node.number()
-        if value is not None and value <= 0:
-            node.error(f"is {value:g}, must be positive")
-            return None
-        return value
+def _center(node: Node, extent: int) -> float:
+    """Principal point in px: inside the image, its middle where not stated."""
+    value = extent / 2 if node.value is None else node.number()
+    if not 0 < value < extent:
+        node.fail(f"is {value:g}, outside the image (0 .. {extent})", "give it in pixels of this image")
+    return value
+
+
+def _positive(node: Node) -> float:
+    if node.value is None:
+        node.fail("is missing", "give the camera's intrinsics at the top level or in every frame")
+    value = node.number()
+    if value <= 0:
+        node.fail(f"is {value:g}, must be positive")
+    return value

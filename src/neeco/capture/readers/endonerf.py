@@ -7,7 +7,8 @@ row, then the nearest and farthest depth; the columns of R are the camera's down
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,18 +33,6 @@ FIRST_TEST = 1  # frames 1, 9, 17, ... test, as in EndoGaussian, SurgicalGaussia
 MAX_STILL_CHANGE = 1e-6  # of the entries of a still camera's pose
 
 
-@dataclass(frozen=True)
-class _Row:
-    """One image's row: camera pose (OpenCV axes), size, focal length and depth bounds, in the folder's own unit."""
-
-    world_from_camera: np.ndarray  # [4, 4]
-    width: int
-    height: int
-    focal: float
-    near: float
-    far: float
-
-
 def is_endonerf_folder(root: Path) -> bool:
     """Return True if a folder has EndoNeRF's poses."""
     return (root / POSES_FILE).is_file()
@@ -60,28 +49,22 @@ def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
     try:
         table = _load(root)
     except NeecoError as error:
-        file.error_from(error)
+        file.error(*str(error).split("; ", 1))
         return parsed
     images = folder_images(root, "images", report)
     if len(images) != len(table):
         message = f"has {len(table)} rows for {len(images)} images in images/"
         file.error(message, "each image needs one row, in the order of the sorted names")
         return parsed
-    rows = []
     for order, (path, values) in enumerate(zip(images, table, strict=True)):
         place = file.item(order)
-        row = _row(values, place)
-        if row is None:
-            continue
-        rows.append(row)
-        pose = torch.from_numpy(row.world_from_camera).float()
-        width, height = row.width, row.height
-        camera = Camera(pose, fx=row.focal, fy=row.focal, cx=width / 2, cy=height / 2, width=width, height=height)
-        split = "test" if order % TEST_EVERY == FIRST_TEST else "train"
-        parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
-        parsed.places.append(place)
-    parsed.points = _points(rows)
-    _warn_of_limits(root, rows, file)
+        if (camera := place.tried(_camera, values)) is not None:
+            split = "test" if order % TEST_EVERY == FIRST_TEST else "train"
+            parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
+            parsed.places.append(place)
+    if len(parsed.frames) == len(table):
+        parsed.points = _points([frame.camera for frame in parsed.frames], table)
+    _warn_of_limits(root, parsed, file)
     return parsed
 
 
@@ -96,7 +79,7 @@ def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
         try:
             paths.append(inside(root, root / folder, path.name))
         except NeecoError as error:
-            Node(None, f"{folder}/{path.name}", "", report).error_from(error)
+            Node(None, f"{folder}/{path.name}", "", report).error(*str(error).split("; ", 1))
     return paths
 
 
@@ -119,40 +102,39 @@ def _load(root: Path) -> np.ndarray:
     return np.array(table, dtype=np.float64)
 
 
-def _row(values: np.ndarray, place: Node) -> _Row | None:
+def _camera(place: Node, values: np.ndarray) -> Camera:
+    """The camera of an image's row [17] of numbers. Raises Fault."""
     matrix = values[:15].reshape(3, 5)
     with np.errstate(invalid="ignore"):
         pose = LLFF.camera_to_opencv(matrix[:, :4])
-    rigid = replace(place, value=pose.tolist()).rigid()
     height, width, focal = (float(value) for value in matrix[:, 4])
     if (fault := size_fault(width, height) or focal_fault(focal, focal, width, height)) is not None:
         message = f"its height, width and focal length are {height:g}, {width:g}, {focal:g}: {fault[0]}"
-        place.error(message, "write whole pixels and a positive focal length in the fifth column")
-        return None
-    if rigid is None:
-        return None
-    return _Row(rigid, int(width), int(height), focal, float(values[15]), float(values[16]))
+        place.fail(message, "write whole pixels and a positive focal length in the fifth column")
+    world_from_camera = torch.from_numpy(replace(place, value=pose.tolist()).rigid()).float()
+    return Camera(
+        world_from_camera, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=int(width), height=int(height)
+    )
 
 
-def _points(rows: list[_Row]) -> PointCloud | None:
-    """Random points about the middle of the depth bounds; None when the bounds are unusable."""
-    good = [row for row in rows if np.isfinite([row.near, row.far]).all() and 0 <= row.near < row.far < 1e9]
-    if not good or len(good) < len(rows):
-        return None
-    middles = np.array([(row.near + row.far) / 2 for row in good])
-    forward = np.stack([row.world_from_camera[:3, 2] for row in good])
-    centers = np.stack([row.world_from_camera[:3, 3] for row in good]) + middles[:, None] * forward
-    half_width = max(0.5 * row.width / row.focal * middle for row, middle in zip(good, middles, strict=True))
-    half_depth = max(0.5 * (row.far - row.near) for row in good)
-    return random_points(centers.mean(axis=0), max(half_width, half_depth))
+def _points(cameras: Sequence[Camera], table: np.ndarray) -> PointCloud | None:
+    """Random points about the middle of the depth bounds of a table [N, 17]; None when the bounds are unusable."""
+    near, far = table[:, 15:].T
+    with np.errstate(invalid="ignore"):
+        if not ((near >= 0) & (near < far) & (far < 1e9)).all():  # nor when NaN
+            return None
+    middles, poses = (near + far) / 2, LLFF.camera_to_opencv(table[:, :15].reshape(-1, 3, 5)[..., :4])
+    centers = poses[:, :3, 3] + middles[:, None] * poses[:, :3, 2]
+    slopes = np.array([0.5 * camera.width / camera.fx for camera in cameras])
+    return random_points(centers.mean(axis=0), max((slopes * middles).max(), (0.5 * (far - near)).max()))
 
 
-def _warn_of_limits(root: Path, rows: list[_Row], file: Node) -> None:
+def _warn_of_limits(root: Path, parsed: Parsed, file: Node) -> None:
     """Warn of what such a folder lacks, and of what in it is not read."""
     remedy = "only methods that need none can be trained, such as 3dgs"
     file.child("instruments").warning("no instrument states", remedy)
     file.child("units").warning("names no unit of length", "lengths are taken as mm: distances may be off")
-    poses = np.stack([row.world_from_camera for row in rows]) if rows else np.zeros((0, 4, 4))
+    poses = [frame.camera.world_from_camera.double().numpy() for frame in parsed.frames]
     if len(poses) > 1 and np.ptp(poses, axis=0).max() < MAX_STILL_CHANGE:
         message = "the camera never moves, so the images do not determine depth"
         file.child("poses").warning(message, "views other than the recorded one will be wrong")

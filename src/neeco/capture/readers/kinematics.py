@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import distinct_keys, read_text
-from neeco.capture.documents import Node, RaisingReport, printable
+from neeco.base.settings import Fault, faults_in
+from neeco.capture.documents import Node, printable
 from neeco.capture.kinematics import FIXED, JOINT_TYPES, PRISMATIC, REVOLUTE, Array, KinematicTree, Link
 from neeco.geometry.rotations import rigid
 
@@ -28,94 +29,59 @@ MAX_GAIN = 1e3
 UNIT_TOLERANCE = 1e-12  # of the length of a unit vector of float64
 
 
-def parse_kinematics(node: Node) -> KinematicTree | None:
-    """The tree that a node describes; None, and reported, where that is none."""
-    if not node.is_object():
-        return None
-    links = [_parse_link(item) for item in node.child("links").items()]
-    pose_of = node.child("pose_of").text() if node.has("pose_of") else None
-    parsed = tuple(link for link in links if link is not None)
-    if len(parsed) < len(links) or not isinstance(node.child("links").value, list):
-        return None
-    if node.has("pose_of") and pose_of is None:
-        return None
-    try:
+def parse_kinematics(node: Node) -> KinematicTree:
+    """The tree that a node describes. Raises Fault where that is none."""
+    node.members()
+    links, pose_of = node.child("links"), node.given("pose_of", Node.text, None)
+    parsed = tuple(map(_parse_link, links.items()))
+    with links.blamed():
         return KinematicTree(parsed, pose_of)
-    except NeecoError as error:
-        node.child("links").error_from(error)
-        return None
 
 
 def kinematics_of(value: Any, file: str) -> KinematicTree:
     """The tree of a plain dict, as in a JSON or YAML file. Raises NeecoError naming `file` and the field."""
-    tree = parse_kinematics(Node(value, file, "kinematics", RaisingReport()))
-    assert tree is not None
-    return tree
+    with faults_in(file):
+        return parse_kinematics(Node(value, file, "kinematics"))
 
 
-def _parse_link(node: Node) -> Link | None:
-    if not node.is_object():
-        return None
-    name = node.child("name").text()
-    parent = node.child("parent").text() if node.has("parent") else None
-    type_node = node.child("type")
-    kind = type_node.text() if node.has("type") else FIXED
-    if kind is not None and kind not in JOINT_TYPES:
-        type_node.error(f"is {printable(kind)}", f"write {', '.join(JOINT_TYPES)}")
-        kind = None
-    origin = _origin(node.child("origin")) if node.has("origin") else np.eye(4)
-    axis = _axis(node.child("axis")) if node.has("axis") else np.array([0.0, 0.0, 1.0])
-    value = _gains(node.child("value")) if node.has("value") else {}
-    offset = node.child("offset").number(above=-MAX_MM, below=MAX_MM) if node.has("offset") else 0.0
-    limits = node.child("limits").range("rad or mm") if node.has("limits") else None
-    body = node.child("body").flag(True)
-    if kind not in (None, FIXED) and not node.has("axis"):
-        node.child("axis").error("is missing", "give the joint's axis in the parent's frame, three numbers")
-        return None
-    wrong = (node.has("parent") and parent is None) or (node.has("limits") and limits is None)
-    if wrong or body is None:
-        return None
-    if name is None or kind is None or origin is None or axis is None or value is None or offset is None:
-        return None
-    return Link(name, parent, kind, origin, axis, value, offset=offset, limits=limits, body=body)
+def _parse_link(node: Node) -> Link:
+    node.members()
+    kind = node.given("type", Node.text, FIXED)
+    if kind not in JOINT_TYPES:
+        node.child("type").fail(f"is {printable(kind)}", f"write {', '.join(JOINT_TYPES)}")
+    if kind != FIXED and not node.has("axis"):
+        node.child("axis").fail("is missing", "give the joint's axis in the parent's frame, three numbers")
+    gains = node.child("value").members(optional=True)
+    return Link(
+        node.child("name").text(),
+        node.given("parent", Node.text, None),
+        kind,
+        node.given("origin", _origin, np.eye(4)),
+        node.given("axis", _axis, np.array([0.0, 0.0, 1.0])),
+        {name: gain.number(above=-MAX_GAIN, below=MAX_GAIN) for name, gain in gains.items()},
+        offset=node.given("offset", lambda offset: offset.number(above=-MAX_MM, below=MAX_MM), 0.0),
+        limits=node.given("limits", lambda limits: limits.range("rad or mm"), None),
+        body=node.given("body", Node.flag, True),
+    )
 
 
-def _origin(node: Node) -> Array | None:
+def _origin(node: Node) -> Array:
     """parent_from_link of three numbers (mm) or a rigid transform."""
     if isinstance(node.value, list) and any(isinstance(row, list) for row in node.value):
         return node.rigid()
-    place = node.numbers(3, "x, y, z in mm")
-    if place is None:
-        return None
-    if max(map(abs, place)) > MAX_MM:
-        node.error(f"lies {max(map(abs, place)):g} mm away", "give it in mm, in the parent's frame")
-        return None
-    origin = np.eye(4)
-    origin[:3, 3] = place
-    return origin
+    place = np.array(node.numbers(3, "x, y, z in mm"))
+    if np.abs(place).max() > MAX_MM:
+        node.fail(f"lies {np.abs(place).max():g} mm away", "give it in mm, in the parent's frame")
+    return rigid(np.eye(3), place)
 
 
-def _axis(node: Node) -> Array | None:
-    direction = node.numbers(3, "x, y, z of the axis in the parent's frame")
-    if direction is None:
-        return None
+def _axis(node: Node) -> Array:
+    direction = np.array(node.numbers(3, "x, y, z of the axis in the parent's frame"))
     length = math.hypot(*direction)
     if not 1e-6 < length < 1e6:
-        node.error("is no direction", "give three numbers that are not all 0")
-        return None
-    if (
-        abs(length - 1) < UNIT_TOLERANCE
-    ):  # as written by us: divided again, its last digits would change with every reading
-        return np.array(direction)
-    return np.array(direction) / length
-
-
-def _gains(node: Node) -> dict[str, float] | None:
-    if not node.is_object():
-        return None
-    gains = {name: node.child(name).number(above=-MAX_GAIN, below=MAX_GAIN) for name in node.value}
-    valid = {name: gain for name, gain in gains.items() if gain is not None}
-    return valid if len(valid) == len(gains) else None
+        node.fail("is no direction", "give three numbers that are not all 0")
+    # as written by us it stays: divided again, its last digits would change with every reading
+    return direction if abs(length - 1) < UNIT_TOLERANCE else direction / length
 
 
 DVRK_READINGS = ("wrist_pitch", "wrist_yaw", "jaw")  # what drives the joints beyond the roll
@@ -134,69 +100,61 @@ def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) 
     Hartenberg as modified by Craig. Raises NeecoError for a file of another kind, or a name that is none of the
     readings.
     """
-    path, names = Path(path), dict(readings or {})
-    document = Node(_json_with_comments(path), str(path), "", RaisingReport())
-    document.is_object()
+    path = Path(path)
+    text = _STRING_OR_COMMENT.sub(lambda match: match[1] or " ", read_text(path, DVRK_TOOL))
+    try:
+        document = json.loads(text, object_pairs_hook=distinct_keys)
+    except (ValueError, RecursionError) as error:
+        raise NeecoError(f"{path}: not readable as {DVRK_TOOL} ({error}); correct it") from None
+    with faults_in(path):
+        return _dvrk_tool(Node(document, str(path)), dict(readings or {}))
+
+
+def _dvrk_tool(document: Node, names: Mapping[str, str]) -> KinematicTree:
+    document.members()
     frames = document.child("DH")
     if frames.child("convention").value != "modified":
         convention = printable(frames.child("convention").value)
-        frames.child("convention").error(f"is {convention}, not 'modified'", "give a tool file of the dVRK")
+        frames.child("convention").fail(f"is {convention}, not 'modified'", "give a tool file of the dVRK")
     # older files call them outer_wrist_pitch and outer_wrist_yaw
-    joints = {(item.child("name").text() or "").removeprefix("outer_"): item for item in frames.child("joints").items()}
+    joints = {item.child("name").text().removeprefix("outer_"): item for item in frames.child("joints").items()}
     # hooks and spatulas have an entry for jaws, too, which no force moves
     has_jaws = document.has("jaw") and document.child("jaw").child("ftmax").value != 0
     for joint in DVRK_READINGS[:2]:
         if joint not in joints:
-            frames.child("joints").error(f"there is no joint {joint}", "only tools with a wrist have a tree")
+            frames.child("joints").fail(f"there is no joint {joint}", "only tools with a wrist have a tree")
     available = DVRK_READINGS if has_jaws else DVRK_READINGS[:2]
     for name in names:
         if name not in available:
-            raise NeecoError(f"{path}: readings: {name!r} is no joint of this tool; it has {', '.join(available)}")
+            raise Fault("readings", f"{name!r} is no joint of this tool; it has {', '.join(available)}")
     pitch, yaw, jaw = (names.get(joint, joint) for joint in DVRK_READINGS)
     wrist, pitch_axis = _frame(joints["wrist_pitch"])
     pivot, yaw_axis = _frame(joints["wrist_yaw"])
-    low, high = (joints["wrist_pitch"].child(end).number() or 0.0 for end in ("qmin", "qmax"))
+    low, high = (joints["wrist_pitch"].child(end).number() for end in ("qmin", "qmax"))
     links = [Link("shaft"), Link("wrist", "shaft", REVOLUTE, wrist, pitch_axis, {pitch: 1.0}, limits=(low, high))]
     if has_jaws:
         for side, share in (("left", 0.5), ("right", -0.5)):
             links.append(Link(f"jaw_{side}", "wrist", REVOLUTE, pivot, yaw_axis, {yaw: 1.0, jaw: share}))
     else:
         links.append(Link("end_effector", "wrist", REVOLUTE, pivot, yaw_axis, {yaw: 1.0}))
-    tip = pivot @ _tool_tip(document)
+    key = "tooltip_offset" if document.has("tooltip_offset") else "tooltip-offset"
+    yaw_from_tip = document.given(key, Node.rigid, np.eye(4))
+    yaw_from_tip[:3, 3] *= MM
+    tip = pivot @ yaw_from_tip
     return KinematicTree((*links, Link("tip", "wrist", REVOLUTE, tip, yaw_axis, {yaw: 1.0}, body=False)), "tip")
-
-
-def _json_with_comments(path: Path) -> object:
-    text = _STRING_OR_COMMENT.sub(lambda match: match[1] or " ", read_text(path, DVRK_TOOL))
-    try:
-        return json.loads(text, object_pairs_hook=distinct_keys)
-    except (ValueError, RecursionError) as error:
-        raise NeecoError(f"{path}: not readable as {DVRK_TOOL} ({error}); correct it") from None
 
 
 def _frame(joint: Node) -> tuple[Array, Array]:
     """(parent_from_link [4, 4] mm at a value of 0, the axis [3] in the parent's frame) of a joint in modified
     Denavit-Hartenberg parameters: Rx(alpha) Tx(A) Rz(theta + offset) Tz(D)."""
     if joint.child("type").value != REVOLUTE:
-        joint.child("type").error(f"is {printable(joint.child('type').value)}", "wrists turn: write revolute")
-    numbers = [joint.child(key).number() for key in ("alpha", "A", "theta", "offset", "D")]
-    alpha, length, theta, offset, depth = (0.0 if number is None else number for number in numbers)
+        joint.child("type").fail(f"is {printable(joint.child('type').value)}", "wrists turn: write revolute")
+    alpha, length, theta, offset, depth = (joint.child(key).number() for key in ("alpha", "A", "theta", "offset", "D"))
     c, s = math.cos(alpha), math.sin(alpha)
     before = np.array([[1, 0, 0, MM * length], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]], np.float64)
     c, s = math.cos(theta + offset), math.sin(theta + offset)
     turned = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, MM * depth], [0, 0, 0, 1]], np.float64)
     return before @ turned, before[:3, 2].copy()
-
-
-def _tool_tip(document: Node) -> Array:
-    """yaw_from_tip [4, 4] mm."""
-    key = "tooltip_offset" if document.has("tooltip_offset") else "tooltip-offset"
-    if not document.has(key):
-        return np.eye(4)
-    tip = document.child(key).rigid()
-    assert tip is not None
-    tip[:3, 3] *= MM
-    return tip
 
 
 TYPES = {"fixed": FIXED, "revolute": REVOLUTE, "continuous": REVOLUTE, "prismatic": PRISMATIC}

@@ -95,6 +95,28 @@ def inside(root: Path, folder: Path, text: str) -> Path:
     return path
 
 
+def named_file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path:
+    """The existing file inside the capture that a node names; `extensions` are tried on paths without one. Raises Fault
+    and, for paths that lead out, NeecoError."""
+    text = node.text()
+    candidates = [inside(root, folder, text + extension) for extension in ("", *extensions)]
+    if not (existing := [candidate for candidate in candidates if candidate.is_file()]):
+        node.fail(*missing_file(folder, text))
+    return existing[0]
+
+
+def named_image(node: Node, folder: Path, parsed: Parsed, extensions: tuple[str, ...] = ()) -> Path | None:
+    """`named_file` of a frame's image; None, and reported, without one. Of a source, one that is nowhere is counted,
+    and no error."""
+    if node.value is None:
+        node.error("is missing", "name the frame's image")
+        return None
+    path, problems = node.tried(named_file, folder, parsed.root, extensions), node.report.problems
+    if path is None and parsed.as_source and problems[-1].remedy == NOWHERE:
+        parsed.absent.append(problems.pop())
+    return path
+
+
 def natural_order(name: str) -> list[tuple[int, int, str]]:
     """Key that sorts frame2 before frame10."""
     parts = re.split(r"(\d+)", name.lower())
@@ -130,12 +152,8 @@ def missing_file(folder: Path, text: str) -> Fault:
     message, similar = f"no such file: {printable(text)}", similar_file(folder, text)
     if similar is None:
         return message, NOWHERE
-    if _normal(similar) == _normal(text):
-        form = (
-            "in another Unicode form (macOS decomposes accents)" if similar.lower() != text.lower() else "in other case"
-        )
-        return message, f"{printable(similar)} is there, {form}: correct the path"
-    return message, f"{printable(similar)} is there: correct the path"
+    form = ", in another Unicode form or case" if _normal(similar) == _normal(text) else ""
+    return message, f"{printable(similar)} is there{form}: correct the path"
 
 
 def similar_file(folder: Path, text: str) -> str | None:

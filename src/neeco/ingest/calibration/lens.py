@@ -15,7 +15,8 @@ from scipy.optimize import least_squares
 from neeco.base.errors import NeecoError
 from neeco.base.files import require_file
 from neeco.base.plausible import size_fault
-from neeco.capture.documents import Node, RaisingReport, as_float, printable
+from neeco.base.settings import faults_in
+from neeco.capture.documents import Node, as_float, printable
 from neeco.capture.readers.cameras import opencv_distortion, stated_distortion
 from neeco.geometry.camera import COEFFICIENT_COUNTS
 from neeco.geometry.lens import Border, Lens
@@ -72,8 +73,8 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
     if missing:
         raise NeecoError(f"{path}: {missing[0]}: missing; give fl_x, fl_y, cx, cy (and k1, k2, p1, p2 if distorted)")
     values = [document["fl_x"], document.get("fl_y", document["fl_x"]), document["cx"], document["cy"]]
-    stated = stated_distortion(Node(document, str(path), "", RaisingReport()).child)
-    assert stated is not None  # else it raised
+    with faults_in(path):
+        stated = stated_distortion(Node(document, str(path)).child)
     lens = checked_lens(path, values, (), size)
     try:
         return replace(lens, distortion=opencv_distortion(stated.model, stated.coefficients, lens.intrinsics, size))

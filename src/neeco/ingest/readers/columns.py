@@ -41,7 +41,7 @@ def _unit(kind: str) -> Callable[[Node], str]:
     def parse(node: Node) -> str:
         unit = canonical_unit(str(node.value))
         if unit not in UNITS[kind]:
-            node.error(f"{printable(node.value)} is no unit of {kind}", f"use {', '.join(UNITS[kind])}")
+            node.fail(f"{printable(node.value)} is no unit of {kind}", f"use {', '.join(UNITS[kind])}")
         return unit
 
     return parse

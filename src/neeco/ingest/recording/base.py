@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from neeco.base.errors import NeecoError
 from neeco.base.files import parse_yaml, read_text
 from neeco.base.settings import Fault, faults_in, join_places, printable, read
-from neeco.capture.documents import Node, RaisingReport
+from neeco.capture.documents import Node
 from neeco.geometry.conventions import DVRK_ECM
 from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.columns import CAMERA
@@ -71,12 +71,12 @@ def _of_hand_eye(path: Path) -> StatedBase:
     """Read the YAML that easy_handeye saves, in metres: of a still camera (eye_on_hand: false), base_from_camera.
     Raises NeecoError."""
     remedy = f"give the YAML of easy_handeye, or write {STATED}"
-    node = Node(parse_yaml(path, read_text(path, WHAT), remedy), str(path), "", RaisingReport())
-    node.is_object()  # else it raises
+    node = Node(parse_yaml(path, read_text(path, WHAT), remedy), str(path))
+    node.members()
     parameters, second = node.child("parameters"), node.has("transform")  # of easy_handeye2
     stated = node.child("transform" if second else "transformation")
     if not isinstance(stated.value, dict):
-        stated.error("is missing", remedy)
+        stated.fail("is missing", remedy)
     if second:
         still = parameters.child("calibration_type").value == "eye_on_base"
         places = [stated.child("translation").child(axis) for axis in "xyz"]
@@ -85,18 +85,18 @@ def _of_hand_eye(path: Path) -> StatedBase:
         still = (parameters if parameters.value is not None else node).child("eye_on_hand").value is False
         places = [stated.child(name) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     if not still:
-        node.error(
+        node.fail(
             "does not say `eye_on_hand: false` (`calibration_type: eye_on_base`), so the camera may be on the robot",
             f"calibrate a camera that stands still, or write {STATED}",
         )
     camera = parameters.child("tracking_base_frame") if parameters.has("tracking_base_frame") else None
     axes = CAMERA if camera is None else meaning_of(str(camera.value)).frame or ""
     if camera is not None and axes not in CAMERA_FRAMES:
-        camera.error(f"is {printable(camera.value)}, and nothing says in which axes", f"write {STATED[:-1]}, axes: …}}")
-    numbers = [number for place in places if (number := place.number()) is not None]
+        camera.fail(f"is {printable(camera.value)}, and nothing says in which axes", f"write {STATED[:-1]}, axes: …}}")
+    numbers = [place.number() for place in places]
     quaternion = np.array(numbers[3:])
     if not 0.99 < np.linalg.norm(quaternion) < 1.01:
-        stated.error("qx, qy, qz, qw are no unit quaternion", "calibrate again")
+        stated.fail("qx, qy, qz, qw are no unit quaternion", "calibrate again")
     rotation = Rotation.from_quat(quaternion).as_matrix()
     camera_from_base = rigid(rotation.T, -rotation.T @ np.array(numbers[:3]) * MM)
     return StatedBase(CAMERA_FRAMES[axes].poses_to_opencv(camera_from_base), DVRK_SD_MM, DVRK_SD_DEG)
@@ -109,8 +109,11 @@ def read_dvrk_registration(path: Path) -> StatedBase:
     It is `…-registration-open-cv.json` or, in the dVRK's axes, `…-registration-dVRK.json`: a piece of a system.json
     and no JSON by itself.
     """
-    if path.suffix.lower() in (".yaml", ".yml"):
-        return _of_hand_eye(path)
+    with faults_in(path):
+        return _of_hand_eye(path) if path.suffix.lower() in (".yaml", ".yml") else _of_registration(path)
+
+
+def _of_registration(path: Path) -> StatedBase:
     content = read_text(path, WHAT).strip()
     whole = content.startswith("{")
     try:
@@ -118,25 +121,22 @@ def read_dvrk_registration(path: Path) -> StatedBase:
     except (ValueError, RecursionError) as error:
         remedy = "give the file …-registration-open-cv.json, or easy_handeye's YAML"
         raise NeecoError(f"{path}: is not {WHAT}; {remedy}") from error
-    node = Node(document, str(path), "", RaisingReport())
+    node = Node(document, str(path))
     if isinstance(document, dict) and (key := next((key for key in ("matrix", "transform") if key in document), None)):
         matrix = node.child(key).rigid()
-        if matrix is not None and np.abs(matrix[:3, 3]).max() < NEAR_MM:
-            node.child(key).error(f"is within {NEAR_MM:g} mm of the camera: in metres?", "give it in mm")
-        with faults_in(path):
-            usual = {"sd_mm": DVRK_SD_MM, "sd_deg": DVRK_SD_DEG, "transform": document.pop(key)}
-            return _stated(Node(usual | document, str(path)))
+        if np.abs(matrix[:3, 3]).max() < NEAR_MM:
+            node.child(key).fail(f"is within {NEAR_MM:g} mm of the camera: in metres?", "give it in mm")
+        usual = {"sd_mm": DVRK_SD_MM, "sd_deg": DVRK_SD_DEG, "transform": document.pop(key)}
+        return _stated(Node(usual | document, str(path)))
     frame = node.child("base-frame")
     if not isinstance(frame.value, dict):
-        frame.error("is missing", f"give {WHAT}, as …-registration-open-cv.json has it, or write {STATED} instead")
+        frame.fail("is missing", f"give {WHAT}, as …-registration-open-cv.json has it, or write {STATED} instead")
     matrix = frame.child("transform").rigid()
-    assert matrix is not None
-    matrix = matrix.copy()
     matrix[:3, 3] *= MM
     name, reference = path.stem.lower(), str(frame.value.get("reference-frame", ""))
     turned = not whole or name.endswith("-dvrk")
     if not turned and "open-cv" not in name and meaning_of(reference).frame == DVRK_ECM.name:
-        frame.child("reference-frame").error(
+        frame.child("reference-frame").fail(
             f"is {printable(reference)}, and nothing says whether in the dVRK's axes ({DVRK_ECM.words}) or OpenCV's",
             "call the file …-registration-dVRK.json or …-registration-open-cv.json",
         )

@@ -243,7 +243,7 @@ class StereoPartner(CameraFrames):
 def _intrinsics(node: Node) -> Path | tuple[float, ...]:
     if isinstance(node.value, str):
         return existing_file(node)
-    return tuple(node.numbers(4, "fl_x, fl_y, cx, cy in pixels, or a calibration file") or ())
+    return node.numbers(4, "fl_x, fl_y, cx, cy in pixels, or a calibration file")
 
 
 def _episodes(node: Node) -> tuple[int, ...]:

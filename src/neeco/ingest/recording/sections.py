@@ -26,7 +26,7 @@ def text(node: Node) -> str:
     """Return a name, which YAML may have read as a whole number."""
     if isinstance(node.value, int) and not isinstance(node.value, bool):
         return str(node.value)
-    return node.text("put it in quotes if it is a name") or ""
+    return node.text("put it in quotes if it is a name")
 
 
 def existing_file(node: Node) -> Path:

@@ -153,11 +153,11 @@ class RecordedSample:
     def load(self) -> Example:
         """Raises NeecoError where the labels differ from the image in size, or have an id without a class."""
         ids, file = self.masks.load(self.name), self.masks.files[self.name]
-        pixels, valid = self.frame.load_image_bytes().numpy(), self.frame.load_mask_pixels()
+        pixels, mask = self.frame.load_image_bytes().numpy(), self.frame.load_mask()
         if ids.shape != pixels.shape[:2]:
             raise NeecoError(f"{file}: is of another size than its frame; label the frames as recorded")
         remedy = "correct the mask, or leave its frame out"
-        return Example(pixels, _classes_of(ids, self.table, file, remedy), valid)
+        return Example(pixels, _classes_of(ids, self.table, file, remedy), None if mask is None else mask.numpy())
 
 
 @dataclass(frozen=True)

@@ -167,7 +167,11 @@ def write_states(root: Path, records: list[Record]) -> None:
     """Write states.jsonl: a line per image, state and labels; readable again as `--states states.jsonl`."""
     lines = []
     for record in records:
-        labels = [_without_polygons(label) for label in record["labels"]]
+        labels = []
+        for label in record["labels"]:
+            shapes = {None: label, **label["parts"]}
+            without = {name: {k: v for k, v in shape.items() if k not in POLYGONS} for name, shape in shapes.items()}
+            labels.append(without.pop(None) | {"parts": without})
         lines.append(json.dumps(public_record(record) | {"labels": labels}, allow_nan=False) + "\n")
     write_text(root / "states.jsonl", "".join(lines))
 
@@ -175,9 +179,3 @@ def write_states(root: Path, records: list[Record]) -> None:
 def public_record(record: Record) -> dict[str, Any]:
     """A record without what it says of the making."""
     return {key: value for key, value in record.items() if key not in ("files", "refused")}
-
-
-def _without_polygons(label: dict[str, Any]) -> dict[str, Any]:
-    shapes = {None: label, **label["parts"]}
-    without = {name: {k: v for k, v in shape.items() if k not in POLYGONS} for name, shape in shapes.items()}
-    return without.pop(None) | {"parts": without}
