@@ -15,7 +15,8 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_json, read_text, require_content, require_inside, visible_entries
-from neeco.capture.documents import Node, RaisingReport, printable
+from neeco.base.settings import faults_in
+from neeco.capture.documents import Node, printable
 from neeco.ingest.readers import file_state, one_line
 
 INFO = "meta/info.json"
@@ -168,28 +169,30 @@ def read_data_set(path: Path) -> DataSet:
 @lru_cache(maxsize=4)
 def _described(path: Path, state: tuple[object, ...]) -> DataSet:
     file = require_inside(path / INFO, _boundary(path))
-    info = Node(read_json(file), str(file), "", RaisingReport())
-    version = info.child("codebase_version")
-    match = VERSIONS.fullmatch(str(version.value))
-    if match is None:
-        version.error(f"{printable(version.value)} is not read", "convert the data set to v2.1 or v3.0")
-    features = info.child("features")
-    if not isinstance(features.value, dict) or not features.value:
-        features.error("expected an object of features", "download it again")
-    known = {key: _feature(features.child(key), key) for key in features.value}
+    info = Node(read_json(file), str(file))
+    with faults_in(file):
+        version, features = info.child("codebase_version"), info.child("features")
+        match = VERSIONS.fullmatch(str(version.value))
+        if match is None:
+            version.fail(f"{printable(version.value)} is not read", "convert the data set to v2.1 or v3.0")
+        if not isinstance(features.value, dict) or not features.value:
+            features.fail("expected an object of features", "download it again")
+        known = {key: _feature(features.child(key), key) for key in features.value}
+        fps = info.child("fps").number(above=0, below=1e5)
+        data_path = info.child("data_path").text("correct it")
+        chunks_size = info.child("chunks_size").integer(1) if info.has("chunks_size") else 1000
     films = [key for key, feature in known.items() if feature.dtype == "video"]
-    is_3 = match is not None and match[2] is not None
-    records = _records_3(path, films) if is_3 else _records_2(path)
+    records = _records_3(path, films) if match[2] is not None else _records_2(path)
     if not records:
         raise NeecoError(f"{path}: holds no episode; download the data set again, with all of meta")
     return DataSet(
         path=path,
-        version=3 if is_3 else 2,
-        fps=info.child("fps").number(above=0, below=1e5) or 0.0,
+        version=2 if match[2] is None else 3,
+        fps=fps,
         features=known,
-        data_path=info.child("data_path").text("correct it") or "",
+        data_path=data_path,
         video_path=str(info.child("video_path").value or ""),
-        chunks_size=(info.child("chunks_size").integer(1) if info.has("chunks_size") else None) or 1000,
+        chunks_size=chunks_size,
         records=records,
     )
 
@@ -295,7 +298,7 @@ def _feature(node: Node, key: str) -> Feature:
     dtype, shape, names = (node.child(name).value for name in ("dtype", "shape", "names"))
     sound = isinstance(shape, list) and all(type(side) is int and 0 <= side < 1e6 for side in shape)
     if not isinstance(dtype, str) or not sound:
-        node.error("has no dtype and shape", "correct it")
+        node.fail("has no dtype and shape", "correct it")
     count = math.prod(shape)
     numeric = re.fullmatch(r"(float|int|uint)\d+|bool", dtype) is not None and count <= LIMITS.numbers
     places = [
