@@ -242,26 +242,6 @@ def test_a_run_whose_capture_is_gone_says_where_to_write_its_new_place(capture, 
     assert main(["render", str(run), "--output", str(tmp_path / "drawn"), "--split", "train"]) == 0
 
 
-def test_a_capture_that_changed_is_not_trained_on(capture, tmp_path, capsys):
-    words = ["train", str(capture), "--output", str(tmp_path / "run"), "--method", "3dgs", "--iterations", "60"]
-    with pytest.raises(KeyboardInterrupt):
-        train(
-            capture,
-            tmp_path / "run",
-            training_config("3dgs", {"iterations": 60}, ["log_interval=5"]),
-            progress=interrupt,
-        )
-    image = capture / "images" / "000003.png"
-    content = image.read_bytes()
-    Image.new("RGB", (32, 24)).save(image)
-    assert main([*words, "--resume"]) == 1
-    told = capsys.readouterr().err.strip().splitlines()[-1]
-    assert f"config.yaml: capture: {capture} has changed since this run was begun; put its files back" in told
-    assert not (tmp_path / "run" / "scene.safetensors").exists()
-    image.write_bytes(content)
-    assert main([*words, "--resume"]) == 0
-
-
 def test_a_run_killed_before_its_first_whole_file_begins_again(capture: Path, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     for name in (LOCK, f"{TEMPORARY}abc.yaml"):

@@ -227,20 +227,16 @@ class Fitter(Generic[P]):
         )
         gain = residual.scale * float((without - with_it).sum(dtype=torch.float64))
         unexplained = (with_it > FIT.foreground_error) & (without > FIT.foreground_error)
-        hidden = wide_areas(unexplained, round(FIT.foreground_width * view.diagonal))
+        # where that holds a square of so many pixels, and the rims of these areas
+        square = np.ones((round(FIT.foreground_width * view.diagonal),) * 2, np.uint8)
+        opened = cv2.morphologyEx(unexplained.numpy().astype(np.uint8), cv2.MORPH_OPEN, square)
+        hidden = torch.from_numpy(cv2.dilate(opened, np.ones((FIT.foreground_rim_px,) * 2, np.uint8)) > 0)
         opaque = alpha * view.weight
         if float(opaque[hidden].sum()) > FIT.max_hidden * float(opaque.sum()):
             hidden = torch.zeros_like(hidden)
         near = widened(alpha > 0.5, round(FIT.neighbourhood * view.diagonal)) & ~hidden
         pixels = max(float(opaque[~hidden].sum()), 1.0)
         return gain, float(with_it[near].sum()) / (0.5 * FIT.huber**2 * 3 * pixels), pixels
-
-
-def wide_areas(mask: Tensor, pixels: int) -> Tensor:
-    """Return where a mask bool [h, w] holds a square of so many pixels, and the rims of these areas."""
-    square = np.ones((pixels, pixels), np.uint8)
-    opened = cv2.morphologyEx(mask.numpy().astype(np.uint8), cv2.MORPH_OPEN, square)
-    return torch.from_numpy(cv2.dilate(opened, np.ones((FIT.foreground_rim_px, FIT.foreground_rim_px), np.uint8)) > 0)
 
 
 def widened(mask: Tensor, pixels: int) -> Tensor:

@@ -38,7 +38,6 @@ from neeco.methods.kinematic.discovery import carve_again, find_instruments
 from neeco.methods.kinematic.finish import conclude
 from neeco.methods.kinematic.hinges import Hinges, hinge_joints
 from neeco.methods.kinematic.lamp_search import find_shadow
-from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.kinematic.wrist import place_wrists, refine_wrists
 from neeco.raster.articulated import ArticulatedBody, pose_bodies
 from neeco.raster.types import Rendering
@@ -292,7 +291,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         """Return tissue whose centre no frame observes, as no image constrains it, and what no stated link reaches."""
         mask = torch.zeros(len(canonical), dtype=torch.bool, device=canonical.means.device)
         for index, articulation in enumerate(self.articulations):
-            if isinstance(articulation, StatedLinks):
+            if articulation.stated:
                 rows = canonical.body(index + 1)
                 mask[rows] = articulation.out_of_reach(canonical.means[rows].detach())
         if self.settings.extrapolate_tissue:
@@ -379,7 +378,7 @@ def articulation_of(instrument: Instrument) -> Articulation:
     """Return the links that the instrument's kinematics state, or else a shaft with a hinge per joint, which is found
     from the images."""
     tree = instrument.kinematics
-    return StatedLinks(tree) if tree is not None and tree.readings else Hinges(tuple(instrument.joints))
+    return Articulation(tree) if tree is not None and tree.readings else Hinges(tuple(instrument.joints))
 
 
 @torch.no_grad()
