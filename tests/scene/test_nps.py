@@ -13,13 +13,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 from scene_worlds import GRASPER, TISSUE, grasper_state, pose_of, random_canonical, rounding
 
 from neeco.base.errors import NeecoError
-from neeco.capture.model import InstrumentState, State
 from neeco.methods.networks import encode
 from neeco.methods.nps import NPS, NPSSettings
 from neeco.raster.devices import fast_bfloat16, processor_has
 from neeco.scene import GaussianScene
 from neeco.scene.deformation import mark_moving, otsu
-from neeco.scene.method_registry import make_deformation, method_class, method_settings
+from neeco.scene.method_registry import method_class, method_settings
 from neeco.training.config import method_defaults
 
 
@@ -140,20 +139,6 @@ def test_what_moves_is_told_from_what_does_not() -> None:
     assert labels.shape == (len(canonical), 1)
     assert not labels[:TISSUE].any()
     assert bool((labels[TISSUE:] == 1).all())
-
-
-def test_an_unknown_method_is_refused() -> None:
-    with pytest.raises(NeecoError, match="'telepathy' is unknown"):
-        make_deformation("telepathy", ())
-
-
-@pytest.mark.parametrize(
-    "state",
-    [State(), State({"grasper": InstrumentState(torch.eye(4, dtype=torch.float64))})],
-)
-def test_a_state_that_lacks_something_is_refused(neeco: GaussianScene, state: State) -> None:
-    with pytest.raises(NeecoError, match="is missing"):
-        neeco.at(state)
 
 
 def in_bfloat16(network: NPS, inputs: tuple[torch.Tensor, torch.Tensor], half: bool) -> list[torch.Tensor]:

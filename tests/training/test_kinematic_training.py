@@ -21,7 +21,7 @@ from neeco.scene.training_views import TrainingViews
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 from neeco.training.config import method_defaults, training_config
-from neeco.training.initial import initial_scene
+from neeco.training.initial import begin_session, initial_scene
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
@@ -121,8 +121,9 @@ def test_joints_that_turn_no_wrist_are_hinges_with_a_warning(tmp_path: Path) -> 
         frame["instruments"][0]["joints"]["grip"] = (0.7 * number * number) % 1.0
     (capture / "transforms.json").write_text(json.dumps(transforms))
     told: list[str] = []
-    run = load_run(train(capture, tmp_path / "run", CONFIG, progress=lambda row: told.append(row.note)))
-    assert run.scene.instruments[0].kinematics is None
+    read = read_capture(capture)
+    session = begin_session(read, TrainingViews.read(read.split("train")), CONFIG, told.append)
+    assert session.scene.instruments[0].kinematics is None
     assert any("several joints, no kinematics, and images show no wrist" in note for note in told)
 
 
