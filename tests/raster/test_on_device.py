@@ -1,4 +1,4 @@
-"""What is asked of a device, copied to it and multiplied on it, as far as that shows without a GPU; by which kernels."""
+"""What is asked of a device, copied to it and multiplied on it, as far as that shows without a GPU; by which kernel."""
 
 from __future__ import annotations
 

@@ -58,6 +58,14 @@ def precision_of(deviations: Tensor) -> Tensor:
     return torch.diag(deviations**-2)
 
 
+def sds_of(sizes: tuple[float, ...], slides: Sequence[bool] | np.ndarray) -> np.ndarray:
+    """Return the standard deviations [6 + J] of an instrument's two tilts and roll (rad), shifts across the view twice
+    and in depth (mm), and joints, of which `slides` [J] are prismatic; sizes: tilt, roll, across, depth, joint (rad),
+    prismatic joint (mm)."""
+    tilt, roll, across, depth, turn, slide = sizes
+    return np.append([tilt, tilt, roll, across, across, depth], np.where(slides, slide, turn))
+
+
 @dataclass(frozen=True, kw_only=True)
 class InstrumentParameters:
     """The parameters of one instrument: six of its pose (see `moved_pose`), then one per joint (rad or mm)."""

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from neeco.capture.model import Frame, Instrument, State, evenly_spaced
 from neeco.scene import GaussianScene
 from neeco.states.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer
 from neeco.states.fitter import Fitter, StateFit
-from neeco.states.parameters import DEG, InstrumentParameters, StateParameters
+from neeco.states.parameters import DEG, InstrumentParameters, StateParameters, sds_of
 from neeco.states.refinement import LIMITS, Refinement
 
 
@@ -237,18 +238,10 @@ class StateSearch:
 
     def _usual(self) -> Tensor:
         """Return usual errors [P] of a robot's states (rad, mm)."""
-        errors: list[float] = []
-        for parameters in self.refinement.layout.instruments:
-            errors += [
-                SEARCH.tilt * DEG,
-                SEARCH.tilt * DEG,
-                SEARCH.roll * DEG,
-                SEARCH.across,
-                SEARCH.across,
-                SEARCH.depth,
-            ]
-            errors += [SEARCH.joint * DEG * (LIMITS.mm_per_rad if slides else 1.0) for slides in parameters.slides]
-        return torch.tensor(errors, dtype=torch.float64)
+        joint = SEARCH.joint * DEG
+        sizes = (SEARCH.tilt * DEG, SEARCH.roll * DEG, SEARCH.across, SEARCH.depth, joint, joint * LIMITS.mm_per_rad)
+        errors = [sds_of(sizes, parameters.slides) for parameters in self.refinement.layout.instruments]
+        return torch.from_numpy(np.concatenate(errors))
 
 
 def _bounded(parameters: InstrumentParameters, instrument: Instrument) -> InstrumentParameters:
