@@ -15,7 +15,8 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State
 from neeco.geometry.rotations import quat_to_matrix, rigid_from_vector, rotate_about
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.methods.kinematic.deformation import Kinematic, Spin
+from neeco.methods.kinematic.deformation import Kinematic
+from neeco.methods.kinematic.wrist import Spin
 from neeco.scene import GaussianScene
 
 POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)

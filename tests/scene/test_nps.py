@@ -22,25 +22,10 @@ from neeco.scene.method_registry import method_class, method_settings
 from neeco.training.config import method_defaults
 
 
-def test_an_untrained_scene_is_its_canonical_one_in_every_state(neeco: GaussianScene) -> None:
-    for state in neeco.recorded.states:
-        posed = neeco.at(state)
-        assert torch.equal(posed.means, neeco.canonical.means)
-        assert torch.equal(posed.scales, neeco.canonical.log_scales.exp())
-        assert torch.allclose(posed.quats, torch.nn.functional.normalize(neeco.canonical.quats, dim=-1))
-
-
 def test_the_head_starts_at_zero_and_still_learns(neeco: GaussianScene) -> None:
     neeco.at(neeco.recorded.states[0]).means.square().sum().backward()
     assert not neeco.deformation.head.weight.any()
     assert neeco.deformation.head.weight.grad[:3].abs().max() > 0
-
-
-def test_a_network_is_not_evaluated_in_its_warm_up(neeco: GaussianScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(NPS, "network", lambda *_: pytest.fail("evaluated"))
-    neeco.deformation.warming_up = True
-    posed = neeco.at(neeco.recorded.states[0])
-    assert torch.equal(posed.means, neeco.canonical.means)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0])

@@ -494,7 +494,3 @@ class ArticulatedInstruments(nn.Module):
         """Return link weights [M, link_count] of one instrument's Gaussians."""
         rows = canonical.body(index + 1)
         return self.articulations[index].link_weights(canonical.means[rows], canonical.extras[LINK_LOGITS][rows])
-
-    def spin_perturbation(self, roll: float) -> Any:
-        """Return the perturbation that spins everything behind the wrists by `roll` rad about the shafts."""
-        raise NotImplementedError

@@ -22,7 +22,7 @@ from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector, skew
 from neeco.methods.kinematic.articulation import SETTINGS, Articulation
-from neeco.methods.kinematic.link_search import doubted_readings, note_doubt
+from neeco.methods.kinematic.link_search import doubted_readings
 from neeco.states.outline_fit import OUTLINES
 from neeco.training.session import GaussianSession
 
@@ -163,7 +163,9 @@ def correct_poses(
         other = register_links(links, evidence, name, shape, [doubt.change(given) for given in readings], stated=stated)
         doubt = doubt if other is not None and other.cost < found.cost else None
     if doubt is not None:
-        note_doubt(session, name, doubt)
+        session.report(f"warning: {name}: its links fit the images {doubt.ratio:.1f} times as well {doubt.words}")
+        doubted = {f"{name}.{reading}": f"the links fit the images better {doubt.words}" for reading in doubt.names}
+        scene.diagnostics.setdefault("doubted_readings", {}).update(doubted)
     if doubt is not None or found is None or not found.needed:
         return False
     base = found.about(scene.center)

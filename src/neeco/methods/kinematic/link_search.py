@@ -364,13 +364,6 @@ def doubted_readings(
     return DoubtedReadings(names, most / max(named, 1), words, change)
 
 
-def note_doubt(session: GaussianSession, name: str, doubt: DoubtedReadings) -> None:
-    """Warn of an instrument's doubted readings, and note them in `scene.diagnostics["doubted_readings"]`."""
-    session.report(f"warning: {name}: its links fit the images {doubt.ratio:.1f} times as well {doubt.words}")
-    warnings = session.scene.diagnostics.setdefault("doubted_readings", {})
-    warnings |= {f"{name}.{reading}": f"the links fit the images better {doubt.words}" for reading in doubt.names}
-
-
 class _Volumes:
     """Volume that stays on evidence, counted in sample points of all links together."""
 
