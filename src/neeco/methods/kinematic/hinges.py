@@ -270,9 +270,8 @@ def start_hinges(
                 hinges.hinge_angle[index] = torch.atan2(across[1], across[0])
                 hinges.hinge_depth[index] = hinges.along_shaft(learned[0])[index]
             elif found := search_hinge(evidence, name, joint, shape, session.config.deformation.carving):
-                hinges.hinge_angle[index] = found.angle
-                hinges.hinge_depth[index] = found.depth
-                hinges.share[index] = 1.0 if found.gains[1] == 0 else 0.5
+                hinges.hinge_angle[index], hinges.hinge_depth[index], gains = found
+                hinges.share[index] = 1.0 if gains[1] == 0 else 0.5
             else:
                 session.report(f"{name}: joint {joint} hardly moves in the training frames; its hinge cannot be found")
                 continue
@@ -313,42 +312,11 @@ def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Ge
         return logits + torch.where(beyond[:, None], lean, lean.new_zeros(()))
 
 
-@dataclass(frozen=True)
-class HingeScores:
-    """Scores of hinges at A angles (rad around the carved shaft), D depths (mm along it) and all `gains`."""
-
-    angles: list[float]
-    depths: list[float]
-    score: np.ndarray  # [D, gains, A] mean evidence on the turned sticks, in [0, 1]
-    over_rigid: np.ndarray  # [D, gains, A] score less that of unturned sticks, times the share of the length they cover
-
-    @property
-    def depth(self) -> float:
-        """Mean of the best depths by score and by score over rigid sticks, mm.
-
-        The first prefers pivots too far back (short turns stay on the body), the second pivots too far forward.
-        """
-        best = [np.unravel_index(score.argmax(), score.shape)[0] for score in (self.score, self.over_rigid)]
-        return (self.depths[best[0]] + self.depths[best[1]]) / 2
-
-    @property
-    def angle(self) -> float:
-        """Phase of the score's second harmonic over the hinge angle, rad in [0, pi): uses all scores, not the peak
-        alone."""
-        best = self.score.max((0, 1)).tolist()
-        wave = sum(s * complex(math.cos(2 * a), math.sin(2 * a)) for a, s in zip(self.angles, best, strict=True))
-        return (math.atan2(wave.imag, wave.real) / 2) % math.pi
-
-    @property
-    def gains(self) -> tuple[float, float]:
-        """Gains of the best score."""
-        return STICKS.gains[np.unravel_index(self.score.argmax(), self.score.shape)[1]]
-
-
 def search_hinge(
     evidence: Evidence, name: str, joint: str, shape: CarvedShape, settings: CarvingSettings
-) -> HingeScores | None:
-    """Score all hinges on a grid by stick figures; None when the reading hardly varies.
+) -> tuple[float, float, tuple[float, float]] | None:
+    """Return the angle (rad around the carved shaft, in [0, pi)), depth (mm along it) and gains of the best of a grid
+    of hinges, scored by stick figures; None when the reading hardly varies.
 
     A joint moves two parts symmetrically or one alone. Its parts are sticks: the instrument's centre line beyond the
     pivot, turned about the hinge by the reading. The right hinge keeps both sticks on evidence in every frame, above
@@ -382,7 +350,16 @@ def search_hinge(
         turned = torch.stack([(scores[first] + scores[second]) / 2 for first, second in STICKS.gains])
         score.append(torch.maximum(turned, (scores[STICKS.small_gain] + scores[-STICKS.small_gain]) / 2))
         over_rigid.append((turned - scores[0.0]) * ((shape.tip - depth) / length))
-    return HingeScores(angles.tolist(), depths, *(torch.stack(s).cpu().numpy() for s in (score, over_rigid)))
+    # [D, gains, A] mean evidence on the turned sticks, and that less the evidence on unturned ones, times the share of
+    # the length they cover: the first prefers pivots too far back (short turns stay on the body), the second too far
+    # forward
+    found = [torch.stack(each).cpu().numpy() for each in (score, over_rigid)]
+    (back, gains, _), (forward, *_) = (np.unravel_index(each.argmax(), each.shape) for each in found)
+    # phase of the score's second harmonic over the hinge angle: uses all scores, not the peak alone
+    best = found[0].max((0, 1)).tolist()
+    wave = sum(s * complex(math.cos(2 * a), math.sin(2 * a)) for a, s in zip(angles.tolist(), best, strict=True))
+    angle = (math.atan2(wave.imag, wave.real) / 2) % math.pi
+    return angle, (depths[back] + depths[forward]) / 2, STICKS.gains[gains]
 
 
 def _stick_scores(
