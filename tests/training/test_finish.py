@@ -14,6 +14,7 @@ from capture_files import PIVOT_MM, WRIST_MM, grasper_body, write_grasper
 from rod_world import WALL_MM
 
 from neeco.capture import read_capture
+from neeco.capture.model import Camera, InstrumentState, State
 from neeco.methods.kinematic import wrist
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.kinematic.finish import (
@@ -234,10 +235,8 @@ def shaft_of(length: float, joints: tuple[str, ...] = ("jaw",)) -> tuple[Canonic
     return canonical, hinges
 
 
-def recorded_at(session: GaussianSession, shift_mm: float) -> Recorded:
-    """The session's recording with each camera looking across the shaft, whose rear leaves the image at `shift_mm`."""
-    from neeco.capture.model import Camera, InstrumentState, State
-
+def recorded_at(shift_mm: float) -> Recorded:
+    """A recording with each camera looking across the shaft, whose rear leaves the image at `shift_mm`."""
     camera = Camera(torch.eye(4, dtype=torch.float64), 100.0, 100.0, 50.0, 50.0, 100, 100)
     pose = torch.eye(4, dtype=torch.float64)
     # the shaft's z along the image's x; its origin so that z = shift_mm falls on the left border at 100 mm depth
@@ -247,9 +246,9 @@ def recorded_at(session: GaussianSession, shift_mm: float) -> Recorded:
     return Recorded(("a",) * 4, ("train",) * 4, (state,) * 4, (camera,) * 4)
 
 
-def test_a_shaft_cut_by_the_image_is_prolonged_by_copies_of_what_was_seen(session: GaussianSession) -> None:
+def test_a_shaft_cut_by_the_image_is_prolonged_by_copies_of_what_was_seen() -> None:
     canonical, hinges = shaft_of(40)
-    longer = extend_shaft(canonical, 1, "tool", hinges, recorded_at(session, -20.0), 60.0)
+    longer = extend_shaft(canonical, 1, "tool", hinges, recorded_at(-20.0), 60.0)
     assert longer.counts[0] == longer.counts[2] == 10
     assert torch.equal(longer.means[longer.body(0)], canonical.means[:10])
     assert torch.equal(longer.means[longer.body(2)], canonical.means[-10:])
@@ -260,15 +259,15 @@ def test_a_shaft_cut_by_the_image_is_prolonged_by_copies_of_what_was_seen(sessio
     assert float(gaps.max()) < 1.01  # and without a gap
 
 
-def test_a_straight_instrument_is_prolonged_as_one_with_joints_is(session: GaussianSession) -> None:
+def test_a_straight_instrument_is_prolonged_as_one_with_joints_is() -> None:
     canonical, straight = shaft_of(40, joints=())
-    longer = extend_shaft(canonical, 1, "tool", straight, recorded_at(session, -20.0), 60.0)
+    longer = extend_shaft(canonical, 1, "tool", straight, recorded_at(-20.0), 60.0)
     assert float(longer.means[longer.body(1)][:, 2].min()) < -70
 
 
-def test_what_a_single_frame_saw_of_a_shaft_is_not_copied(session: GaussianSession) -> None:
+def test_what_a_single_frame_saw_of_a_shaft_is_not_copied() -> None:
     canonical, hinges = shaft_of(40)
-    near, far = recorded_at(session, -20.0), recorded_at(session, -35.0)
+    near, far = recorded_at(-20.0), recorded_at(-35.0)
     states = (*near.states * 3, far.states[0])  # one of 13 frames shows more of the shaft
     few = Recorded(("a",) * 13, ("train",) * 13, states, (near.cameras[0],) * 13)
     stray = canonical.means[:, 2] < -30
@@ -279,16 +278,17 @@ def test_what_a_single_frame_saw_of_a_shaft_is_not_copied(session: GaussianSessi
     assert float(tube[:, :2].norm(dim=1).max()) == pytest.approx(2, abs=1e-4)
 
 
-def test_a_shaft_whose_end_was_seen_stays_as_it_is(session: GaussianSession) -> None:
+def test_a_shaft_whose_end_was_seen_stays_as_it_is() -> None:
     canonical, hinges = shaft_of(40)
-    same = extend_shaft(canonical, 1, "tool", hinges, recorded_at(session, -60.0), 60.0)
+    same = extend_shaft(canonical, 1, "tool", hinges, recorded_at(-60.0), 60.0)
     assert same is canonical
 
 
-def links_near_the_hinge(session: GaussianSession, share: float) -> list[int]:
+def links_near_the_hinge(share: float) -> list[int]:
     """The link that holds the most of a Gaussian beside the hinge, of one between the prongs and of one far beyond,
     once learned: the first two were learned as jaw 1, the last one as the shaft that might be jaw 2."""
-    hinges = hinges_of(session)
+    _, hinges = shaft_of(40)
+    hinges.requires_grad_(False)
     hinges.hinge_angle.fill_(0.3)
     hinges.share.fill_(share)
     hinges.radius.fill_(3.0)
@@ -301,12 +301,12 @@ def links_near_the_hinge(session: GaussianSession, share: float) -> list[int]:
     return hinges.link_weights(places, settled).argmax(1).tolist()
 
 
-def test_only_what_holds_the_jaws_is_beside_the_hinge_and_only_jaws_are_beyond(session: GaussianSession) -> None:
-    assert links_near_the_hinge(session, share=0.6) == [0, 1, 2]
+def test_only_what_holds_the_jaws_is_beside_the_hinge_and_only_jaws_are_beyond() -> None:
+    assert links_near_the_hinge(share=0.6) == [0, 1, 2]
 
 
-def test_beyond_the_hinge_a_jaw_that_stands_still_is_left_as_it_was_learned(session: GaussianSession) -> None:
-    assert links_near_the_hinge(session, share=1.0) == [0, 1, 0]
+def test_beyond_the_hinge_a_jaw_that_stands_still_is_left_as_it_was_learned() -> None:
+    assert links_near_the_hinge(share=1.0) == [0, 1, 0]
 
 
 PLACES = [(0.0, 0.0, 60.0), (10.0, 5.0, 65.0), (-12.0, 3.0, 70.0), (4.0, -6.0, 55.0), (0.0, 9.0, 62.0)]

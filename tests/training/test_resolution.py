@@ -163,7 +163,7 @@ def test_pixels_scaled_on_reading_and_afterwards_are_the_same() -> None:
 
 def test_a_kinematic_run_at_a_fifth_of_the_size_ends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
-    words = ["--scale", "0.2", "--iterations", "40", "--set", "deformation.carving.tissue_steps=100"]
+    words = ["--scale", "0.2", "--iterations", "40", "--set", "deformation.carving.tissue_steps=30"]
     assert main(["train", str(SAMPLE), "--output", str(run), *words]) == 0
     assert load_run(run).scene.diagnostics["iterations"] == 40
     assert main(["render", str(run), "--output", str(tmp_path / "rendered")]) == 0
