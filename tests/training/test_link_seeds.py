@@ -314,7 +314,7 @@ def test_links_that_nobody_stated_are_found_whatever_their_readings_are_called(c
 
 
 def test_readings_of_other_moments_show_no_wrist(carved) -> None:
-    evidence, shape = few_frames(carved, step=3)
+    evidence, shape = carved  # with 20 of its frames, one is found by chance
     readings = [dict(frame.state.instruments["tool"].joints) for frame in evidence.frames]
-    exchanged_in_time = [*readings[7:], *readings[:7]]
+    exchanged_in_time = [*readings[17:], *readings[:17]]
     assert search_wrist(evidence, "tool", shape, exchanged_in_time, ("pitch", "jaw")) is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import torch
@@ -352,16 +353,21 @@ def doubted_readings(
     for one, other in combinations(recorded, 2):
         if instrument.slides(one) == instrument.slides(other):
             words = f"with the readings of {one} and {other} exchanged: which log is which?"
-            changes.append(((one, other), words, lambda g, a=one, b=other: {**g, a: g[b], b: g[a]}))
+            changes.append(((one, other), words, partial(_changed, {one: (1.0, other), other: (1.0, one)})))
     for name in recorded:
         words = f"with the sign of {name} reversed: is its axis, or its gain, the wrong way round?"
-        changes.append(((name,), words, lambda g, a=name: {**g, a: -g[a]}))
+        changes.append(((name,), words, partial(_changed, {name: (-1.0, name)})))
     found = [(volumes.with_readings(change), index) for index, (_, _, change) in enumerate(changes)]
     most, index = max(found, default=(0.0, 0))
     if most <= LINKS.min_volume_ratio * named:
         return None
     names, words, change = changes[index]
     return DoubtedReadings(names, most / max(named, 1), words, change)
+
+
+def _changed(taken: dict[str, tuple[float, str]], readings: Readings) -> Readings:
+    """Return `readings` with some `taken` as (sign, of which reading)."""
+    return {**readings, **{name: sign * readings[source] for name, (sign, source) in taken.items()}}
 
 
 class _Volumes:
