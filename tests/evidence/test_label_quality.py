@@ -33,6 +33,21 @@ def view(label: slice, seed: int, *, dark: bool = False) -> Comparison:
     )
 
 
+def learned(views: list[Comparison]) -> Foreground:
+    foreground = Foreground.learned(views)
+    assert foreground is not None
+    return foreground
+
+
+def quality(label: slice, dark: bool) -> LabelQuality:
+    """Estimated from three views."""
+    views = [view(label, seed, dark=dark) for seed in range(3)]
+    foreground = learned(views)
+    found = quality_of([label_counts(shown, foreground) for shown in views])
+    assert found is not None
+    return found
+
+
 def iou(label: slice) -> float:
     both = max(0, min(label.stop, SHAFT.stop) - max(label.start, SHAFT.start))
     return both / (label.stop - label.start + SHAFT.stop - SHAFT.start - both)
@@ -41,25 +56,15 @@ def iou(label: slice) -> float:
 @pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.parametrize("label", [SHAFT, slice(50, 66), slice(50, 60), slice(48, 79), slice(56, 78)])
 def test_the_estimated_iou_of_labels_is_near_the_true_one(label: slice, dark: bool) -> None:
-    views = [view(label, seed, dark=dark) for seed in range(3)]
-    foreground = Foreground.learned(views)
-    assert foreground is not None
-    quality = quality_of([label_counts(shown, foreground) for shown in views])
-    assert quality is not None
     missed = label.start >= SHAFT.start and label.stop <= SHAFT.stop
-    assert quality.iou == pytest.approx(
+    assert quality(label, dark).iou == pytest.approx(
         iou(label), abs=0.06 if missed else 0.12
     )  # of shadows that are labelled, less shows
 
 
 def test_labels_that_leave_out_a_dark_shaft_are_doubtful_and_right_ones_are_not() -> None:
     for label, doubtful in ((slice(50, 60), True), (SHAFT, False)):
-        views = [view(label, seed, dark=True) for seed in range(3)]
-        foreground = Foreground.learned(views)
-        assert foreground is not None
-        quality = quality_of([label_counts(shown, foreground) for shown in views])
-        assert quality is not None
-        assert (quality.doubt is not None) == doubtful
+        assert (quality(label, dark=True).doubt is not None) == doubtful
 
 
 def test_nothing_is_said_of_images_without_an_instrument() -> None:
@@ -70,8 +75,7 @@ def test_nothing_is_said_of_images_without_an_instrument() -> None:
 def test_labels_of_pixels_that_tell_nothing_are_less_certain() -> None:
     """At outlines they show what covers them by half; elsewhere, with nothing certain nearby, either is as likely."""
     views = [view(SHAFT, seed) for seed in range(3)]
-    foreground = Foreground.learned(views)
-    assert foreground is not None
+    foreground = learned(views)
     certain = label_counts(views[0], foreground)
     unsure = replace(foreground, ratio=np.zeros_like(foreground.ratio))
     shares = []
@@ -85,8 +89,7 @@ def test_labels_of_pixels_that_tell_nothing_are_less_certain() -> None:
 
 def test_labelled_pixels_that_tell_nothing_show_what_certain_ones_nearby_do() -> None:
     views = [view(SHAFT, seed) for seed in range(3)]
-    foreground = Foreground.learned(views)
-    assert foreground is not None
+    foreground = learned(views)
     ratio = foreground.ratio.copy()
     ratio[-1, 0] = 0  # of the largest residual and the darkest shade
     foreground = replace(foreground, ratio=ratio)
@@ -103,8 +106,7 @@ def test_labelled_pixels_that_tell_nothing_show_what_certain_ones_nearby_do() ->
 
 def test_highlights_apart_from_the_instrument_are_no_unlabelled_part_of_it() -> None:
     views = [view(SHAFT, seed) for seed in range(3)]
-    foreground = Foreground.learned(views)
-    assert foreground is not None
+    foreground = learned(views)
     right = label_counts(views[0], foreground)
     for rows, part_of_it in ((slice(20, 32), False), (slice(0, 80), True)):
         residual, shade = views[0].residual.copy(), views[0].shade.copy()
@@ -115,10 +117,10 @@ def test_highlights_apart_from_the_instrument_are_no_unlabelled_part_of_it() -> 
 
 def test_labels_lost_in_one_image_are_doubtful_though_it_shows_little_of_the_instrument() -> None:
     right, lost = np.array([4000.0, 0, 0, 0]), np.array([100.0, 300, 0, 0])
-    quality = quality_of([right, right, right, lost])
-    assert quality is not None
-    assert quality.recall == pytest.approx(0.8125)
-    assert quality.doubt is not None
+    found = quality_of([right, right, right, lost])
+    assert found is not None
+    assert found.recall == pytest.approx(0.8125)
+    assert found.doubt is not None
     assert quality_of([np.array([0.0, 0, 50, 0])]) is None
 
 
@@ -131,8 +133,7 @@ def test_a_part_that_neither_the_label_nor_the_rendering_has_makes_labels_doubtf
     """Jaws whose joints nothing logged: taken for tissue that looks so at times, they have no certain pixel."""
     jaws = np.s_[20:50, SHAFT.stop + 12 : SHAFT.stop + 34]
     views = [view(SHAFT, seed) for seed in range(3)]
-    foreground = Foreground.learned(views)
-    assert foreground is not None
+    foreground = learned(views)
     for error, doubtful in ((0.02, False), (0.2, True)):
         counts = []
         for shown in views:

@@ -111,12 +111,6 @@ def test_compare_names_what_computed(verb: Call, word: str, capture: str) -> Non
 
 
 @slowly
-def test_ablate(verb: Call, capture: str) -> None:
-    verb("ablate", capture, "--tables", "kinematic", "--iterations", "3", "--output", "out")
-    assert Path("out/report.html").exists()
-
-
-@slowly
 def test_downstream(verb: Call, capture: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neeco.studies.downstream.models.unet.UNet.channels", (4, 4, 8, 8, 8))
     small = [

@@ -16,7 +16,6 @@ from articulated_worlds import Tree, assert_same_as_definition, hinges, make_wor
 
 from neeco.base.errors import NeecoError
 from neeco.geometry.rotations import quat_to_matrix
-from neeco.raster import kernels
 from neeco.raster.articulated import MAX_JOINTS, ArticulatedBody, pose_bodies
 from neeco.raster.native import set_threads
 
@@ -101,16 +100,6 @@ def test_a_number_that_is_none_stays_with_its_gaussian(field: str) -> None:
     rest = torch.arange(40) != 25
     assert all(torch.equal(a[rest], b[rest]) for a, b in zip(found, expected, strict=True))
     assert not all(bool(t[25].isfinite().all()) for t in found)
-
-
-def test_plain_torch_takes_the_place_of_the_kernel() -> None:
-    world = make_world((20, 20), (None, hinges(1)), roll=1.0)
-    native = posed(world, torch.float32)
-    with kernels("torch"):
-        plain = posed(world, torch.float32)
-    for a, b in zip(native[0], plain[0], strict=True):
-        assert torch.allclose(a, b, atol=1e-5)
-    assert any(not torch.equal(a, b) for a, b in zip(native[0], plain[0], strict=True))
 
 
 def test_an_input_changed_before_the_backward_pass_is_noticed() -> None:

@@ -1,11 +1,16 @@
-"""What is asked of a device, copied to it and multiplied on it, as far as that shows without a GPU."""
+"""What is asked of a device, copied to it and multiplied on it, as far as that shows without a GPU; by which kernel."""
 
 from __future__ import annotations
+
+from threading import Thread
 
 import pytest
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.raster import kernels
 from neeco.raster.devices import CachedPredicate, constant, tf32_products
+from neeco.raster.native import runs_native
 from neeco.raster.triton import ready
 
 CPU, CUDA, META = torch.device("cpu"), torch.device("cuda"), torch.device("meta")
@@ -68,3 +73,22 @@ def test_kernels_are_launched_for_float32_on_cuda_devices_alone(monkeypatch: pyt
     finally:
         ready.require_triton.cache_clear()
         ready.starts_on.cache_clear()
+
+
+def test_the_switch_holds_for_its_block_and_its_thread() -> None:
+    tensor, seen = torch.zeros(1), []
+    with kernels("torch"):
+        assert not runs_native(tensor)
+        with kernels("native"):
+            assert runs_native(tensor)
+        thread = Thread(target=lambda: seen.append(runs_native(tensor)))
+        thread.start()
+        thread.join()
+    assert runs_native(tensor)
+    assert seen == [True]
+    assert not runs_native(tensor.to("meta"))
+
+
+def test_an_unknown_family_is_named() -> None:
+    with pytest.raises(NeecoError, match="'fast': unknown"), kernels("fast"):  # type: ignore[arg-type]
+        pass

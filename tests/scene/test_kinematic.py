@@ -15,7 +15,8 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import InstrumentState, State
 from neeco.geometry.rotations import quat_to_matrix, rigid_from_vector, rotate_about
 from neeco.methods.kinematic.articulation import LINK_LOGITS
-from neeco.methods.kinematic.deformation import Kinematic, Spin
+from neeco.methods.kinematic.deformation import Kinematic
+from neeco.methods.kinematic.wrist import Spin
 from neeco.scene import GaussianScene
 
 POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)
@@ -59,7 +60,7 @@ def test_a_joint_turns_its_parts_by_gain_times_reading_about_the_hinge(kinematic
     shut, open_ = (kinematic.at(grasper_state(identity, jaw)).means[TISSUE:] for jaw in (0.0, 0.7))
     hinges = kinematic.deformation.articulations[0]
     pivot, axis = hinges.hinge(0)
-    turn = (0.7 * hinges.gains[0, part - 1]).expand(len(shut))
+    turn = (0.7 * hinges.jaw_gains[0, part - 1]).expand(len(shut))
     assert turn[0].abs() > 0.1
     assert torch.allclose(open_, rotate_about(shut, axis, pivot, turn), atol=1e-4)
     assert (open_ - shut).norm(dim=1).max() > 1
@@ -90,12 +91,12 @@ def test_tips_turn_with_their_parts_wherever_they_were_measured(kinematic: Gauss
     pivot, axis = hinges.hinge(0)
     _, direction = hinges.shaft()
     beside = torch.linalg.cross(axis, direction)
-    hinges.tips[0] = torch.stack([pivot + 9 * direction + 2 * beside, pivot + 12 * direction - beside])
+    hinges.tips[1:3] = torch.stack([pivot + 9 * direction + 2 * beside, pivot + 12 * direction - beside])
     for reading in (0.1, 0.6):
         for part in (0, 1):
             assign(kinematic, 1 + part)
             canonical = kinematic.canonical
-            canonical.means[TISSUE] = hinges.tips[0, part]
+            canonical.means[TISSUE] = hinges.tips[1 + part]
             drawn = kinematic.at(grasper_state(POSE, reading)).means[TISSUE]
             side = ("tip_left", "tip_right")[hinges.left_right_order(0).tolist().index(part)]
             told = kinematic.keypoints(grasper_state(POSE, reading))["grasper"][side]
@@ -141,7 +142,7 @@ def test_a_jaw_that_stands_still_is_a_jaw(kinematic: GaussianScene) -> None:
         with torch.no_grad():
             hinges.share.fill_(share)
             labels = kinematic.label_channels()[TISSUE:]
-            turning = int(hinges.gains[0].abs().argmax())
+            turning = int(hinges.jaw_gains[0].abs().argmax())
             still = [names.index("jaw_left"), names.index("jaw_right")][
                 int(hinges.left_right_order(0).tolist().index(turning)) - 1
             ]

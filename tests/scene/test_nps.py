@@ -18,29 +18,14 @@ from neeco.methods.nps import NPS, NPSSettings
 from neeco.raster.devices import fast_bfloat16, processor_has
 from neeco.scene import GaussianScene
 from neeco.scene.deformation import mark_moving, otsu
-from neeco.scene.method_registry import make_deformation, method_class, method_settings
+from neeco.scene.method_registry import method_class, method_settings
 from neeco.training.config import method_defaults
-
-
-def test_an_untrained_scene_is_its_canonical_one_in_every_state(neeco: GaussianScene) -> None:
-    for state in neeco.recorded.states:
-        posed = neeco.at(state)
-        assert torch.equal(posed.means, neeco.canonical.means)
-        assert torch.equal(posed.scales, neeco.canonical.log_scales.exp())
-        assert torch.allclose(posed.quats, torch.nn.functional.normalize(neeco.canonical.quats, dim=-1))
 
 
 def test_the_head_starts_at_zero_and_still_learns(neeco: GaussianScene) -> None:
     neeco.at(neeco.recorded.states[0]).means.square().sum().backward()
     assert not neeco.deformation.head.weight.any()
     assert neeco.deformation.head.weight.grad[:3].abs().max() > 0
-
-
-def test_a_network_is_not_evaluated_in_its_warm_up(neeco: GaussianScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(NPS, "network", lambda *_: pytest.fail("evaluated"))
-    neeco.deformation.warming_up = True
-    posed = neeco.at(neeco.recorded.states[0])
-    assert torch.equal(posed.means, neeco.canonical.means)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0])
@@ -140,11 +125,6 @@ def test_what_moves_is_told_from_what_does_not_and_from_traces_of_motion(still: 
     assert labels.shape == (len(canonical), 1)
     assert not labels[:first].any()
     assert bool((labels[first:] == 1).all())
-
-
-def test_an_unknown_method_is_refused() -> None:
-    with pytest.raises(NeecoError, match="'telepathy' is unknown"):
-        make_deformation("telepathy", ())
 
 
 def in_bfloat16(network: NPS, inputs: tuple[torch.Tensor, torch.Tensor], half: bool) -> list[torch.Tensor]:

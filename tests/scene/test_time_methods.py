@@ -31,6 +31,11 @@ def scene(request: pytest.FixtureRequest) -> GaussianScene:
     return make_scene(request.param)
 
 
+@pytest.fixture(params=[*METHODS, "nps"])
+def of_networks(request: pytest.FixtureRequest) -> GaussianScene:
+    return make_scene(request.param)
+
+
 def woken(deformation: Deformation) -> Deformation:
     """The same with random numbers added to all it learns, as after some training."""
     torch.manual_seed(1)
@@ -40,7 +45,8 @@ def woken(deformation: Deformation) -> Deformation:
     return deformation
 
 
-def test_an_untrained_scene_is_its_canonical_one_at_every_time(scene: GaussianScene) -> None:
+def test_an_untrained_scene_is_its_canonical_one_at_every_time(of_networks: GaussianScene) -> None:
+    scene = of_networks
     for state in scene.recorded.states:
         posed = scene.at(state)
         assert torch.equal(posed.means, scene.canonical.means)
@@ -49,7 +55,8 @@ def test_an_untrained_scene_is_its_canonical_one_at_every_time(scene: GaussianSc
         assert torch.allclose(directions, torch.nn.functional.normalize(scene.canonical.quats, dim=-1))
 
 
-def test_the_gradient_reaches_every_parameter(scene: GaussianScene) -> None:
+def test_the_gradient_reaches_every_parameter(of_networks: GaussianScene) -> None:
+    scene = of_networks
     woken(scene.deformation)
     posed = scene.at(scene.recorded.states[3])
     loss = posed.means.square().sum() + posed.quats[:, 0].sum() + posed.scales.sum()
@@ -61,7 +68,8 @@ def test_the_gradient_reaches_every_parameter(scene: GaussianScene) -> None:
     assert set(scene.deformation.learning_rates(0.0)) == {name for name, _ in scene.deformation.named_parameters()}
 
 
-def test_a_deformation_changes_nothing_in_its_warm_up(scene: GaussianScene) -> None:
+def test_a_deformation_changes_nothing_in_its_warm_up(of_networks: GaussianScene) -> None:
+    scene = of_networks
     woken(scene.deformation).warming_up = True
     assert torch.equal(scene.at(scene.recorded.states[1]).means, scene.canonical.means)
 

@@ -37,7 +37,7 @@ from neeco.states.crop_rendering import FrameView
 from neeco.states.fitter import Fitter, StateFit
 from neeco.states.parameters import StateParameters
 from neeco.states.refinement import Refinement, Verdict
-from neeco.states.search import SEARCH, FittedState, StateSearch
+from neeco.states.search import SEARCH, StateSearch
 from neeco.training.config import method_defaults
 from neeco.training.session import GaussianSession, new_session
 
@@ -84,7 +84,7 @@ def contradicting(refinement: Refinement) -> dict[int, Verdict]:
     return {k: Verdict(verdict) for k, verdict in enumerate(refinement.verdicts.tolist()) if verdict}
 
 
-def measured(search: StateSearch, scale: float) -> list[FittedState]:
+def measured(search: StateSearch, scale: float) -> list[tuple[int, StateFit, torch.Tensor]]:
     """Fits as images of 0.3 degrees and 0.3 mm make them of states with errors of this scale, without images."""
     fits, rng = [], np.random.default_rng(2)
     layout = search.refinement.layout
@@ -98,7 +98,7 @@ def measured(search: StateSearch, scale: float) -> list[FittedState]:
         fit = StateFit(
             state=wrong, cost=0.0, gain=0.0, misfit=1.0, observations=1.0, information=information, view=view
         )
-        fits.append(FittedState(index=index, fit=fit, precision=precision, correction=correction))
+        fits.append((index, fit, correction))
     return fits
 
 
@@ -113,11 +113,11 @@ def test_without_stated_links_only_tilt_tells_how_large_errors_are(tmp_path: Pat
     assert search.scene.instruments[0].kinematics is None
     fits = measured(search, 0.1)
     rough = []
-    for sign, fit in zip((1.0, -1.0) * 6, fits, strict=True):
-        view = search.scene.recorded.cameras[fit.index].world_from_camera[:3, 2].double()
-        away = TRUE[fit.index].instruments["grasper"].pose[:3, :3].double().T @ view
+    for sign, (index, fit, correction) in zip((1.0, -1.0) * 6, fits, strict=True):
+        view = search.scene.recorded.cameras[index].world_from_camera[:3, 2].double()
+        away = TRUE[index].instruments["grasper"].pose[:3, :3].double().T @ view
         wrong = torch.cat([math.radians(12) * search.shafts[0], 3.0 * away, torch.tensor([0.2])])  # roll, depth, jaw
-        rough.append(replace(fit, correction=fit.correction + sign * wrong))
+        rough.append((index, fit, correction + sign * wrong))
     assert search.scale_of(rough) == pytest.approx(search.scale_of(fits), abs=0.02)
 
 
@@ -127,14 +127,15 @@ def test_a_joint_is_fitted_to_its_image(tmp_path: Path) -> None:
     states[6] = replace(TRUE[6], instruments={"grasper": InstrumentState(given.pose, {"jaw_angle": 0.55})})
     found = search_of(session_of(tmp_path, states)).fitted(6, 1.0)
     assert found is not None
-    error = found.fit.state.instruments["grasper"].joints["jaw_angle"] - given.joints["jaw_angle"]
-    assert abs(error) < 1.5 * found.deviations[6]
-    assert found.deviations[6] < math.radians(3.5) < math.radians(SEARCH.joint)
+    fit, deviations = found
+    error = fit.state.instruments["grasper"].joints["jaw_angle"] - given.joints["jaw_angle"]
+    assert abs(error) < 1.5 * deviations[6]
+    assert deviations[6] < math.radians(3.5) < math.radians(SEARCH.joint)
 
 
 def test_a_fitted_state_is_no_surer_for_more_pixels_with_the_same_residuals(tmp_path: Path) -> None:
     search = search_of(session_of(tmp_path, TRUE))
-    fit = replace(measured(search, 1.0)[0].fit, misfit=0.5, observations=40.0)
+    fit = replace(measured(search, 1.0)[0][1], misfit=0.5, observations=40.0)
     no_prior = torch.zeros_like(fit.information)
     usual = fit.deviations(no_prior)
     nearer = replace(fit, information=4 * fit.information, observations=160.0)
@@ -340,9 +341,9 @@ def test_a_state_fitted_anew_on_its_other_side_is_turned_back(tmp_path: Path) ->
     session.refinement.set_state(4, true, half_turned_state(search, true), session.refinement.deviations(4))
     found = fitted_anew(search, 4)
     assert found is not None
-    off = session.refinement.layout.increments_between(true, found.fit.state)
+    off = session.refinement.layout.increments_between(true, found[0].state)
     assert off[:3].norm().rad2deg() < 5
-    assert bool((off.abs() < 3 * found.deviations).all())
+    assert bool((off.abs() < 3 * found[1]).all())
 
 
 def test_states_with_usual_errors_are_not_taken_for_wrong_ones(tmp_path: Path) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import torch
-from capture_files import PIVOT_MM, WRIST_MM, write_grasper
+from capture_files import PIVOT_MM, WRIST_MM, train_interrupted, write_grasper
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
@@ -21,9 +19,9 @@ from neeco.scene.training_views import TrainingViews
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 from neeco.training.config import method_defaults, training_config
-from neeco.training.initial import initial_scene
+from neeco.training.initial import begin_session, initial_scene
 from neeco.training.run import load_run
-from neeco.training.train import ProgressRow, train
+from neeco.training.train import train
 
 SIZES = ((80, 64), (64, 72))
 # everything that a long run does happens within 40 iterations
@@ -53,16 +51,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_path: Path) -> None:
-    def interrupt(row: ProgressRow) -> None:
-        if row.iteration == 23 and not row.note:  # after the hinges began to move and density control acted
-            os.kill(os.getpid(), signal.SIGINT)
-
-    first = train(capture, tmp_path / "first", CONFIG)
-    with pytest.raises(KeyboardInterrupt, match="at iteration 23"):
-        train(capture, tmp_path / "cut", CONFIG, progress=interrupt)
-    cut = train(capture, tmp_path / "cut", CONFIG, resume=True)
-    assert (first / "scene.safetensors").read_bytes() == (cut / "scene.safetensors").read_bytes()
-
+    first, _ = train_interrupted(capture, tmp_path, CONFIG, 23)  # after hinges began to move and density control acted
     scene = load_scene(first / "scene.safetensors")
     assert scene.diagnostics["instruments"]["grasper"]["moves_with_its_pose"]
     pivot = scene.deformation.articulations[0].hinge(0)[0]
@@ -121,8 +110,9 @@ def test_joints_that_turn_no_wrist_are_hinges_with_a_warning(tmp_path: Path) -> 
         frame["instruments"][0]["joints"]["grip"] = (0.7 * number * number) % 1.0
     (capture / "transforms.json").write_text(json.dumps(transforms))
     told: list[str] = []
-    run = load_run(train(capture, tmp_path / "run", CONFIG, progress=lambda row: told.append(row.note)))
-    assert run.scene.instruments[0].kinematics is None
+    read = read_capture(capture)
+    session = begin_session(read, TrainingViews.read(read.split("train")), CONFIG, told.append)
+    assert session.scene.instruments[0].kinematics is None
     assert any("several joints, no kinematics, and images show no wrist" in note for note in told)
 
 

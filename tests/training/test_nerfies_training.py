@@ -35,11 +35,12 @@ def config_of(*assignments: str, iterations: int = 30):
     return training_config("nerfies", {"iterations": iterations}, small)
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
-    """A short run on frames of two splits."""
-    capture = write_grasper(tmp_path / "capture", frames=7, sizes=((48, 48), (52, 48)))
-    return train(capture, tmp_path / "run", config_of(iterations=20))
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short run on frames of two splits; not to be changed but by what the verbs write."""
+    folder = tmp_path_factory.mktemp("run")
+    capture = write_grasper(folder / "capture", frames=7, sizes=((48, 48), (52, 48)))
+    return train(capture, folder / "run", config_of(iterations=20))
 
 
 def test_runs_learn_and_an_interrupted_one_gives_the_same_bytes(capture: Path, tmp_path: Path) -> None:

@@ -22,50 +22,25 @@ from neeco.training.config import method_defaults, training_config
 from neeco.training.train import train
 
 FILE = '''
-from dataclasses import dataclass
-
 import torch
 from torch import nn
 
 from neeco.scene.deformation import UNPERTURBED, Deformation, Posed
 
 
-@dataclass(frozen=True)
-class DriftSettings:
-    """`reach`: mm per unit of the learned direction; `weight`: of the term of the loss that draws it to 1."""
-
-    reach: float = 1.0
-    weight: float = 0.0
-
-
 class Drift(Deformation):
     """Everything moves with time along one learned direction [3] mm."""
 
     method = "drift"
-    Settings = DriftSettings
-    training_defaults = {"schedule.frame_order": "off", "ssim_weight": 0.05}
     needs_instruments = True
     label_names = (("grasper", "instrument"),)
 
     def __init__(self, instruments, settings=None) -> None:
         super().__init__(instruments, settings)
         self.direction = nn.Parameter(torch.zeros(3))
-        self.register_buffer("duration", torch.ones(()))
-
-    def fit_ranges(self, states, means):
-        self.duration.fill_(max(state.time for state in states))
-
-    def finish(self, training):
-        scene = training.scene
-        moved = torch.full((len(scene.canonical),), float(len(scene.recorded.states)))
-        scene.canonical = scene.canonical.with_extras(moved=moved)
 
     def pose(self, canonical, state, perturbation=UNPERTURBED):
-        shift = self.direction * self.settings.reach * (state.time / float(self.duration))
-        return Posed(canonical.means + shift, canonical.quats, canonical.log_scales.exp())
-
-    def regularisation(self, canonical, rendering, iteration):
-        return self.settings.weight * (self.direction - 1).abs().sum()
+        return Posed(canonical.means + self.direction * state.time, canonical.quats, canonical.log_scales.exp())
 
     def learning_rates(self, progress):
         return {"direction": 1e-2 * (1 - progress)}
@@ -97,26 +72,6 @@ def test_two_files_of_one_method_are_refused(tmp_path: Path) -> None:
             methods()
     finally:
         del sys.modules["neeco.methods.drifting"]
-
-
-def test_a_methods_own_term_of_the_loss_moves_it(tmp_path: Path) -> None:
-    """Every step of Adam follows the sign of a large gradient; all at the rates that were asked for."""
-    config = training_config("drift", {"iterations": 12}, ["deformation.weight=1.0e6"])
-    scene = load_scene(train(write_capture(tmp_path / "capture"), tmp_path / "run", config) / "scene.safetensors")
-    reached = sum(1e-2 * (1 - k / 12) for k in range(1, 13))
-    assert scene.deformation.direction.tolist() == pytest.approx([reached] * 3, rel=0.01)
-
-
-def test_a_new_method_trains_is_finished_and_comes_back_from_disk(drift: Any, tmp_path: Path) -> None:
-    config = training_config("drift", {"iterations": 12}, ["deformation.reach=3"])
-    assert (config.schedule.frame_order, config.ssim_weight) == ("off", 0.05)
-    run = train(write_capture(tmp_path / "capture"), tmp_path / "run", config)
-    scene = load_scene(run / "scene.safetensors")
-    assert isinstance(scene.deformation, drift)
-    assert scene.settings.reach == 3
-    assert float(scene.deformation.duration) == pytest.approx(0.28)  # fit_ranges was asked
-    assert bool((scene.deformation.direction != 0).all())  # it was learned
-    assert bool((scene.canonical.extras["moved"] == 8).all())  # finish was asked, with every recorded state
 
 
 def test_a_new_method_that_needs_instruments_says_so(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""A config survives YAML, and wrong settings are refused by name."""
+"""A config survives YAML; wrong settings, and others than a run was begun with, are refused by name; former names are
+understood."""
 
 from __future__ import annotations
 
@@ -8,10 +9,14 @@ from typing import get_args, get_type_hints
 
 import pytest
 import yaml
+from PIL import Image
 
+import neeco
 from neeco.base.errors import NeecoError
-from neeco.capture.model import Instrument
-from neeco.scene.method_registry import method_class, method_settings, methods
+from neeco.capture import read_capture
+from neeco.capture.writer import fingerprint
+from neeco.cli import main
+from neeco.scene.method_registry import current_name, method_class, method_settings, methods
 from neeco.training.config import (
     config_from_dict,
     config_to_dict,
@@ -20,8 +25,6 @@ from neeco.training.config import (
     training_config,
 )
 from neeco.training.run import read_config, stored_config, write_config
-
-ROD = (Instrument("rod"),)
 
 
 @pytest.mark.parametrize("method", list(methods()))
@@ -163,3 +166,124 @@ STEPS = r"--set.*published_steps: .* is not a (positive )?whole number"
 def test_a_setting_that_cannot_be_is_refused_by_name(method, values, assignment, message):
     with pytest.raises(NeecoError, match=message):
         training_config(method, values, [assignment] if assignment else [])
+
+
+SAID = "method neeco is now called nps"
+SMALL = ["deformation.width=16", "deformation.depth=2"]
+
+
+def test_a_former_name_trains_the_method_of_today() -> None:
+    with pytest.warns(FutureWarning, match=f"^{SAID}$"):
+        assert training_config("neeco", {}, SMALL) == training_config("nps", {}, SMALL)
+    assert [current_name(name) for name in ("nps", "kinematic", "nothing")] == ["nps", "kinematic", "nothing"]
+
+
+def test_a_run_of_a_former_name_is_continued_under_either(capture, tmp_path, capsys):
+    run = tmp_path / "run"
+    flags = ["train", str(capture), "--output", str(run), "--iterations", "4", "--set", SMALL[0], "--set", SMALL[1]]
+    assert main([*flags, "--method", "neeco"]) == 0
+    assert capsys.readouterr().err.count(SAID) == 1
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["method"] == "nps"
+
+    (run / "config.yaml").write_text(yaml.safe_dump(config | {"method": "neeco"}, sort_keys=False))  # as 0.2 wrote it
+    with pytest.warns(FutureWarning, match=SAID):
+        assert neeco.load(run).config["method"] == "nps"
+    for name in ("neeco", "nps"):
+        assert main([*flags, "--resume", "--method", name]) == 0
+
+
+def test_a_stored_setting_that_is_none_any_more_is_read_and_not_taken_anew(tmp_path: Path) -> None:
+    config = training_config("kinematic", {}, [])
+    stored = config_to_dict(config)
+    stored["deformation"] |= {"label_shares": True}
+    assert stored_config(tmp_path, stored) == config
+    with pytest.raises(NeecoError, match="label_shares"):
+        training_config("kinematic", {}, ["deformation.label_shares=false"])
+
+
+def test_a_stored_setting_that_was_removed_is_read_where_it_was_off_and_refused_where_it_was_on(tmp_path: Path) -> None:
+    config = training_config("nps", {}, [])
+    stored = config_to_dict(config)
+    off, on = ({"gate_mm": mm, "carried_places": mm is not None} for mm in (None, 20.0))
+    assert stored_config(tmp_path, stored | {"deformation": stored["deformation"] | off}) == config
+    with pytest.raises(NeecoError, match="gate_mm"):
+        stored_config(tmp_path, stored | {"deformation": stored["deformation"] | on})
+
+
+SETS = ["schedule.phase_1.interval=7", "density_start=10"]
+
+
+@pytest.fixture
+def run(capture: Path, tmp_path: Path) -> Path:
+    """A run that ended, as far as resuming it looks."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    config = training_config("3dgs", {"iterations": 20, "minutes": 3.0}, SETS)
+    write_config(folder, capture, config, fingerprint(read_capture(capture)))
+    (folder / "scene.safetensors").touch()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--iterations", "200"], "--iterations 200: the run was begun with 20"),
+        (["--minutes", "5"], "--minutes 5.0: the run was begun with 3.0"),
+        (["--seed", "5"], "--seed 5: the run was begun with 0"),
+        (["--method", "nps"], "--method nps: the run was begun with 3dgs"),
+        (["--transforms", "other.json"], "--transforms other.json: the run was begun with transforms.json"),
+        (["--batch-size", "2"], "--batch-size 2: the run was begun with 1"),
+        (["--scale", "0.5"], "--scale 0.5: the run was begun with 1.0"),
+        (["--max-tissue-gaussians", "9"], "--max-tissue-gaussians 9: the run was begun without"),
+        (["--set", "density_start=11"], "--set density_start=11: the run was begun with 10"),
+        (["--set", "schedule.phase_1.interval=8"], "--set schedule.phase_1.interval=8: the run was begun with 7"),
+        (["--method", "3dgs+dta"], "--set schedule.compensation=on: the run was begun with off"),
+        (["--seed", "5", "--iterations", "200"], "begun with 20; --seed 5: the run was begun with 0; leave them out"),
+    ],
+)
+def test_a_run_is_not_continued_with_other_settings(flags, said, capture, run, capsys):
+    assert main(["train", str(capture), "--output", str(run), "--resume", *flags]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert f"to continue {run}, or give another --output" in line
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        [],
+        ["--iterations", "20"],
+        ["--method", "3dgs", "--seed", "0"],
+        ["--method", "3dgs", "--iterations", "20", "--minutes", "3", *(f"--set={word}" for word in SETS)],
+    ],
+)
+def test_a_run_is_continued_without_flags_or_with_its_own(flags: list[str], capture: Path, run: Path) -> None:
+    assert main(["train", str(capture), "--output", str(run), "--resume", *flags]) == 0
+
+
+def test_an_adjusted_run_is_continued_by_its_own_name_alone() -> None:
+    sets = ["schedule.compensation=inverse"]
+    for name in ("3dgs+dta", "nps"):
+        for words in ([], sets):
+            begun = training_config(name, {}, words)
+            assert training_config(name, {}, words, begun) == begun
+            assert training_config(None, {}, (), begun) == begun
+    plain = training_config("3dgs", {}, (), training_config("3dgs+dta", {}))
+    assert plain.schedule == training_config("3dgs", {}).schedule
+
+
+def test_a_finished_run_of_another_capture_is_not_called_finished(capture, run, capsys):
+    Image.new("RGB", (32, 24)).save(capture / "images" / "000003.png")
+    assert main(["train", str(capture), "--output", str(run), "--resume"]) == 1
+    assert f"{capture} has changed since this run was begun" in capsys.readouterr().err
+
+
+def test_python_is_refused_as_the_command_line_is_without_dashes(capture: Path, run: Path) -> None:
+    for given, said in (
+        ({"seed": 5}, "^seed 5"),
+        ({"method": "nps"}, "^method nps"),
+        ({"density_start": 3}, "3"),
+    ):
+        with pytest.raises(NeecoError, match=f"{said}: the run was begun with"):
+            neeco.train(capture, run, resume=True, **given)  # type: ignore[arg-type]

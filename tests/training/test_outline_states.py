@@ -13,7 +13,8 @@ from wristed_world import shifted
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.states.outline_fit import LinkViews
 from neeco.states.outline_model import ArticulatedModel, half_turned, joint_values, mirrored
-from neeco.states.outline_states import FoundStates, find_states, sds_of
+from neeco.states.outline_states import FoundStates, find_states
+from neeco.states.parameters import sds_of
 
 WIDTH, HEIGHT, FOCAL, STATES = 240, 192, 260.0, 20
 DEG = np.pi / 180

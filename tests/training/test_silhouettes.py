@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +12,6 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from neeco.capture import read_capture
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
 from neeco.methods.kinematic.deformation import observe_silhouettes
@@ -21,9 +19,6 @@ from neeco.methods.kinematic.finish import drop_refuted
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.scene.training_views import TrainingViews
-from neeco.training.config import training_config
-from neeco.training.initial import begin_session
 from neeco.training.session import GaussianSession
 from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
 
@@ -165,25 +160,6 @@ def test_the_loss_takes_labels_of_any_size(size: tuple[int, int]) -> None:
     right[:, : size[1] // 2] = 1
     silhouettes = Silhouettes((values,), 0.0)
     assert float(silhouettes.loss(0, right)) < 1e-4 < float(silhouettes.loss(0, 1 - right))
-
-
-def test_a_checkpoint_brings_them_back(capture: Path) -> None:
-    views = TrainingViews.read(read_capture(capture).split("train"))
-    first, second = (
-        begin_session(
-            read_capture(capture), views, training_config("nps", {"iterations": 20}, ["deformation.width=16"]), print
-        )
-        for _ in range(2)
-    )
-    frames = (torch.arange(6, dtype=torch.uint8).view(2, 3), torch.arange(8, dtype=torch.uint8).view(4, 2))
-    second.restore(*first.pack())
-    assert second.silhouettes is None
-    first.silhouettes = Silhouettes(frames, 0.0125)
-    second.restore(*first.pack())
-    back = second.silhouettes
-    assert back is not None
-    assert back.noise == 0.0125
-    assert all(torch.equal(a, b) for a, b in zip(back.values, frames, strict=True))
 
 
 @pytest.mark.parametrize(("deviation_mm", "dropped"), [(0.0, True), (5.0, False)])

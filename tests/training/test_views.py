@@ -1,4 +1,4 @@
-"""Pixels are given where the scene is, whether they live there or are copied frame by frame."""
+"""Pixels are given where the scene is; several frames per step give the mean of their losses."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.methods.nerfies.session import RayTable
+from neeco.raster.optimizer import Adam
 from neeco.scene import training_views as module
-from neeco.scene.training_views import PixelPrefetcher, TrainingViews
-from neeco.training.config import training_config
+from neeco.scene.training_views import TrainingViews
+from neeco.training.config import TrainConfig, training_config
 from neeco.training.initial import begin_session
+from neeco.training.schedule import due
+from neeco.training.session import GaussianSession
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 
@@ -35,29 +38,6 @@ def test_copied_frames_are_the_frames_prefetched_or_not(views: TrainingViews) ->
         assert (copied.mask(index) is None) == (views.mask(index) is None)
         copied.prefetch(index + 1)
     assert torch.equal(copied.mask(1), views.masks[1])
-
-
-def test_what_is_prefetched_is_copied_once_and_ahead(views: TrainingViews, monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[int] = []
-    real = PixelPrefetcher.start
-
-    def begin(self: PixelPrefetcher, index: int, image: Tensor, mask: Tensor | None) -> None:
-        if index != self._index:
-            begun.append(index)
-        real(self, index, image, mask)
-
-    monkeypatch.setattr(PixelPrefetcher, "start", begin)
-    copied = views.prefetched_to(torch.device("meta"))
-    copied.prefetch(1)
-    assert begun == [1]
-    target, mask = copied.target(1), copied.mask(1)
-    assert target.is_meta
-    assert mask is not None
-    assert mask.is_meta
-    assert not copied.images[1].is_meta
-    copied.prefetch(2)
-    copied.target(2)
-    assert begun == [1, 2]
 
 
 @pytest.mark.parametrize("stays", [True, False])
@@ -91,3 +71,88 @@ def test_a_run_learns_the_same_from_frames_that_are_copied(capture: Path, views:
             session.step()
         learned.append(session.scene.canonical.means.detach())
     assert torch.equal(*learned)
+
+
+NEECO = ["deformation.width=16", "deformation.depth=2", "deformation.warm_up=0", "refine.start=0"]
+
+
+def config_of(views: int, method: str = "nps", assignments: tuple[str, ...] = ()) -> TrainConfig:
+    small = [
+        *(NEECO if method == "nps" else []),
+        "density_start=10",
+        "density_stop=0.9",
+        "log_interval=5",
+        "checkpoint_interval=20",
+        *assignments,
+    ]
+    return training_config(method, {"iterations": 60, "batch_size": views}, small)
+
+
+def begun(folder: Path, config: TrainConfig) -> GaussianSession:
+    capture = read_capture(folder)
+    torch.manual_seed(0)
+    return begin_session(capture, TrainingViews.read(capture.split("train")), config, print)
+
+
+def gradients(session: GaussianSession, monkeypatch: pytest.MonkeyPatch, steps: int) -> list[dict[str, Tensor]]:
+    """Of every tensor that is learned, step by step; nothing is."""
+    seen: list[dict[str, Tensor]] = []
+
+    def note(self: Adam, learned) -> None:
+        given = [(name, tensor) for name, tensor, _ in learned if tensor.grad is not None]
+        seen.append({name: tensor.grad.clone() for name, tensor in given})
+        for _, tensor in given:
+            tensor.grad = None
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Adam, "step", note)
+        for _ in range(steps):
+            session.step()
+    return seen
+
+
+def test_gradients_are_the_mean_of_single_ones_and_density_counts_every_frame(capture, monkeypatch):
+    still = ("schedule.compensation=off", "schedule.frame_order=off", "density_start=50", "refine.frame_poses=true")
+    one, two = (begun(capture, config_of(views, assignments=still)) for views in (1, 2))
+    torch.nn.init.normal_(one.scene.deformation.head.weight, std=0.1)
+    two.scene.load_state_dict(one.scene.state_dict())
+    single = gradients(one, monkeypatch, 2)
+    (both,) = gradients(two, monkeypatch, 1)
+    assert both.keys() == single[0].keys() > {"means", "sh_dc", "falloff", "deformation.head.weight"}
+    for name, gradient in both.items():
+        mean = (single[0][name] + single[1][name]) / 2
+        assert (gradient - mean).norm() <= 1e-5 * mean.norm() + 1e-9, name
+    assert not torch.equal(single[0]["means"], single[1]["means"])
+    assert torch.allclose(two.statistics.total, one.statistics.total, rtol=1e-5, atol=1e-9)
+    assert torch.equal(two.statistics.seen, one.statistics.seen)
+    assert torch.allclose(two.refinement.poses, one.refinement.poses, rtol=0.05)  # its rate falls with the progress
+    assert two.refinement.poses.any()
+    assert torch.equal(two.refinement.frame_steps, one.refinement.frame_steps)
+    assert (two.iteration, two.queue) == (one.iteration, one.queue)
+    histories = (torch.tensor(list(session.schedule.history)) for session in (one, two))
+    assert torch.allclose(*histories, rtol=1e-4)
+
+
+def test_intervals_fall_due_once_whatever_the_step() -> None:
+    for views in (1, 2, 3, 7):
+        fell_due = [step for step in range(views, 100, views) if due(10, step - views, step)]
+        assert len(fell_due) == (100 - 1) // views * views // 10
+        assert all(step % 10 < views for step in fell_due)
+
+
+def test_rates_grow_with_the_root_and_memory_shrinks_with_the_number_of_frames() -> None:
+    """A first step is as long as its rate, whatever the gradient; so many steps later a moment is forgotten alike."""
+    one, four = Adam(), Adam(4)
+    moved = []
+    for adam, steps in ((one, 4), (four, 1)):
+        tensor = torch.zeros(3, requires_grad=True)
+        tensor.grad = torch.tensor([0.1, -2.0, 30.0])
+        adam.step([("tensor", tensor, 0.01)])
+        moved.append(tensor.detach().clone())
+        first = adam.first["tensor"] / (1 - adam.betas[0])  # the gradient itself
+        for _ in range(steps):
+            tensor.grad = torch.zeros(3)
+            adam.step([("tensor", tensor, 0.01)])
+        assert torch.allclose(adam.first["tensor"] / (1 - adam.betas[0]), first * 0.9**4)
+    assert torch.allclose(moved[1], 2 * moved[0])
+    assert torch.allclose(moved[0], 0.01 * torch.tensor([-1.0, 1.0, -1.0]))

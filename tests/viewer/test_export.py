@@ -79,7 +79,7 @@ def test_turns_and_sizes_are_those_that_are_drawn() -> None:
     posed = scene.at(state)
     turns = np.stack([between(found["turn"][rows, k], 65535, header["ranges"]["turn"][k]) for k in (0, 1)], 1)
     hinges, weights = scene.deformation.articulations[0], scene.deformation.link_weights(scene.canonical, 0)
-    expected = weights[:, 1:3] @ hinges.turns(0, reading)
+    expected = weights[:, 1:3] @ hinges.values({"jaw_angle": reading})[0]
     assert np.abs(turns[:, 0] + turns[:, 1] * reading - expected.numpy()).max() < 1e-3
     pivot, axis = hinges.hinge(0)
     assert np.allclose(hinge["pivot"], pivot, atol=1e-5)

@@ -248,15 +248,6 @@ def posed_views(evidence: Evidence, name: str, settings: CarvingSettings, moved:
     return PosedViews(evidence, own, exchanged, settings.motion_ratio)
 
 
-def shape_around_frame(shape: CarvedShape, distance: float, count: int, generator: torch.Generator) -> CarvedShape:
-    """Return the initial shape where carving is not reliable: `count` seeds around the tracked frame, which is on the
-    body."""
-    spread = CARVING.seed_spread * distance
-    seeds = (torch.randn(count, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
-    frame = torch.eye(4, device=seeds.device)
-    return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
-
-
 @torch.no_grad()
 def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: CarvingSettings) -> CarvedShape | None:
     """Return the shape of instrument `name`; None without evidence in its frame (wrong poses, or never in view)."""

@@ -10,13 +10,13 @@ from torch import Tensor
 from neeco.base.errors import NeecoError
 from neeco.capture.model import HOW_TO_REGISTER
 from neeco.evidence.carving import (
+    CARVING,
     CarvedShape,
     Evidence,
     carve,
     gather_evidence,
     posed_views,
     score_points,
-    shape_around_frame,
 )
 from neeco.methods.breathing import Breathing
 from neeco.methods.static import Static
@@ -97,7 +97,10 @@ def carved_shape(session: GaussianSession, evidence: Evidence, name: str, genera
         )
     if moves_with_pose(session, evidence, name, shape):
         return shape
-    return shape_around_frame(shape, evidence.distance, search.seeds, generator)
+    spread = CARVING.seed_spread * evidence.distance
+    seeds = (torch.randn(search.seeds, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
+    frame = torch.eye(4, device=seeds.device)  # the tracked frame is on the body
+    return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
 
 
 def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, shape: CarvedShape) -> bool:

@@ -110,16 +110,12 @@ def blocked(among: Casting, width: Tensor, offsets: Tensor, draw: Draw, shines: 
     lamps = [index for index in range(len(offsets)) if shines is None or shines[index]]
     if all_run_native(among.means, offsets):
         return _Blocked.apply(width, offsets, among, draw, lamps)
-    none = torch.zeros_like(among.means[:, 0])
-    rows = [_blocked_by(among, width, offsets[k], draw) if k in lamps else none for k in range(len(offsets))]
+    rows = [torch.zeros_like(among.means[:, 0])] * len(offsets)
+    for lamp in lamps:
+        at_light = light_camera(among.camera, offsets[lamp].detach())
+        (seen,) = draw(among.bare, [at_light])
+        rows[lamp] = blocked_reference(seen.alpha, seen.depth, width, offsets[lamp], among, at_light)
     return torch.stack(rows)
-
-
-def _blocked_by(among: Casting, width: Tensor, offset: Tensor, draw: Draw) -> Tensor:
-    """`blocked` of one lamp, [N]. Any float type and device."""
-    at_light = light_camera(among.camera, offset.detach())
-    (from_light,) = draw(among.bare, [at_light])
-    return blocked_reference(from_light.alpha, from_light.depth, width, offset, among, at_light)
 
 
 def blocked_reference(

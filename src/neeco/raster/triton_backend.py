@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,25 +11,14 @@ from torch.autograd.function import once_differentiable
 
 from neeco.base.errors import NeecoError
 from neeco.geometry.camera import Camera
-from neeco.raster.triton.binning import Lists, Tiles, list_per_tile
+from neeco.raster.triton.binning import Tiles, list_per_tile
 from neeco.raster.triton.composite import Images, composite, composite_backward
-from neeco.raster.triton.project import INPUTS, Inputs, Projected, project
+from neeco.raster.triton.project import INPUTS, Inputs, project
 from neeco.raster.triton.project_backward import project_backward
 from neeco.raster.triton.ready import working_on
 from neeco.raster.types import Gaussians, Rendering, differentiable
 
 TILE_PX = 16
-
-
-@dataclass(frozen=True)
-class ForwardState:
-    """Intermediate results that the backward pass needs; none is an input or output of autograd."""
-
-    projected: Projected
-    lists: Lists
-    tiles: Tiles
-    left: Tensor
-    full_at: Tensor
 
 
 def rasterize_triton(
@@ -75,25 +63,24 @@ class _Rasterize(torch.autograd.Function):
             # saved so that autograd detects a modified input before the backward pass
             ctx.save_for_backward(images.alpha, images.depth, *tensors)
             ctx.camera = camera
-            ctx.state = ForwardState(projected, lists, tiles, images.left, images.full_at)
+            # what the backward pass needs and is no input or output of autograd
+            ctx.state = projected, lists, tiles, images.left, images.full_at
         return images.color, images.alpha, images.depth, images.channels, projected.radii
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> Any:
         alpha, depth, *tensors = ctx.saved_tensors
-        inputs, state, camera = _inputs(tensors), ctx.state, ctx.camera
+        inputs, camera, (projected, lists, tiles, left, full_at) = _inputs(tensors), ctx.camera, ctx.state
         to_images = tuple(None if g is None else g.to(torch.float32).contiguous() for g in gradients[:4])
         to_color = to_images[0]
         wanted = ctx.needs_input_grad[3:]
-        images = Images(depth, alpha, depth, None, state.left, state.full_at)
+        images = Images(depth, alpha, depth, None, left, full_at)
         with working_on(alpha.device):
-            sums = composite_backward(inputs, state.projected.records, state.lists, state.tiles, images, to_images)
-            to = project_backward(inputs, state.projected, camera, sums, wanted[4], wanted[8] or wanted[9])
+            sums = composite_backward(inputs, projected.records, lists, tiles, images, to_images)
+            to_centers, grads = project_backward(inputs, projected, camera, sums, wanted[4], wanted[8] or wanted[9])
         to_background = None
         if wanted[10] and to_color is not None and inputs.background is not None:
             to_background = ((1 - alpha)[..., None] * to_color).sum(dim=(0, 1))
-        grads = [to.means, to.quats, to.scales, to.opacities, to.sh, to.falloff, to.channels, to.left]
-        grads += [to.vignette, to.pose]
         needed = [gradient if need else None for gradient, need in zip(grads, wanted, strict=False)]
-        return to.centers, None, None, *needed, to_background, None
+        return to_centers, None, None, *needed, to_background, None

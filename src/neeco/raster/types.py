@@ -10,9 +10,21 @@ from torch import Tensor
 
 from neeco.geometry.camera import Camera
 
+Held = TypeVar("Held", bound="Movable")
+
 
 @dataclass(frozen=True)
-class Shadow:
+class Movable:
+    """Tensors, and groups of them, that move to a device together."""
+
+    def to(self: Held, device: torch.device | str) -> Held:
+        """Return the same on `device`."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: value.to(device) for name, value in values.items() if value is not None})
+
+
+@dataclass(frozen=True)
+class Shadow(Movable):
     """Shadows that some Gaussians cast on the others under lamps next to the lens (see `shadow.shadowed`)."""
 
     casters: Tensor  # [N] bool: these cast the shadow, all others receive it
@@ -20,13 +32,9 @@ class Shadow:
     strengths: Tensor  # [L] in [0, 1]: share of all (linear) light that each gives, missing in its deepest shadow
     width: Tensor  # [] slope: standard deviation of a shadow's edge, viewed from the lamp
 
-    def to(self, device: torch.device | str) -> Shadow:
-        """Return the shadow on `device`."""
-        return _moved(self, device)
-
 
 @dataclass(frozen=True)
-class Headlight:
+class Headlight(Movable):
     """Light at the camera, as an endoscope's: it decreases with distance and off the optical axis.
 
     A Gaussian's colour is multiplied by
@@ -40,10 +48,6 @@ class Headlight:
     vignette: Tensor  # [2]
     shadow: Shadow | None = None
     left: Tensor | None = None  # [N] of stored colours, > 0; None: all
-
-    def to(self, device: torch.device | str) -> Headlight:
-        """Return the light on `device`."""
-        return _moved(self, device)
 
     def select(self, rows: Tensor | slice) -> Headlight:
         """Return the light of the Gaussians `rows`."""
@@ -61,7 +65,7 @@ def _rows(chosen: Tensor) -> Tensor | slice:
 
 
 @dataclass(frozen=True)
-class Gaussians:
+class Gaussians(Movable):
     """Posed Gaussians (world frame, lengths in mm).
 
     Colour is `max(0, sh . basis(direction) + 0.5)`, direction = from the camera centre to the mean, unit, turned into
@@ -90,18 +94,6 @@ class Gaussians:
         }
         frames = None if self.sh_frames is None else self.sh_frames[rows]
         return replace(self, **columns, sh_frames=frames, headlight=self.headlight and self.headlight.select(rows))
-
-    def to(self, device: torch.device | str) -> Gaussians:
-        """Return the Gaussians on `device`."""
-        return _moved(self, device)
-
-
-Held = TypeVar("Held", Shadow, Headlight, Gaussians)
-
-
-def _moved(group: Held, device: torch.device | str) -> Held:
-    values = {field.name: getattr(group, field.name) for field in fields(group)}
-    return replace(group, **{name: value.to(device) for name, value in values.items() if value is not None})
 
 
 def differentiable(

@@ -22,7 +22,7 @@ from neeco.raster import depth_maps, rasterize
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
 from neeco.states.crop_rendering import CROPS
-from neeco.states.minimise import ImageResidual, minimise
+from neeco.states.minimise import Differences, ImageResidual, Render, minimise
 from neeco.states.parameters import InstrumentParameters, StateParameters, moved_camera, precision_of
 
 if TYPE_CHECKING:
@@ -63,39 +63,6 @@ class AlignedFrame:
     increments: Tensor  # [P] float64: rotation vector rad and translation mm of each instrument, joints, the camera
 
 
-@dataclass(frozen=True, kw_only=True)
-class _AlignmentProblem:
-    """A frame at one resolution (see `FitProblem`)."""
-
-    scene: GaussianScene
-    state: State
-    camera: Camera  # of the image's size; its pose is the recorded one
-    parameters: StateParameters
-    residual: ImageResidual
-    precision: Tensor  # [P, P]
-    steps: Tensor  # [P] finite differences
-
-    def gaussians(self, at: Tensor) -> Gaussians:
-        return self.scene.at(self.parameters.moved(self.state, at))
-
-    def image(self, gaussians: Gaussians, at: Tensor) -> Tensor:
-        return rasterize(gaussians, _camera_at(self.camera, at)).color.cpu()  # where the small systems are solved
-
-    def render(self, at: Tensor) -> tuple[Gaussians, Tensor]:
-        gaussians = self.gaussians(at)
-        return gaussians, self.image(gaussians, at)
-
-    def differences(self, at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
-        # shadows, which move as little as what casts them, are rendered once for all differences
-        still = shadowed(posed, _camera_at(self.camera, at), depth_maps)
-        for index, step in enumerate(self.steps.tolist()):
-            moved = at.clone()
-            moved[index] += step
-            is_camera = index >= len(at) - 6
-            gaussians = still if is_camera else replace(self.gaussians(moved), headlight=still.headlight)
-            yield self.image(gaussians, moved), step
-
-
 @torch.no_grad()
 def align_frame(
     scene: GaussianScene, frame: Frame, image: Tensor, start: Tensor | None = None, config: AlignConfig | None = None
@@ -125,18 +92,39 @@ def align_frame(
         camera = frame.camera.scaled(factor * largest)
         weight = area_averaged(counted[..., None], camera.width, camera.height)[..., 0]
         target = area_averaged(image, camera.width, camera.height)
-        problem = _AlignmentProblem(
-            scene=scene,
-            state=frame.state,
-            camera=camera,
-            parameters=parameters,
-            residual=ImageResidual(target, torch.where(weight > 0.99, 1.0, 0.0), config.huber, scale),
-            precision=precision,
-            steps=steps / factor,
-        )
-        starts = [minimise(problem, starts, count).parameters]
+        residual = ImageResidual(target, torch.where(weight > 0.99, 1.0, 0.0), config.huber, scale)
+        rendering = _rendering(scene, frame.state, camera, parameters, (steps / factor).tolist())
+        starts = [minimise(residual, precision, *rendering, starts, count).parameters]
     (increments,) = starts
     return AlignedFrame(parameters.moved(frame.state, increments), _camera_at(frame.camera, increments), increments)
+
+
+def _rendering(
+    scene: GaussianScene, state: State, camera: Camera, parameters: StateParameters, steps: list[float]
+) -> tuple[Render[Gaussians], Differences[Gaussians]]:
+    """Return `render` and `differences` of `minimise` for images of a `camera` of the recorded pose, with these finite
+    differences [P]."""
+
+    def gaussians(at: Tensor) -> Gaussians:
+        return scene.at(parameters.moved(state, at))
+
+    def image(posed: Gaussians, at: Tensor) -> Tensor:
+        return rasterize(posed, _camera_at(camera, at)).color.cpu()  # where the small systems are solved
+
+    def render(at: Tensor) -> tuple[Gaussians, Tensor]:
+        posed = gaussians(at)
+        return posed, image(posed, at)
+
+    def differences(at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
+        # shadows, which move as little as what casts them, are rendered once for all differences
+        still = shadowed(posed, _camera_at(camera, at), depth_maps)
+        for index, step in enumerate(steps):
+            moved = at.clone()
+            moved[index] += step
+            is_camera = index >= len(at) - 6
+            yield image(still if is_camera else replace(gaussians(moved), headlight=still.headlight), moved), step
+
+    return render, differences
 
 
 def _camera_at(camera: Camera, at: Tensor) -> Camera:

@@ -89,26 +89,17 @@ def _limit(misfits: Tensor, many: float) -> float:
     return math.exp(float(logs.median()) + many * spread)
 
 
-@dataclass(frozen=True)
-class Refitted:
-    """A frame's best fit, and standard deviations [P] that include the spread of those that it does not refute."""
-
-    fit: StateFit
-    deviations: Tensor
-
-    @classmethod
-    def of(cls, search: StateSearch, index: int, fits: Sequence[StateFit]) -> Refitted:
-        """Return the best of `fits`, and, with stated links, of fits about the best one turned by half a turn about its
-        shaft, which has a similar outline."""
-        precision, best = search.precision(index, JUDGE.start_scale), _best(fits)
-        if search.linked:
-            fits = [*fits, *_fits_near(search, index, half_turned_state(search, best.state))]
-            best = _best(fits)
-        apart = search.refinement.layout.increments_between
-        possible = torch.stack(
-            [apart(best.state, fit.state) for fit in fits if JUDGE.better * fit.misfit <= best.misfit]
-        )
-        return cls(best, (best.deviations(precision).square() + possible.square().mean(0)).sqrt())
+def refitted(search: StateSearch, index: int, fits: Sequence[StateFit]) -> tuple[StateFit, Tensor]:
+    """Return the best of a frame's `fits`, and, with stated links, of fits about the best one turned by half a turn
+    about its shaft, which has a similar outline; and standard deviations [P] that include the spread of those that it
+    does not refute."""
+    precision, best = search.precision(index, JUDGE.start_scale), _best(fits)
+    if search.linked:
+        fits = [*fits, *_fits_near(search, index, half_turned_state(search, best.state))]
+        best = _best(fits)
+    apart = search.refinement.layout.increments_between
+    possible = torch.stack([apart(best.state, fit.state) for fit in fits if JUDGE.better * fit.misfit <= best.misfit])
+    return best, (best.deviations(precision).square() + possible.square().mean(0)).sqrt()
 
 
 @torch.no_grad()
@@ -147,10 +138,11 @@ def judge_again(search: StateSearch) -> None:
 
 
 @torch.no_grad()
-def fitted_anew(search: StateSearch, index: int) -> Refitted | None:
-    """Return the fit of a frame whose recorded state is wrong, about its present one; None if it leaves the image."""
+def fitted_anew(search: StateSearch, index: int) -> tuple[StateFit, Tensor] | None:
+    """Return the fit of a frame whose recorded state is wrong, about its present one, as `refitted` does; None if it
+    leaves the image."""
     fits = _fits_from(search, index, [search.state(index)])
-    return Refitted.of(search, index, fits) if fits else None
+    return refitted(search, index, fits) if fits else None
 
 
 def leave_out_unexplained(search: StateSearch, misfits: Mapping[int, float]) -> None:
@@ -188,8 +180,8 @@ def _judge(
     if best is not None and best.misfit < JUDGE.better * misfit and best.gain > gain:
         if _distance(search, index, recorded, best.state, scale) > JUDGE.min_distance:
             verdict = Verdict.REFITTED if best.misfit < misfits.limit else Verdict.EXCLUDED
-            refitted = Refitted.of(search, index, others)
-            refinement.set_state(index, recorded, refitted.fit.state, refitted.deviations)
+            refit, deviations = refitted(search, index, others)
+            refinement.set_state(index, recorded, refit.state, deviations)
     elif misfits.rejection_limit < misfit < math.inf:
         verdict = Verdict.EXCLUDED
     explained = not misfits.limit < misfit < math.inf and (best is None or best.gain <= JUDGE.unclear * gain)

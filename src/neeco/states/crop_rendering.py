@@ -174,17 +174,13 @@ class InstrumentRenderer:
         registered = self.alone.registered(state)
         moved = self._poser(registered)
         geometry = {name: getattr(moved, name) for name in ("means", "quats", "scales", "sh_frames")}
-        posed = replace(self._unposed(state), **geometry)
+        if self._first is None:  # colours and opacities are the same in all states
+            unposed = self.alone.at(state)
+            light = unposed.headlight and replace(unposed.headlight, shadow=None)  # nothing receives their shadow
+            self._first = replace(unposed, headlight=light)
+        posed = replace(self._first, **geometry)
         self._latest.append((state, registered, posed))
         return registered, posed
-
-    def _unposed(self, state: State) -> Gaussians:
-        """Return Gaussians in whatever state was posed first: their colours and opacities are the same in all."""
-        if self._first is None:
-            posed = self.alone.at(state)
-            light = posed.headlight and replace(posed.headlight, shadow=None)  # nothing receives their shadow
-            self._first = replace(posed, headlight=light)
-        return self._first
 
     def render(self, state: State, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return (colour [h, w, 3] over black, alpha [h, w]) of the instruments in `state`."""

@@ -26,7 +26,7 @@ from neeco.states.crop_rendering import (
     view_of,
     working_size,
 )
-from neeco.states.minimise import ImageResidual, minimise
+from neeco.states.minimise import Differences, ImageResidual, Render, minimise
 from neeco.states.parameters import StateParameters, precision_of
 
 
@@ -77,38 +77,6 @@ class StateFit:
         """
         share = 1 / max(1.0, self.observations * self.misfit)
         return torch.linalg.inv(share * self.information + precision).diagonal().sqrt()
-
-
-@dataclass(frozen=True)
-class _CropProblem:
-    """The parameters of states before a view's tissue as it is, images reduced to `size` (see `FitProblem`)."""
-
-    fitter: Fitter[StateParameters]
-    view: FrameView
-    size: float
-    residual: ImageResidual
-    moved: MovedStates
-    precision: Tensor
-
-    def render(self, at: Tensor) -> tuple[Gaussians, Tensor]:
-        return self._rendered(self.moved.at(at))
-
-    def _rendered(self, state: State) -> tuple[Gaussians, Tensor]:
-        posed = self.fitter.instruments.pose(state)
-        return posed, downsampled(self.fitter.instruments.composed(posed, self.view), self.size)
-
-    def differences(self, at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
-        parameters, state = self.fitter.parameters, self.moved.at(at)
-        # the pose of a single instrument moves all Gaussians as one
-        n_rigid = 6 if len(parameters.instruments) == 1 else 0
-        for index, step in enumerate((parameters.vector_from_degrees(*FIT.steps) / self.size).tolist()):
-            increments, change = at.clone(), step * parameters.step_sign(state, index, step)
-            increments[index] += change
-            other = parameters.moved(self.moved.expected, increments)
-            if index < n_rigid:
-                yield downsampled(self.fitter.instruments.moved(posed, state, other, self.view), self.size), change
-            else:
-                yield self._rendered(other)[1], change
 
 
 class MovedStates:
@@ -169,9 +137,16 @@ class Fitter(Generic[P]):
             residual = residual_of(crop, level, self.correlation_px)
             for first in range(0, count, FIT.steps_at_once):
                 crop = self.with_shadow(crop, moved.at(increments))
-                problem = _CropProblem(self, crop, level, residual, moved, precision)
-                max_steps = min(count - first, FIT.steps_at_once)
-                minimum = minimise(problem, [increments], max_steps, small=small, linearised_for=FIT.steps_at_once)
+                rendering, max_steps = self._rendering(crop, level, moved), min(count - first, FIT.steps_at_once)
+                minimum = minimise(
+                    residual,
+                    precision,
+                    *rendering,
+                    [increments],
+                    max_steps,
+                    small=small,
+                    linearised_for=FIT.steps_at_once,
+                )
                 increments, cost = minimum.parameters, minimum.cost
                 information = information if minimum.information is None else minimum.information
                 if minimum.settled:
@@ -191,6 +166,31 @@ class Fitter(Generic[P]):
             information=information,
             view=crop,
         )
+
+    def _rendering(
+        self, view: FrameView, size: float, moved: MovedStates
+    ) -> tuple[Render[Gaussians], Differences[Gaussians]]:
+        """Return `render` and `differences` of `minimise` before a view's tissue as it is, images reduced to `size`."""
+        parameters, instruments = self.parameters, self.instruments
+
+        def rendered(state: State) -> tuple[Gaussians, Tensor]:
+            posed = instruments.pose(state)
+            return posed, downsampled(instruments.composed(posed, view), size)
+
+        def differences(at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
+            state = moved.at(at)
+            # the pose of a single instrument moves all Gaussians as one
+            n_rigid = 6 if len(parameters.instruments) == 1 else 0
+            for index, step in enumerate((parameters.vector_from_degrees(*FIT.steps) / size).tolist()):
+                increments, change = at.clone(), step * parameters.step_sign(state, index, step)
+                increments[index] += change
+                other = parameters.moved(moved.expected, increments)
+                if index < n_rigid:
+                    yield downsampled(instruments.moved(posed, state, other, view), size), change
+                else:
+                    yield rendered(other)[1], change
+
+        return (lambda at: rendered(moved.at(at))), differences
 
     def ranked(self, view: FrameView, states: Iterable[State], size: float) -> list[State]:
         """Return states, the best first, by how well they explain a view reduced to `size`."""
@@ -227,20 +227,16 @@ class Fitter(Generic[P]):
         )
         gain = residual.scale * float((without - with_it).sum(dtype=torch.float64))
         unexplained = (with_it > FIT.foreground_error) & (without > FIT.foreground_error)
-        hidden = wide_areas(unexplained, round(FIT.foreground_width * view.diagonal))
+        # where that holds a square of so many pixels, and the rims of these areas
+        square = np.ones((round(FIT.foreground_width * view.diagonal),) * 2, np.uint8)
+        opened = cv2.morphologyEx(unexplained.numpy().astype(np.uint8), cv2.MORPH_OPEN, square)
+        hidden = torch.from_numpy(cv2.dilate(opened, np.ones((FIT.foreground_rim_px,) * 2, np.uint8)) > 0)
         opaque = alpha * view.weight
         if float(opaque[hidden].sum()) > FIT.max_hidden * float(opaque.sum()):
             hidden = torch.zeros_like(hidden)
         near = widened(alpha > 0.5, round(FIT.neighbourhood * view.diagonal)) & ~hidden
         pixels = max(float(opaque[~hidden].sum()), 1.0)
         return gain, float(with_it[near].sum()) / (0.5 * FIT.huber**2 * 3 * pixels), pixels
-
-
-def wide_areas(mask: Tensor, pixels: int) -> Tensor:
-    """Return where a mask bool [h, w] holds a square of so many pixels, and the rims of these areas."""
-    square = np.ones((pixels, pixels), np.uint8)
-    opened = cv2.morphologyEx(mask.numpy().astype(np.uint8), cv2.MORPH_OPEN, square)
-    return torch.from_numpy(cv2.dilate(opened, np.ones((FIT.foreground_rim_px, FIT.foreground_rim_px), np.uint8)) > 0)
 
 
 def widened(mask: Tensor, pixels: int) -> Tensor:

@@ -6,9 +6,9 @@ be differentiable. `alignment` fits poses to recorded frames with it, `fitter` t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -16,6 +16,10 @@ import torch
 from torch import Tensor
 
 Posed = TypeVar("Posed")  # what is rendered
+# from parameters [P] float64 to what is posed by them and its image [h, w, 3]; and, from both, for every parameter the
+# image with that one changed, and by how much
+Render = Callable[[Tensor], tuple[Posed, Tensor]]
+Differences = Callable[[Tensor, Posed], Iterable[tuple[Tensor, float]]]
 BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 MAX_TRIALS = 3  # steps tried from one linearisation, each damped ten times more
 
@@ -44,24 +48,6 @@ class ImageResidual:
         return residual.sub_(squared, alpha=0.5).mul_(squared)
 
 
-class FitProblem(Protocol[Posed]):
-    """A fit of parameters [P] float64 to an image: the image, the prior, and how parameters are rendered."""
-
-    @property
-    def residual(self) -> ImageResidual:
-        """The image and what counts of it."""
-
-    @property
-    def precision(self) -> Tensor:
-        """[P, P] of the prior, whose mean is zero."""
-
-    def render(self, parameters: Tensor) -> tuple[Posed, Tensor]:
-        """Return what is posed by the parameters, and its image [h, w, 3]."""
-
-    def differences(self, parameters: Tensor, posed: Posed) -> Iterable[tuple[Tensor, float]]:
-        """Return for every parameter the image with that one changed, and by how much."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Minimum(Generic[Posed]):
     """The end of a descent."""
@@ -75,7 +61,10 @@ class Minimum(Generic[Posed]):
 
 
 def minimise(
-    problem: FitProblem[Posed],
+    residual: ImageResidual,
+    precision: Tensor,
+    render: Render[Posed],
+    differences: Differences[Posed],
     starts: Sequence[Tensor],
     max_steps: int,
     *,
@@ -84,13 +73,13 @@ def minimise(
 ) -> Minimum[Posed]:
     """Take Levenberg-Marquardt steps from the best of `starts` (each [P] float64); every accepted one lowers the cost.
 
+    precision [P, P]: of the prior, whose mean is zero.
     small [P]: a step of which every entry is smaller is the last. linearised_for: steps taken with the differences of
     one state.
     """
-    residual, precision = problem.residual, problem.precision
 
     def evaluated(at: Tensor) -> tuple[float, Tensor, Posed, Tensor]:
-        posed, image = problem.render(at)
+        posed, image = render(at)
         return residual.cost(image) + 0.5 * float(at @ precision @ at), at, posed, image
 
     cost, parameters, posed, image = min(map(evaluated, starts), key=lambda evaluation: evaluation[0])
@@ -99,7 +88,7 @@ def minimise(
         off = residual.of(image)
         if step % linearised_for == 0:
             columns = np.empty((len(parameters), *image.shape), np.float32)
-            for row, (moved, change) in enumerate(problem.differences(parameters, posed)):
+            for row, (moved, change) in enumerate(differences(parameters, posed)):
                 columns[row] = weighted_blur((moved - image).div_(change), residual.weight)
             touched = np.flatnonzero(columns.any(0))  # values that no parameter changes have no derivative
             jacobian = torch.from_numpy(columns.reshape(len(parameters), -1).take(touched, 1))  # [P, values]

@@ -105,7 +105,9 @@ class StatesProblem:
             self.center = views.poses[:, :3, 3].mean(0)
             self.basis = frame_about(self.model.axis)
             if line_through_trocar(views.poses, MODEL.max_bend_mm) is None:
-                self.model.widen_shaft(OUTLINES.tube_tilt_sd, OUTLINES.end_sd_mm, OUTLINES.least_end_mm)
+                tilts = slice(self.model.tilt, self.model.tilt + 2)
+                self.model.sds[tilts], self.model.sds[self.model.ears] = OUTLINES.tube_tilt_sd, OUTLINES.end_sd_mm
+                self.model.least_ears = OUTLINES.least_end_mm
         else:
             self.model, self.center, self.basis = like.model, like.center, like.basis
         base = [OUTLINES.base_sd_rad] * 3 + [OUTLINES.base_sd_mm] * 3

@@ -124,11 +124,6 @@ class ArticulatedModel:
         self._cones()
         self._outline()
 
-    def widen_shaft(self, tilt_sd_rad: float, end_sd_mm: float, least_end_mm: float) -> None:
-        """Let the shaft's axis be farther from its first guess, and its end farther from the first pivot."""
-        self.sds[self.tilt : self.tilt + 2], self.sds[self.ears] = tilt_sd_rad, end_sd_mm
-        self.least_ears = least_end_mm
-
     def shaft_axis(self, parameters: np.ndarray) -> np.ndarray:
         """Direction [3] of the tube in the root's frame."""
         return np.asarray(unit(self.axis + frame_about(self.axis)[:, :2] @ parameters[self.tilt : self.tilt + 2]))
@@ -168,10 +163,11 @@ class ArticulatedModel:
 
     def _cones(self) -> None:
         self.cones: list[Cone] = []
-        lengths = self._add("length", [MODEL.length_mm], [MODEL.length_sd_mm])
-        self.mean_length = lengths
-        for index, link in enumerate(self.tree.links):
-            if index == 0 or not link.body or all(self.pivots[i] is None for i in self._chain(index)):
+        self.mean_length = self._add("length", [MODEL.length_mm], [MODEL.length_sd_mm])
+        moves = [False]
+        for index, link in enumerate(self.tree.links[1:], 1):
+            moves.append(moves[self.parents[index]] or self.pivots[index] is not None)
+            if not (link.body and moves[index]):
                 continue
             below = [i for i, parent in enumerate(self.parents) if parent == index]
             pivots = {tuple(self.tree.links[i].origin[:3, 3].round(3)): i for i in below}
@@ -190,13 +186,6 @@ class ArticulatedModel:
                 length = self._add(f"length of {link.name}", [0], [MODEL.unequal_sd_mm])
                 heading = self._add(f"heading of {link.name}", [0], [MODEL.heading_sd_rad])
                 self.cones.append(Cone(index, None, radii, length, heading))
-
-    def _chain(self, index: int) -> list[int]:
-        chain = []
-        while index >= 0:
-            chain.append(index)
-            index = self.parents[index]
-        return chain
 
     def link_poses(self, parameters: np.ndarray, values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """root_from_link rotations [F, 3, 3] and translations [F, 3] mm of all links; values [F, L] of joints, or

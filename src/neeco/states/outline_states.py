@@ -18,7 +18,7 @@ from neeco.geometry.rotations import rigid
 from neeco.scene.training_views import TrainingViews
 from neeco.states.outline_fit import OUTLINES, POSE, Cells, LinkViews, StatesFit, StatesProblem, adjust, posterior
 from neeco.states.outline_model import mirrored
-from neeco.states.parameters import DEG
+from neeco.states.parameters import DEG, sds_of
 from neeco.states.refinement import Refinement, Verdict
 
 
@@ -65,12 +65,6 @@ class FoundStates:
     covariances: np.ndarray  # [S, 6 + R, 6 + R] of pose (rad, mm, the root's frame) and readings
     inconsistent: np.ndarray  # bool [S], whose states contradict the others
     refitted: np.ndarray  # bool [S], of those: explained from another start
-
-
-def sds_of(sizes: tuple[float, ...], slides: np.ndarray) -> np.ndarray:
-    """Standard deviations [6 + R] of sizes as `tried` has them."""
-    tilt, roll, across, depth, turn, slide = sizes
-    return np.append([tilt, tilt, roll, across, across, depth], np.where(slides, slide, turn))
 
 
 def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> FoundStates | None:

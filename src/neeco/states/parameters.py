@@ -58,6 +58,14 @@ def precision_of(deviations: Tensor) -> Tensor:
     return torch.diag(deviations**-2)
 
 
+def sds_of(sizes: tuple[float, ...], slides: Sequence[bool] | np.ndarray) -> np.ndarray:
+    """Return the standard deviations [6 + J] of an instrument's two tilts and roll (rad), shifts across the view twice
+    and in depth (mm), and joints, of which `slides` [J] are prismatic; sizes: tilt, roll, across, depth, joint (rad),
+    prismatic joint (mm)."""
+    tilt, roll, across, depth, turn, slide = sizes
+    return np.append([tilt, tilt, roll, across, across, depth], np.where(slides, slide, turn))
+
+
 @dataclass(frozen=True, kw_only=True)
 class InstrumentParameters:
     """The parameters of one instrument: six of its pose (see `moved_pose`), then one per joint (rad or mm)."""
@@ -70,16 +78,10 @@ class InstrumentParameters:
     high: Tensor | None = None
 
     @classmethod
-    def of(cls, instrument: Instrument) -> InstrumentParameters:
-        """Return the parameters of an instrument's pose and of its joints in stated kinematics."""
-        joints = () if instrument.kinematics is None else tuple(instrument.kinematics.readings)
+    def of(cls, instrument: Instrument, unstated: Sequence[str] = ()) -> InstrumentParameters:
+        """Return the parameters of an instrument's pose and of its joints in stated kinematics, or else `unstated`."""
+        joints = tuple(unstated) if instrument.kinematics is None else tuple(instrument.kinematics.readings)
         return cls(name=instrument.name, joints=joints, slides=tuple(map(instrument.slides, joints)))
-
-    def within_bounds(self, joint: int, value: Any) -> Any:
-        """Return the value of joint number `joint`, clamped to its bounds."""
-        if self.low is None or self.high is None:
-            return value
-        return min(max(value, float(self.low[joint])), float(self.high[joint]))
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,9 @@ class StateParameters:
             values = dict(before.joints)
             if joints is not None:
                 for index, (name, change) in enumerate(zip(item.joints, joints[number], strict=True)):
-                    values[name] = item.within_bounds(index, before.joints[name] + change)
+                    values[name] = before.joints[name] + change
+                    if item.low is not None and item.high is not None:
+                        values[name] = min(max(values[name], float(item.low[index])), float(item.high[index]))
             instruments[item.name] = InstrumentState(moved_pose(before.pose, increment, item.pivot), values)
         return replace(state, instruments=instruments)
 

@@ -67,7 +67,10 @@ def predict_corrections(
         columns = [refinement.readings.index((name, reading)) for reading in readings]
         rows = torch.cat([refinement.poses[order, index], refinement.joints[order][:, columns]], 1).double().cpu()
         sigma = torch.cat([refinement.pose_sd[:, index].mean(0), refinement.joint_sd[:, columns].mean(0)])
-        usual_rows = _consistent(rows) if bool(refinement.fitted.any()) else torch.ones(len(rows), dtype=torch.bool)
+        usual_rows = torch.ones(len(rows), dtype=torch.bool)
+        if bool(refinement.fitted.any()):  # without those of states that were wrong altogether
+            off = (rows - rows.median(0).values).abs()
+            usual_rows = (off <= PREDICTION.max_deviations * off.median(0).values.clamp_min(1e-9)).all(1)
         parts = {name: slice(0, 6)} | {f"{name}.{reading}": slice(6 + k, 7 + k) for k, reading in enumerate(readings)}
         residuals, usual, length, noise = _best(features[usual_rows], rows[usual_rows] / sigma.double().cpu())
         applied = torch.zeros(rows.shape[1], dtype=rows.dtype)
@@ -87,12 +90,6 @@ def predict_corrections(
             refinement.poses[instant, index] -= increments[:6]
             refinement.joints[instant, columns] -= increments[6 : 6 + len(columns)]
     return predictions
-
-
-def _consistent(rows: Tensor) -> Tensor:
-    """Return which corrections [n] bool of `rows` [n, K] are none of a state that was wrong altogether."""
-    off = (rows - rows.median(0).values).abs()
-    return (off <= PREDICTION.max_deviations * off.median(0).values.clamp_min(1e-9)).all(1)
 
 
 def _best(features: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, float, float]:

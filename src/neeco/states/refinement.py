@@ -104,7 +104,8 @@ class Refinement:
         self, config: RefineConfig, frames: tuple[Frame, ...], instruments: tuple[Instrument, ...], device: torch.device
     ) -> None:
         self.config = config
-        self.layout = StateParameters(tuple(map(_parameters_of, instruments)))
+        # of every instrument the pose, and its joints in stated kinematics or all of them
+        self.layout = StateParameters(tuple(InstrumentParameters.of(item, tuple(item.joints)) for item in instruments))
         items = self.layout.instruments
         names = tuple(item.name for item in items)
         self.readings = tuple((item.name, reading) for item in items for reading in item.joints)
@@ -118,7 +119,9 @@ class Refinement:
             [place for place, (name, _) in enumerate(self.readings) if name in stated], dtype=torch.int64, device=device
         )
         self.instants, self.neighbours = _instants(frames, names)
-        self.frames_of_instant = _members(self.instants)
+        self.frames_of_instant: list[list[int]] = [[] for _ in self.neighbours]
+        for index, instant in enumerate(self.instants):
+            self.frames_of_instant[instant].append(index)
         first = tuple(frames[members[0]] for members in self.frames_of_instant)
         self.joints = torch.zeros(len(self.neighbours), len(self.readings), device=device)
         self.poses = torch.zeros(len(first), len(names), 6, device=device)
@@ -429,12 +432,6 @@ class Refinement:
         self.moments = {name: tensors[name] for name in self.moments}
 
 
-def _parameters_of(instrument: Instrument) -> InstrumentParameters:
-    """Return the parameters of an instrument's pose and its joints, in stated kinematics or all of them."""
-    joints = tuple(instrument.joints) if instrument.kinematics is None else tuple(instrument.kinematics.readings)
-    return InstrumentParameters(name=instrument.name, joints=joints, slides=tuple(map(instrument.slides, joints)))
-
-
 def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[list[int], list[list[int]]]:
     """Return (instant of each frame, neighbours of each instant).
 
@@ -469,14 +466,6 @@ def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual_sd
             turns = torch.tensor(stated.rotation_deg, dtype=torch.float64).deg2rad()
             priors[row, k] = torch.cat([turns, shifts]).clamp(min=LIMITS.min_deviation).float()
     return priors
-
-
-def _members(numbers: Sequence[int]) -> list[list[int]]:
-    """Return the places in `numbers` of 0, of 1, and so on."""
-    members: list[list[int]] = [[] for _ in range(max(numbers, default=-1) + 1)]
-    for place, number in enumerate(numbers):
-        members[number].append(place)
-    return members
 
 
 def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tensor:

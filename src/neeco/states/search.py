@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from neeco.capture.model import Frame, Instrument, State, evenly_spaced
 from neeco.scene import GaussianScene
 from neeco.states.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer
 from neeco.states.fitter import Fitter, StateFit
-from neeco.states.parameters import DEG, InstrumentParameters, StateParameters
+from neeco.states.parameters import DEG, InstrumentParameters, StateParameters, sds_of
 from neeco.states.refinement import LIMITS, Refinement
 
 
@@ -47,21 +48,6 @@ class SearchSettings:
 
 
 SEARCH = SearchSettings()
-
-
-@dataclass(frozen=True, kw_only=True)
-class FittedState:
-    """A training frame's state as fitted to its image."""
-
-    index: int
-    fit: StateFit
-    precision: Tensor  # [P, P] of the prior
-    correction: Tensor  # [P] of the state that the prior is about
-
-    @property
-    def deviations(self) -> Tensor:
-        """Standard deviations [P] of the state."""
-        return self.fit.deviations(self.precision)
 
 
 @dataclass(frozen=True)
@@ -100,19 +86,16 @@ class StateSearch:
 
     def fitted(
         self, index: int, scale: float, about: State | None = None, start: State | None = None
-    ) -> FittedState | None:
-        """Return the state of frame `index` fitted from its present one (or another `start`), with a prior about that
-        recorded (or `about` another) of errors `scale` times as large as usual ones of a robot, or as stated; None
-        where the fit leads out of the image."""
+    ) -> tuple[StateFit, Tensor] | None:
+        """Return the state, with its standard deviations [P], of frame `index` fitted from its present one (or another
+        `start`), with a prior about that recorded (or `about` another) of errors `scale` times as large as usual ones
+        of a robot, or as stated; None where the fit leads out of the image."""
         recorded, precision = self.scene.recorded.states[index], self.precision(index, scale)
         start = start or self.state(index)
         fit = self.fitter.fit(
             self.view(index, start), about or recorded, precision, start, levels=SEARCH.levels, steps=SEARCH.steps
         )
-        if fit is None:
-            return None
-        correction = self.refinement.layout.increments_between(about or recorded, fit.state)
-        return FittedState(index=index, fit=fit, precision=precision, correction=correction)
+        return None if fit is None else (fit, fit.deviations(precision))
 
     def misfit(self, index: int, state: State) -> float:
         """Return the misfit of a frame's instruments in `state` (see `StateFit`); infinite outside of the image."""
@@ -181,25 +164,27 @@ class StateSearch:
     def _size_of_errors(self, outliers: Sequence[int]) -> float:
         """Return how large the errors of a sample of states are, times the usual ones of a robot; without `outliers`,
         which may be wrong altogether."""
-        fits = []
+        fits: list[tuple[int, StateFit, Tensor]] = []
         usual = [index for index in range(len(self.frames)) if index not in outliers]
         for index in (usual[place] for place in evenly_spaced(len(usual), SEARCH.n_sampled)):
             # states that were fitted before training are judged by what is left of their errors
             about = self.state(index) if self.refinement.fitted[index] else None
-            fit = self.fitted(index, SEARCH.largest, about)
-            fits += [] if fit is None else [fit]
+            if (found := self.fitted(index, SEARCH.largest, about)) is not None:
+                expected = about or self.scene.recorded.states[index]
+                fits.append((index, found[0], self.refinement.layout.increments_between(expected, found[0].state)))
         return self.scale_of(fits) if len(fits) > 2 else 0.0
 
-    def scale_of(self, fits: Sequence[FittedState]) -> float:
-        """Return how large errors are, times the usual ones of a robot: the median over the classes of errors of
+    def scale_of(self, fits: Sequence[tuple[int, StateFit, Tensor]]) -> float:
+        """Return how large errors are, times the usual ones of a robot, by fits of frames (index, fit, correction [P])
+        with a prior `largest` times as wide: the median over the classes of errors of
         variance components by expectation maximisation, about the median correction, which belongs to the shape."""
         kinds = self._kinds()
         kind = torch.tensor(kinds)
         observed = []  # information on corrections in units of usual errors, and it times the most likely ones
-        for fitted in fits:
-            back = torch.linalg.inv(self._axes(fitted.index)) * self._usual()
-            weighed = (fitted.fit.information + fitted.precision) @ fitted.correction
-            observed.append((back.T @ fitted.fit.information @ back, back.T @ weighed))
+        for index, fit, correction in fits:
+            back = torch.linalg.inv(self._axes(index)) * self._usual()
+            weighed = (fit.information + self.precision(index, SEARCH.largest)) @ correction
+            observed.append((back.T @ fit.information @ back, back.T @ weighed))
         variances = torch.full((6,), SEARCH.usual**2, dtype=torch.float64)
         for _ in range(SEARCH.n_iterations):
             prior = torch.diag(1 / variances[kind])
@@ -237,18 +222,10 @@ class StateSearch:
 
     def _usual(self) -> Tensor:
         """Return usual errors [P] of a robot's states (rad, mm)."""
-        errors: list[float] = []
-        for parameters in self.refinement.layout.instruments:
-            errors += [
-                SEARCH.tilt * DEG,
-                SEARCH.tilt * DEG,
-                SEARCH.roll * DEG,
-                SEARCH.across,
-                SEARCH.across,
-                SEARCH.depth,
-            ]
-            errors += [SEARCH.joint * DEG * (LIMITS.mm_per_rad if slides else 1.0) for slides in parameters.slides]
-        return torch.tensor(errors, dtype=torch.float64)
+        joint = SEARCH.joint * DEG
+        sizes = (SEARCH.tilt * DEG, SEARCH.roll * DEG, SEARCH.across, SEARCH.depth, joint, joint * LIMITS.mm_per_rad)
+        errors = [sds_of(sizes, parameters.slides) for parameters in self.refinement.layout.instruments]
+        return torch.from_numpy(np.concatenate(errors))
 
 
 def _bounded(parameters: InstrumentParameters, instrument: Instrument) -> InstrumentParameters:

@@ -78,17 +78,13 @@ def control_density(
     counts = tuple(int((bodies[index] == body).sum()) for body in range(len(max_gaussians)))
     adam.select_rows(list(canonical.tensors()), index, fresh)
     changed = canonical.map(lambda tensor: tensor[index].contiguous(), counts)
-    _scatter_halves(changed, is_half, config.split_shrink, generator)
-    return changed
-
-
-def _scatter_halves(canonical: CanonicalGaussians, is_half: Tensor, shrink: float, generator: torch.Generator) -> None:
-    """Move each half of a split Gaussian to a random place inside its parent and divide its scales by `shrink`."""
-    rotation = quat_to_matrix(torch.nn.functional.normalize(canonical.quats[is_half], dim=-1))
-    scales = canonical.log_scales[is_half].exp()
+    # halves are smaller, at random places inside their parent
+    rotation = quat_to_matrix(torch.nn.functional.normalize(changed.quats[is_half], dim=-1))
+    scales = changed.log_scales[is_half].exp()
     offset = torch.randn(scales.shape, generator=generator, device=scales.device) * scales
-    canonical.means[is_half] += (rotation @ offset[..., None])[..., 0]
-    canonical.log_scales[is_half] -= math.log(shrink)
+    changed.means[is_half] += (rotation @ offset[..., None])[..., 0]
+    changed.log_scales[is_half] -= math.log(config.split_shrink)
+    return changed
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ import torch
 
 from neeco.base.errors import NeecoError
 from neeco.capture.images import has_alpha
-from neeco.capture.model import Capture, Frame, Instrument, PointCloud
+from neeco.capture.model import Capture, Frame, Instrument
 from neeco.scene.canonical import neighbour_spacing, seed_gaussians
 from neeco.scene.drawable import DrawableScene, Recorded
 from neeco.scene.gaussian_scene import GaussianScene
@@ -71,7 +71,13 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
         scale=config.scale,
         still=capture.still,
     )
-    positions, colors = _thinned_points(capture.points, frames, config)
+    positions, colors = capture.points.positions, capture.points.colors
+    limit, _ = config.gaussian_limits(mean_pixels(frames))
+    most = min(limit, config.initial_points or limit)
+    if len(positions) > most:  # at most as many as the tissue may have Gaussians
+        chosen = np.sort(np.random.default_rng(config.seed).choice(len(positions), most, replace=False))
+        positions, colors = positions[chosen], colors[chosen]
+    positions, colors = np.ascontiguousarray(positions), np.ascontiguousarray(colors)
     tissue = seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
     deformation = make_deformation(config.method, instruments, config.deformation)
     deformation.fit_ranges(list(recorded.states), tissue.means)
@@ -80,20 +86,6 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     scene = GaussianScene(config.method, tissue, deformation, instruments, recorded, center)
     scene.background = background
     return scene
-
-
-def _thinned_points(
-    points: PointCloud, frames: tuple[Frame, ...], config: TrainConfig
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions [P, 3] mm and colours [P, 3] of at most `config.initial_points` sparse points, and at most as
-    many as the tissue may have Gaussians."""
-    positions, colors = points.positions, points.colors
-    limit, _ = config.gaussian_limits(mean_pixels(frames))
-    most = min(limit, config.initial_points or limit)
-    if len(positions) > most:
-        chosen = np.random.default_rng(config.seed).choice(len(positions), most, replace=False)
-        positions, colors = positions[np.sort(chosen)], colors[np.sort(chosen)]
-    return np.ascontiguousarray(positions), np.ascontiguousarray(colors)
 
 
 def _learned_instrument(

@@ -116,15 +116,13 @@ class Schedule:
     def density(self) -> DensityPhase:
         """Return the density settings in force, in iterations of this run."""
         config = self.config
+        resets = self._density_of(config.opacity_reset).opacity_reset
         return DensityPhase(
             self.scaled(self._density_of(config.density_interval).interval),
-            self._reset_interval(self._density_of(config.opacity_reset).opacity_reset),
+            # but not below MIN_RESET_INTERVAL, or what was published where that is less
+            max(self.scaled(resets), min(resets, MIN_RESET_INTERVAL)),
             self._density_of(config.gradient_threshold).threshold,
         )
-
-    def _reset_interval(self, published: int) -> int:
-        """Scaled, but not below MIN_RESET_INTERVAL, or what was published where that is less."""
-        return max(self.scaled(published), min(published, MIN_RESET_INTERVAL))
 
     def _density_of(self, part: Part) -> DensityPhase:
         return (self.config.plain_density, self.config.phase_1, self.config.phase_2)[self._acting_phase(part)]

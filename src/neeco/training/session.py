@@ -170,7 +170,9 @@ class GaussianSession(Session):
         channels = scene.deformation.training_channels(scene.canonical, self.iteration)
         if channels is None and self.silhouettes is not None:
             channels = scene.canonical.of_instruments.to(scene.canonical.means.dtype)[:, None]
-        rendering = rasterize(scene.at(state, self._perturbation(progress)), camera, channels=channels)
+        noise = Perturbation(self.schedule.state_noise(progress))
+        perturbation = scene.deformation.perturb(noise, self.iteration, progress, self.rng)
+        rendering = rasterize(scene.at(state, perturbation), camera, channels=channels)
         target, mask = self.views.target(index), self.views.mask(index)
         if following is not None:
             self.views.prefetch(following)
@@ -212,10 +214,6 @@ class GaussianSession(Session):
             self.queue = self.schedule.frames(self.pose_order, self.rng)
         self.queue_phase = phase
         return self.queue.pop(0)
-
-    def _perturbation(self, progress: float) -> Perturbation:
-        noise = Perturbation(self.schedule.state_noise(progress))
-        return self.scene.deformation.perturb(noise, self.iteration, progress, self.rng)
 
     def _regularisation(self, rendering: Rendering, penalty: Tensor | None) -> Tensor | float:
         """Return the prior on corrected poses plus the method's own term."""

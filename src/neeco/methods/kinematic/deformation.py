@@ -38,8 +38,7 @@ from neeco.methods.kinematic.discovery import carve_again, find_instruments
 from neeco.methods.kinematic.finish import conclude
 from neeco.methods.kinematic.hinges import Hinges, hinge_joints
 from neeco.methods.kinematic.lamp_search import find_shadow
-from neeco.methods.kinematic.stated_links import StatedLinks
-from neeco.methods.kinematic.wrist import place_wrists, refine_wrists
+from neeco.methods.kinematic.wrist import Spin, place_wrists, refine_wrists
 from neeco.raster.articulated import ArticulatedBody, pose_bodies
 from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
@@ -97,14 +96,6 @@ class KinematicSettings:
     stated_axes: bool = True  # whether the axes stated there are corrected
     stated_readings: bool = True  # whether offsets and gains of the readings of joints stated there are corrected
     carving: CarvingSettings = field(default_factory=CarvingSettings)  # of the search for instruments
-
-
-@dataclass(frozen=True)
-class Spin(Perturbation):
-    """`shaft_roll`: angle in rad by which everything behind the wrist is spun about the shaft (a surface of revolution
-    looks the same)."""
-
-    shaft_roll: float = 0.0
 
 
 EVENTS = (
@@ -285,14 +276,11 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             return Spin(perturbation.state_noise, float(rng.uniform(-math.pi, math.pi)))
         return perturbation
 
-    def spin_perturbation(self, roll: float) -> Perturbation:
-        return Spin(shaft_roll=roll)
-
     def prune_mask(self, canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> Tensor | None:
         """Return tissue whose centre no frame observes, as no image constrains it, and what no stated link reaches."""
         mask = torch.zeros(len(canonical), dtype=torch.bool, device=canonical.means.device)
         for index, articulation in enumerate(self.articulations):
-            if isinstance(articulation, StatedLinks):
+            if articulation.stated:
                 rows = canonical.body(index + 1)
                 mask[rows] = articulation.out_of_reach(canonical.means[rows].detach())
         if self.settings.extrapolate_tissue:
@@ -379,7 +367,7 @@ def articulation_of(instrument: Instrument) -> Articulation:
     """Return the links that the instrument's kinematics state, or else a shaft with a hinge per joint, which is found
     from the images."""
     tree = instrument.kinematics
-    return StatedLinks(tree) if tree is not None and tree.readings else Hinges(tuple(instrument.joints))
+    return Articulation(tree) if tree is not None and tree.readings else Hinges(tuple(instrument.joints))
 
 
 @torch.no_grad()
@@ -450,12 +438,12 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *,
             continue
         wrong = refinement.verdict(index) is Verdict.REFITTED
         about = search.state(index) if wrong else None
-        fit = fitted_anew(search, index) if wrong and last else search.fitted(index, SEARCH.scale, about)
-        if fit is not None:
+        found = fitted_anew(search, index) if wrong and last else search.fitted(index, SEARCH.scale, about)
+        if found is not None:
             # until the last fit, gradients go on with the uncertainty of recorded states
-            deviations = fit.deviations if last else search.deviations(index, SEARCH.scale)
-            refinement.set_state(index, session.recorded.states[index], fit.fit.state, deviations)
-            explained[index] = fit.fit.misfit
+            deviations = found[1] if last else search.deviations(index, SEARCH.scale)
+            refinement.set_state(index, session.recorded.states[index], found[0].state, deviations)
+            explained[index] = found[0].misfit
     if last:
         leave_out_unexplained(search, explained)
 

@@ -19,7 +19,6 @@ from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstrum
 from neeco.methods.kinematic.hinges import STATE_LINKS, STICKS, Hinges, start_hinges
 from neeco.methods.kinematic.link_registration import correct_poses
 from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
-from neeco.methods.kinematic.stated_links import StatedLinks
 from neeco.methods.kinematic.wrist_search import WRISTS, search_wrist
 from neeco.methods.tissue_fit import carved_shape, fit_tissue, tissue_evidence
 from neeco.raster.reference import SH_C0
@@ -50,7 +49,7 @@ def find_instruments(
     evidence = tissue_evidence(scene, session.views, session.config, tissue)
     if wrists and (found := _unstated_wrists(session, articulated, evidence)):
         return found
-    alone = len(scene.instruments) == 1 and isinstance(articulated.articulations[0], StatedLinks)
+    alone = len(scene.instruments) == 1 and articulated.articulations[0].stated
     corrects = alone and session.config.refine.frame_poses
     if corrects and register_states(session.views, session.refinement, scene.instruments[0]):
         evidence = _corrected_evidence(session, evidence)
@@ -69,7 +68,7 @@ def _unstated_wrists(
         logged = set.intersection(*map(set, readings))
         varying = {j for j in logged if np.ptp([given[j] for given in readings]) > STICKS.min_reading_range}
         moving = [joint for joint in articulation.reading_names if joint in varying]
-        if len(moving) < 2 or isinstance(articulation, StatedLinks):
+        if len(moving) < 2 or articulation.stated:
             continue
         tree = None
         if len(moving) <= WRISTS.max_joints:
@@ -143,7 +142,7 @@ def _with_instruments(
     for index, instrument in enumerate(scene.instruments):
         shape = carved_shape(session, evidence, instrument.name, generator)
         articulation = articulated.articulations[index]
-        if isinstance(articulation, StatedLinks):
+        if articulation.stated:
             shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
             articulation.radius.fill_(shape.radius)
             readings = readings_of(session, evidence, instrument.name)
@@ -159,7 +158,7 @@ def _with_instruments(
         articulation.extent.copy_(torch.tensor([shape.near, shape.tip]))
         articulation.radius.fill_(shape.radius)
         columns = articulated.logit_count
-        if isinstance(articulation, StatedLinks):
+        if articulation.stated:
             seeds, logits = start_links(
                 session, articulation, evidence, instrument.name, shape, columns=columns, generator=generator
             )

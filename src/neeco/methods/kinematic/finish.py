@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
+from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, evenly_spaced
 from neeco.evidence.carving import CARVING
 from neeco.evidence.foreground import Foreground
 from neeco.evidence.label_quality import QUALITY
@@ -115,14 +115,18 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
     readings = torch.tensor([state.instruments[instrument.name].joints[name] for state in scene.recorded.states])
     ordered = readings.argsort()
     extremes = torch.cat([ordered[:6], ordered[-10:]]).tolist()
-    moving = _moving_weight(scene.canonical, articulated, index, name)
+    moving = scene.canonical.means.new_zeros(len(scene.canonical), 1)  # share of each Gaussian that the reading moves
+    moving[scene.canonical.body(index + 1), 0] = articulation.moved_by(
+        name, articulated.link_weights(scene.canonical, index)
+    )
     given = middle = 0.0
     for frame_index in extremes:
         state, camera = session.corrected(frame_index)
-        target = session.views.target(frame_index)
+        target, own = session.views.target(frame_index), state.instruments[instrument.name]
+        middle_state = InstrumentState(own.pose, {**own.joints, name: float(readings.mean())})
         renderings = [
             rasterize(scene.at(variant), camera, channels=moving)
-            for variant in (state, _with_reading(state, instrument.name, name, float(readings.mean())))
+            for variant in (state, replace(state, instruments={**state.instruments, instrument.name: middle_state}))
         ]
         covered = torch.maximum(*(r.channels[..., 0] for r in renderings if r.channels is not None)) > 0.3
         mask = session.views.mask(frame_index)
@@ -156,22 +160,6 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
         **articulation.describe(name),
         "verdict": verdict,
     }
-
-
-def _moving_weight(
-    canonical: CanonicalGaussians, articulated: ArticulatedInstruments, index: int, reading: str
-) -> Tensor:
-    """Return the share [N, 1] of each Gaussian of instrument `index` that a reading moves."""
-    weight = canonical.means.new_zeros(len(canonical), 1)
-    weights = articulated.link_weights(canonical, index)
-    weight[canonical.body(index + 1), 0] = articulated.articulations[index].moved_by(reading, weights)
-    return weight
-
-
-def _with_reading(state: State, instrument: str, joint: str, reading: float) -> State:
-    given = state.instruments[instrument]
-    changed = InstrumentState(given.pose, {**given.joints, joint: reading})
-    return replace(state, instruments={**state.instruments, instrument: changed})
 
 
 def drop_refuted(session: GaussianSession) -> CanonicalGaussians:

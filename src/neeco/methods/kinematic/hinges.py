@@ -8,17 +8,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument
 from neeco.evidence.carving import CarvedShape, CarvingSettings, Evidence, camera_from_instrument, center_line
 from neeco.geometry.rotations import rotate_about
 from neeco.methods.kinematic.articulation import Articulation
-from neeco.scene.drawable import JointMotion, Skeleton
 from neeco.scene.training_session import Report
 from neeco.training.session import GaussianSession
 
@@ -33,26 +34,22 @@ class HingeSettings:
     border_width_radii: float = 0.2  # of either border
     ruled_out_margin: float = 10.0  # by which the logit of a link that positions rule out is below all others
     max_fixed_jaw_gain: float = 0.25  # rad per rad of reading: a jaw that turns less is fixed
-    min_part_share: float = 0.5  # of a Gaussian that counts as belonging to a part
-    min_tip_gaussians: int = 10  # of a part; with fewer its tip stays unknown
-    tip_quantile: float = 0.97  # of the distances of a part's Gaussians from its pivot: farther ones are its tip
 
 
 HINGES = HingeSettings()
 
 
 class Hinges(Articulation):
-    """A straight shaft and revolute joints whose axes cross it at right angles.
+    """A straight shaft and revolute joints whose axes cross it at right angles, each of two links, its jaws.
 
     Joint j turns two jaws about the axis at `hinge_angle[j]` (rad, around the shaft) and `hinge_depth[j]` (mm, along
-    it); jaw k turns by `offsets[j, k] + gains[j, k] * (reading - middle[j])`, `middle` being the mean of the recorded
-    readings, or a change of the gains would turn everything. The reading is the angle between the two jaws, so the
-    gains are `scale * (share, share - 1)`: `share` is learned freely, `scale` stays near 1.
+    it); jaw k turns by `offsets[j, k] + jaw_gains[j, k] * (reading - middle[j])`, `middle` being the mean of the
+    recorded readings, or a change of the gains would turn everything. The reading is the angle between the two jaws, so
+    the gains are `scale * (share, share - 1)`: `share` is learned freely, `scale` stays near 1.
     """
 
     middle: Tensor  # [J] rad or mm, as the readings
     closed: Tensor  # [J] the lowest recorded reading; nan: not known
-    tips: Tensor  # [J, 2, 3] mm, of each joint's jaws as learned; nan: not measured
     rates: ClassVar[Mapping[str, float]] = {
         **Articulation.rates,
         "hinge_angle": 1e-2,
@@ -61,37 +58,52 @@ class Hinges(Articulation):
         "share": 6e-3,
         "scale": 2e-4,
     }
-    skeleton: Skeleton = (
-        ("shaft_far", "shaft_near"),
-        ("shaft_near", "hinge"),
-        ("hinge", "tip_left"),
-        ("hinge", "tip_right"),
-    )
+    stated: ClassVar[bool] = False
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
-        super().__init__()
-        count = len(joint_names)
-        self.reading_names = joint_names
-        self.link_count = 1 + 2 * count  # the shaft, and two jaws per joint
+        pairs = [
+            [Link(f"{joint}_{jaw}", "shaft", REVOLUTE, value={joint: gain}) for jaw, gain in enumerate((0.5, -0.5))]
+            for joint in joint_names
+        ]
+        super().__init__(KinematicTree((Link("shaft"), *chain(*pairs))), pairs)
         stems = [joint.removesuffix("_angle") for joint in joint_names]
         sides = [f"{stem}_{side}" for stem in stems for side in ("left", "right")]
         self.part_names = ("shaft", "wrist", *sides) if joint_names else ("instrument",)
-        self.register_buffer("middle", torch.zeros(count))
-        self.register_buffer("closed", torch.full((count,), math.nan))
-        self.register_buffer("tips", torch.full((count, 2, 3), math.nan))
-        self.hinge_angle = nn.Parameter(torch.zeros(count))
-        self.hinge_depth = nn.Parameter(torch.zeros(count))
-        self.offsets = nn.Parameter(torch.zeros(count, 2))
-        self.share = nn.Parameter(torch.full((count,), 0.5))
-        self.scale = nn.Parameter(torch.ones(count))
+        self.register_buffer("middle", torch.zeros(len(joint_names)))
+        self.register_buffer("closed", torch.full((len(joint_names),), math.nan))
+        ends = (("shaft_near", "hinge"), ("hinge", "tip_left"), ("hinge", "tip_right"))
+        self.skeleton = (("shaft_far", "shaft_near"), *ends)
+
+    def add_unknowns(self, joints: int, readings: int) -> None:
+        self.hinge_angle = nn.Parameter(torch.zeros(joints))
+        self.hinge_depth = nn.Parameter(torch.zeros(joints))
+        self.offsets = nn.Parameter(torch.zeros(joints, 2))
+        self.share = nn.Parameter(torch.full((joints,), 0.5))
+        self.scale = nn.Parameter(torch.ones(joints))
 
     @property
-    def gains(self) -> Tensor:
+    def jaw_gains(self) -> Tensor:
         """[J, 2] rad of each jaw per rad of reading."""
         return self.scale[:, None] * torch.stack([self.share, self.share - 1], -1)
 
+    @property
+    def per_unit(self) -> Tensor:
+        return torch.block_diag(*self.jaw_gains.split(1))[..., None] * (self.gains != 0)
+
     def first_joint(self) -> Tensor:
         return self.hinge_depth.detach().min() if self.jointed else torch.zeros_like(self.radius)
+
+    def round_until(self) -> Tensor:
+        return self.wrist_start
+
+    def shaft_like(self, weights: Tensor) -> tuple[Tensor, Tensor]:
+        return weights[:, 0], self.first_joint()
+
+    def positioned_logits(self, points: Tensor, logits: Tensor) -> Tensor:
+        return logits
+
+    def prior(self) -> None:
+        return None
 
     def axes(self, shaft: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """No gradient reaches the shaft: it is learned by spinning alone, or the hinges would move it."""
@@ -103,64 +115,52 @@ class Hinges(Articulation):
 
     def values(self, readings: Mapping[str, float]) -> Tensor:
         turned = [readings[name] - self.middle[joint] for joint, name in enumerate(self.reading_names)]
-        angles = self.offsets + self.gains * torch.stack(turned)[:, None] if turned else self.offsets
+        angles = self.offsets + self.jaw_gains * torch.stack(turned)[:, None] if turned else self.offsets
         return torch.block_diag(*angles.split(1)) if len(turned) > 1 else angles  # a joint moves its own two jaws
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
+        """Version 0.3 stored the tips of the jaws alone, by joint."""
+        if (tips := state_dict.get(f"{prefix}tips")) is not None and tips.dim() == 3:
+            state_dict[f"{prefix}tips"] = torch.cat([self.tips[:1].to(tips), tips.flatten(0, 1)])
+        super()._load_from_state_dict(state_dict, prefix, *others)
 
     def hinge(self, joint: int) -> tuple[Tensor, Tensor]:
         """Return (pivot [3] mm, unit axis [3]) of one joint, instrument frame."""
         pivots, axes = self.axes()
         return pivots[joint], axes[joint]
 
-    def bend(self, points: Tensor, weights: Tensor, joints: Mapping[str, float]) -> Tensor:
-        """Return points [M, 3] moved by the joints; weights [M, link_count] sum to 1: the shaft, then two jaws per
-        joint."""
-        pivots, axes = self.axes()
-        for index, name in enumerate(self.reading_names):
-            angle = weights[:, 1 + 2 * index : 3 + 2 * index] @ self.turns(index, joints[name])
-            points = rotate_about(points, axes[index], pivots[index], angle)
-        return points
-
-    def turns(self, joint: int, reading: float) -> Tensor:
-        """Return the angles [2] rad of a joint's two jaws."""
-        return self.offsets[joint] + self.gains[joint] * (reading - self.middle[joint])
-
-    def opening(self, joint: int, reading: float) -> Tensor:
-        """Return the angles [2] rad between a joint's two jaws and the shaft, along which they lie when closed."""
-        from_closed = self.gains[joint] * (reading - self.closed[joint])
-        return torch.where(self.closed[joint].isnan(), self.turns(joint, reading), from_closed)
-
-    def _tips(self, joint: int, reading: float, shaft: tuple[Tensor, Tensor], pivots: Tensor, axes: Tensor) -> Tensor:
-        """Return the tips [2, 3] mm of a joint's left and right jaw, instrument frame. A tip that was not measured lies
-        at the shaft's end when the joint is closed."""
-        origin, direction = shaft
-        known = self.tips[joint].isfinite().all(1)  # [2]
-        points = torch.where(known[:, None], self.tips[joint], origin + self.extent[1] * direction)  # [2, 3]
-        angles = torch.where(known, self.turns(joint, reading), self.opening(joint, reading))
-        order = self.left_right_order(joint, axes)
-        return rotate_about(points, axes[joint], pivots[joint], angles).index_select(0, order)
-
     def joint_points(self, readings: Mapping[str, float], shaft: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
-        """Return the first joint's hinge and tips."""
+        """Return the first joint's hinge, and the tips of its left and right jaw. A tip that was not measured lies at
+        the shaft's end when the joint is closed."""
         if not self.jointed:
             return {}
         pivots, axes = self.axes(shaft)
-        left, right = self._tips(0, readings[self.reading_names[0]], shaft, pivots, axes)
+        turns, measured = self.values(readings)[0, :2], self.tips[1:3].isfinite().all(1)  # [2]
+        points = torch.where(measured[:, None], self.tips[1:3], shaft[0] + self.extent[1] * shaft[1])  # [2, 3]
+        opening = self.jaw_gains[0] * (readings[self.reading_names[0]] - self.closed[0])  # from where both meet
+        angles = torch.where(measured | self.closed[0].isnan(), turns, opening)
+        tips = rotate_about(points, axes[0], pivots[0], angles)
+        left, right = tips.index_select(0, self.left_right_order(0, axes))
         return {"hinge": pivots[0], "tip_left": left, "tip_right": right}
 
-    def parts(self, points: Tensor, weights: Tensor) -> Tensor:
+    def link_shares(self, points: Tensor, weights: Tensor) -> Tensor:
         """A fixed jaw is learned as shaft, since it moves with it: beyond the hinge there are only jaws."""
-        if not self.jointed:
-            return weights.new_ones(len(weights), 1)
-        along, body = self.along_shaft(points), weights[:, 0]
-        jaws: list[Tensor] = []
+        along, body, jaws = self.along_shaft(points), weights[:, 0], []
         for joint in range(len(self.reading_names)):
             beyond = along > self.hinge_depth[joint] + HINGES.jaw_start_radii * self.radius  # [M]
             fixed_jaw = body[:, None] * (beyond[:, None] & self._fixed(joint))
-            pair = weights[:, 1 + 2 * joint : 3 + 2 * joint] + fixed_jaw
+            jaws.append(weights[:, 1 + 2 * joint : 3 + 2 * joint] + fixed_jaw)
             body = body - fixed_jaw.sum(1)
-            jaws += pair.index_select(1, self.left_right_order(joint)).unbind(1)
-        wrist = (along >= self.wrist_start).to(weights.dtype)
-        return torch.stack([body * (1 - wrist), body * wrist, *jaws], -1)
+        return torch.cat([body[:, None], *jaws], 1)
+
+    def parts(self, points: Tensor, weights: Tensor) -> Tensor:
+        if not self.jointed:
+            return weights.new_ones(len(weights), 1)
+        body, *jaws = self.link_shares(points, weights).unbind(1)
+        order = [1 + 2 * joint + self.left_right_order(joint) for joint in range(len(self.reading_names))]
+        wrist = (self.along_shaft(points) >= self.wrist_start).to(weights.dtype)
+        links = torch.stack([body * (1 - wrist), *jaws], 1).index_select(1, torch.cat([order[0].new_zeros(1), *order]))
+        return torch.cat([links[:, :1], (body * wrist)[:, None], links[:, 1:]], 1)
 
     def settled(self, points: Tensor, logits: Tensor) -> Tensor:
         if not self.jointed:
@@ -189,7 +189,7 @@ class Hinges(Articulation):
 
     def _fixed(self, joint: int) -> Tensor:
         """Return which of a joint's jaws is fixed, [2] bool."""
-        gains = self.gains[joint].detach().abs()
+        gains = self.jaw_gains[joint].detach().abs()
         return (gains < HINGES.max_fixed_jaw_gain) & (gains == gains.min())
 
     def left_right_order(self, joint: int, axes: Tensor | None = None) -> Tensor:
@@ -200,34 +200,8 @@ class Hinges(Articulation):
         """
         axis = (self.axes()[1] if axes is None else axes)[joint]
         sign = torch.sign(axis.gather(0, axis.abs().argmax()[None]))
-        left = (sign * self.gains[joint]).argmin()
+        left = (sign * self.jaw_gains[joint]).argmin()
         return torch.stack([left, 1 - left])
-
-    def moved_by(self, reading: str, weights: Tensor) -> Tensor:
-        joint = self.reading_names.index(reading)
-        return weights[:, 1 + 2 * joint : 3 + 2 * joint].sum(1)
-
-    def motion(self, weights: Tensor) -> tuple[list[JointMotion], Tensor]:
-        turns = weights.new_zeros(len(weights), len(self.reading_names), 2)
-        found = []
-        for joint, name in enumerate(self.reading_names):
-            pair = weights[:, 1 + 2 * joint : 3 + 2 * joint]
-            turns[:, joint, 0] = pair @ self.turns(joint, 0.0)
-            turns[:, joint, 1] = pair @ self.gains[joint]
-            found.append(JointMotion(*self.hinge(joint), name))
-        return found, turns
-
-    def measure_tips(self, points: Tensor, weights: Tensor) -> None:
-        """Set the tips of every joint's jaws to where their Gaussians lie farthest from the hinge."""
-        shares = self.parts(points, weights)
-        for joint in range(len(self.reading_names)):
-            pivot, _ = self.hinge(joint)
-            found = torch.full_like(self.tips[joint], torch.nan)
-            for side, part in enumerate(self.left_right_order(joint).tolist()):
-                tip = farthest(points[shares[:, 2 + 2 * joint + side] > HINGES.min_part_share], pivot)
-                if tip is not None:
-                    found[part] = tip
-            self.tips[joint] = found
 
     def describe(self, reading: str) -> dict[str, Any]:
         """Return axis and pivot in the instrument's frame, and the gains and offsets of the jaws."""
@@ -236,17 +210,12 @@ class Hinges(Articulation):
         return {
             "axis": [round(float(v), 5) for v in axis],
             "pivot_mm": [round(float(v), 3) for v in pivot],
-            "gains": [round(float(v), 4) for v in self.gains[joint]],
-            "offsets_rad": [round(float(v), 4) for v in self.turns(joint, 0.0)],
+            "gains": [round(float(v), 4) for v in self.jaw_gains[joint]],
+            "offsets_rad": [
+                round(float(v), 4)
+                for v in self.values(dict.fromkeys(self.reading_names, 0.0))[joint, 2 * joint : 2 * joint + 2]
+            ],
         }
-
-
-def farthest(points: Tensor, pivot: Tensor) -> Tensor | None:
-    """Return the mean [3] of the points [M, 3] farthest from `pivot` [3]; None for too few points."""
-    if len(points) < HINGES.min_tip_gaussians:
-        return None
-    away = (points - pivot).norm(dim=1)
-    return points[away >= away.quantile(HINGES.tip_quantile)].mean(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,16 +270,15 @@ def start_hinges(
                 hinges.hinge_angle[index] = torch.atan2(across[1], across[0])
                 hinges.hinge_depth[index] = hinges.along_shaft(learned[0])[index]
             elif found := search_hinge(evidence, name, joint, shape, session.config.deformation.carving):
-                hinges.hinge_angle[index] = found.angle
-                hinges.hinge_depth[index] = found.depth
-                hinges.share[index] = 1.0 if found.gains[1] == 0 else 0.5
+                hinges.hinge_angle[index], hinges.hinge_depth[index], gains = found
+                hinges.share[index] = 1.0 if gains[1] == 0 else 0.5
             else:
                 session.report(f"{name}: joint {joint} hardly moves in the training frames; its hinge cannot be found")
                 continue
             readings = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
             hinges.middle[index] = sum(readings) / len(readings)
             hinges.closed[index] = min(readings)
-            hinges.offsets[index] = (hinges.middle[index] - min(readings)) * hinges.gains[index]
+            hinges.offsets[index] = (hinges.middle[index] - min(readings)) * hinges.jaw_gains[index]
     if hinges.reading_names:
         hinges.wrist_start.fill_(float(hinges.hinge_depth[0].detach()) - 5 * shape.radius)
     seeds = shape.seeds.to(hinges.base.device)
@@ -323,10 +291,11 @@ def unbend_seeds(hinges: Hinges, seeds: Tensor, logits: Tensor) -> Tensor:
     """Return seeds [M, 3] mm, carved with the joints at their offsets, turned to zero offsets, to which the hinges are
     set: there a change of hinge or gains moves nothing."""
     weights = torch.softmax(logits[:, : hinges.link_count], -1)
-    middle = {name: float(hinges.middle[joint]) for joint, name in enumerate(hinges.reading_names)}
-    turned = hinges.bend(seeds, weights, middle)
+    for joint, (pivot, axis) in enumerate(zip(*hinges.axes(), strict=True)):
+        angles = weights[:, 1 + 2 * joint : 3 + 2 * joint] @ hinges.offsets[joint]
+        seeds = rotate_about(seeds, axis, pivot, angles)
     hinges.offsets.zero_()
-    return turned
+    return seeds
 
 
 def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Generator) -> Tensor:
@@ -343,42 +312,11 @@ def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Ge
         return logits + torch.where(beyond[:, None], lean, lean.new_zeros(()))
 
 
-@dataclass(frozen=True)
-class HingeScores:
-    """Scores of hinges at A angles (rad around the carved shaft), D depths (mm along it) and all `gains`."""
-
-    angles: list[float]
-    depths: list[float]
-    score: np.ndarray  # [D, gains, A] mean evidence on the turned sticks, in [0, 1]
-    over_rigid: np.ndarray  # [D, gains, A] score less that of unturned sticks, times the share of the length they cover
-
-    @property
-    def depth(self) -> float:
-        """Mean of the best depths by score and by score over rigid sticks, mm.
-
-        The first prefers pivots too far back (short turns stay on the body), the second pivots too far forward.
-        """
-        best = [np.unravel_index(score.argmax(), score.shape)[0] for score in (self.score, self.over_rigid)]
-        return (self.depths[best[0]] + self.depths[best[1]]) / 2
-
-    @property
-    def angle(self) -> float:
-        """Phase of the score's second harmonic over the hinge angle, rad in [0, pi): uses all scores, not the peak
-        alone."""
-        best = self.score.max((0, 1)).tolist()
-        wave = sum(s * complex(math.cos(2 * a), math.sin(2 * a)) for a, s in zip(self.angles, best, strict=True))
-        return (math.atan2(wave.imag, wave.real) / 2) % math.pi
-
-    @property
-    def gains(self) -> tuple[float, float]:
-        """Gains of the best score."""
-        return STICKS.gains[np.unravel_index(self.score.argmax(), self.score.shape)[1]]
-
-
 def search_hinge(
     evidence: Evidence, name: str, joint: str, shape: CarvedShape, settings: CarvingSettings
-) -> HingeScores | None:
-    """Score all hinges on a grid by stick figures; None when the reading hardly varies.
+) -> tuple[float, float, tuple[float, float]] | None:
+    """Return the angle (rad around the carved shaft, in [0, pi)), depth (mm along it) and gains of the best of a grid
+    of hinges, scored by stick figures; None when the reading hardly varies.
 
     A joint moves two parts symmetrically or one alone. Its parts are sticks: the instrument's centre line beyond the
     pivot, turned about the hinge by the reading. The right hinge keeps both sticks on evidence in every frame, above
@@ -397,9 +335,14 @@ def search_hinge(
     angles = torch.arange(STICKS.n_hinge_angles, device=evidence.device) * (math.pi / STICKS.n_hinge_angles)
     length = shape.tip - shape.near
     depths = np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, STICKS.n_hinge_depths).tolist()
-    score, over_rigid = [], []
+    score, over_rigid, known = [], [], line.cpu().numpy()
     for depth in depths:
-        stick = _stick(line, depth, shape.tip)
+        # points [Q, 3] of the centre line, shaft frame, from just beyond the pivot to just before the tip
+        along = np.linspace(
+            depth + 0.15 * (shape.tip - depth), shape.tip - 0.1 * (shape.tip - depth), STICKS.n_stick_points
+        )
+        across = [np.interp(along, known[:, 0], known[:, k]) for k in (1, 2)]
+        stick = torch.from_numpy(np.stack([*across, along], -1)).to(line)
         scores = {
             gain: _stick_scores(evidence, camera_from_shaft, stick, depth, angles, turns=gain * opening, weight=opening)
             for gain in {0.0, STICKS.small_gain, -STICKS.small_gain, *STICKS.gains[0], *STICKS.gains[1]}
@@ -407,16 +350,16 @@ def search_hinge(
         turned = torch.stack([(scores[first] + scores[second]) / 2 for first, second in STICKS.gains])
         score.append(torch.maximum(turned, (scores[STICKS.small_gain] + scores[-STICKS.small_gain]) / 2))
         over_rigid.append((turned - scores[0.0]) * ((shape.tip - depth) / length))
-    return HingeScores(angles.tolist(), depths, *(torch.stack(s).cpu().numpy() for s in (score, over_rigid)))
-
-
-def _stick(line: Tensor, depth: float, tip: float) -> Tensor:
-    """Return points [Q, 3], shaft frame, of the centre line [Z, 3] from just beyond the pivot at `depth` to just before
-    the tip."""
-    known = line.cpu().numpy()
-    along = np.linspace(depth + 0.15 * (tip - depth), tip - 0.1 * (tip - depth), STICKS.n_stick_points)
-    across = [np.interp(along, known[:, 0], known[:, k]) for k in (1, 2)]
-    return torch.from_numpy(np.stack([*across, along], -1)).to(line)
+    # [D, gains, A] mean evidence on the turned sticks, and that less the evidence on unturned ones, times the share of
+    # the length they cover: the first prefers pivots too far back (short turns stay on the body), the second too far
+    # forward
+    found = [torch.stack(each).cpu().numpy() for each in (score, over_rigid)]
+    (back, gains, _), (forward, *_) = (np.unravel_index(each.argmax(), each.shape) for each in found)
+    # phase of the score's second harmonic over the hinge angle: uses all scores, not the peak alone
+    best = found[0].max((0, 1)).tolist()
+    wave = sum(s * complex(math.cos(2 * a), math.sin(2 * a)) for a, s in zip(angles.tolist(), best, strict=True))
+    angle = (math.atan2(wave.imag, wave.real) / 2) % math.pi
+    return angle, (depths[back] + depths[forward]) / 2, STICKS.gains[gains]
 
 
 def _stick_scores(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import cosine_similarity, max_pool2d
 
 from neeco.raster import depth_maps, rasterize
 from neeco.raster.shadow import GAMMA, Casting, blocked
@@ -104,14 +104,8 @@ def find_shadow(session: GaussianSession) -> None:
         scene.shadow_offsets[lamp] = offsets[candidate]
         scene.shadow_strengths[lamp] = min(float(strength), LAMPS.max_strength)
         searches[-1]["found_at_mm"].append([round(float(v), 2) for v in offsets[candidate]])
-    _fade_instruments(session)
-
-
-def _fade_instruments(session: GaussianSession) -> None:
-    """Reset faint Gaussians of the instruments to nearly transparent: they may have modelled the shadow."""
-    canonical = session.scene.canonical
-    logits = canonical.opacity_logits
-    faint = canonical.of_instruments & (torch.sigmoid(logits) <= LAMPS.faint_opacity)
+    logits = scene.canonical.opacity_logits  # of instruments, faint ones may have modelled the shadow
+    faint = scene.canonical.of_instruments & (torch.sigmoid(logits) <= LAMPS.faint_opacity)
     logits[faint] = logits[faint].clamp_max(math.log(LAMPS.faded_opacity / (1 - LAMPS.faded_opacity)))
     session.adam.forget("opacity_logits")
 
@@ -131,7 +125,9 @@ def _choose(equations: _NormalEquations, offsets: Tensor, known: list[Tensor], m
     while len(known) + len(best.chosen) < MAX_LAMPS:
         taken = [*known, *(offsets[k] for k in best.chosen)]
         apart = [
-            k for k in range(len(offsets)) if all(_cosine(offsets[k], other) < LAMPS.max_cosine for other in taken)
+            k
+            for k in range(len(offsets))
+            if all(float(cosine_similarity(offsets[k], other, dim=0)) < LAMPS.max_cosine for other in taken)
         ]
         if not apart:
             break
@@ -142,10 +138,6 @@ def _choose(equations: _NormalEquations, offsets: Tensor, known: list[Tensor], m
     return best
 
 
-def _cosine(a: Tensor, b: Tensor) -> float:
-    return float(torch.nn.functional.cosine_similarity(a, b, dim=0))
-
-
 def _normal_equations(session: GaussianSession, offsets: Tensor) -> _NormalEquations:
     """Return the normal equations of candidate lamps at `offsets` [C, 3] mm, from some of the training frames."""
     gram, moment, total = [], [], 0.0
@@ -153,9 +145,8 @@ def _normal_equations(session: GaussianSession, offsets: Tensor) -> _NormalEquat
     for index in session.frames_along_poses(LAMPS.n_lamp_frames):
         color, shade, instrument = _render_candidates(session, index, offsets)
         target, mask = session.views.target(index), session.views.mask(index)
-        counts = _clear_of_instruments(instrument, margin) & (
-            torch.maximum(color, target).amax(-1) < LAMPS.max_brightness
-        )
+        near = max_pool2d(instrument[None, None], 2 * margin + 1, 1, margin)[0, 0]  # an instrument within `margin` px
+        counts = (near < LAMPS.max_coverage) & (torch.maximum(color, target).amax(-1) < LAMPS.max_brightness)
         if mask is not None:
             counts &= mask
         color, target = color[counts].clamp(LAMPS.min_brightness, 1), target[counts]  # [P, 3]
@@ -185,9 +176,3 @@ def _render_candidates(session: GaussianSession, index: int, offsets: Tensor) ->
     rendering = rasterize(posed, camera, channels=channels)
     assert rendering.channels is not None
     return rendering.color, rendering.channels[..., 1:], rendering.channels[..., 0]
-
-
-def _clear_of_instruments(instrument: Tensor, margin: int) -> Tensor:
-    """Return the pixels without instrument within `margin` px, [H, W] bool; `instrument` [H, W]: its share of each
-    pixel."""
-    return max_pool2d(instrument[None, None], 2 * margin + 1, 1, margin)[0, 0] < LAMPS.max_coverage

@@ -21,8 +21,8 @@ from neeco.evidence.carving import CarvedShape, Evidence, camera_from_instrument
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector, skew
-from neeco.methods.kinematic.link_search import doubted_readings, note_doubt
-from neeco.methods.kinematic.stated_links import OFFSET_SD, STATED, StatedLinks
+from neeco.methods.kinematic.articulation import SETTINGS, Articulation
+from neeco.methods.kinematic.link_search import doubted_readings
 from neeco.states.outline_fit import OUTLINES
 from neeco.training.session import GaussianSession
 
@@ -87,7 +87,7 @@ class LinkRegistration:
 
 @torch.no_grad()
 def register_links(
-    links: StatedLinks,
+    links: Articulation,
     evidence: Evidence,
     name: str,
     shape: CarvedShape,
@@ -108,7 +108,8 @@ def register_links(
         return None
     problem = SilhouetteProblem(links, evidence, name, shape, line, readings)
     if stated is not None:
-        problem.state_base(stated)
+        problem.base_root = base_root(stated, problem.center)
+        problem.layout["base"] = torch.ones_like(problem.layout["base"])
     fits: list[tuple[tuple[str, ...], np.ndarray, Linearisation[np.ndarray]]] = []
     names: list[str] = []
     for more in MODELS:
@@ -142,7 +143,7 @@ def register_links(
 
 def correct_poses(
     session: GaussianSession,
-    links: StatedLinks,
+    links: Articulation,
     evidence: Evidence,
     instrument: Instrument,
     shape: CarvedShape,
@@ -162,7 +163,9 @@ def correct_poses(
         other = register_links(links, evidence, name, shape, [doubt.change(given) for given in readings], stated=stated)
         doubt = doubt if other is not None and other.cost < found.cost else None
     if doubt is not None:
-        note_doubt(session, name, doubt)
+        session.report(f"warning: {name}: its links fit the images {doubt.ratio:.1f} times as well {doubt.words}")
+        doubted = {f"{name}.{reading}": f"the links fit the images better {doubt.words}" for reading in doubt.names}
+        scene.diagnostics.setdefault("doubted_readings", {}).update(doubted)
     if doubt is not None or found is None or not found.needed:
         return False
     base = found.about(scene.center)
@@ -215,7 +218,7 @@ class SilhouetteProblem:
 
     def __init__(
         self,
-        links: StatedLinks,
+        links: Articulation,
         evidence: Evidence,
         name: str,
         shape: CarvedShape,
@@ -232,27 +235,20 @@ class SilhouetteProblem:
         self.center = self.poses[:, :3, 3].mean(0)
         joints = range(len(links.points))
         # of every link but the shaft: the joint that carries it, and the joints that it carries
-        self.own = [next(j for j in joints if bool(links.moves(j)[k])) for k in range(links.link_count - 1)]
+        self.own = [links.joint_of(link) for link in range(1, links.link_count)]
         carriers = [links.link_of(group[0].parent) for group in links.joint_groups]
         self.carried = [[j for j in joints if carriers[j] == k] for k in range(1, links.link_count)]
-        slides = [any(links.slides[j] and bool(links.gains[j, :, r].any()) for j in joints)
-                  for r in range(len(links.reading_names))]  # fmt: skip
         spreads = {
             "base": [OUTLINES.base_sd_rad] * 3 + [OUTLINES.base_sd_mm] * 3,
             "frame": CAPSULES.frame_sd,
-            "turns": [STATED.axis_sd] * 3 * len(joints),
-            "shifts": [STATED.pivot_sd] * 3 * len(joints),
-            "offsets": [OFFSET_SD[slide] * float(seen) for slide, seen in zip(slides, links.observable, strict=True)],
+            "turns": [SETTINGS.axis_sd] * 3 * len(joints),
+            "shifts": [SETTINGS.pivot_sd] * 3 * len(joints),
+            "offsets": [sd * float(seen) for sd, seen in zip(links.offset_sds, links.observable, strict=True)],
             "shaft": CAPSULES.shaft_sd,
             "radii": [CAPSULES.log_radius_sd] * links.link_count,
             "ends": [*CAPSULES.end_sd] * sum(not carried for carried in self.carried),
         }
         self.layout = {key: torch.tensor(spread).to(self.axis) for key, spread in spreads.items()}
-
-    def state_base(self, stated: BaseUncertainty) -> None:
-        """Take the base's error to have the stated covariance."""
-        self.base_root = base_root(stated, self.center)
-        self.layout["base"] = torch.ones_like(self.layout["base"])
 
     def fit_only(self, names: Sequence[str]) -> None:
         """Fit the parameters of these names; others, and those without deviation, stay 0."""

@@ -23,7 +23,8 @@ from neeco.evidence.carving import (
     posed_views,
     score_points,
 )
-from neeco.methods.kinematic.stated_links import StatedLinks
+from neeco.geometry.rotations import rotate_about
+from neeco.methods.kinematic.articulation import Articulation
 from neeco.training.session import GaussianSession
 
 
@@ -75,7 +76,7 @@ PLANE_OFFSETS = torch.cartesian_prod(torch.linspace(1, 4, 7), torch.linspace(-0.
 @torch.no_grad()
 def align_to_links(
     session: GaussianSession,
-    links: StatedLinks,
+    links: Articulation,
     evidence: Evidence,
     name: str,
     shape: CarvedShape,
@@ -134,7 +135,7 @@ def _shaft_about_line(
 @torch.no_grad()
 def start_links(
     session: GaussianSession,
-    links: StatedLinks,
+    links: Articulation,
     evidence: Evidence,
     name: str,
     shape: CarvedShape,
@@ -168,7 +169,7 @@ def start_links(
 
 
 def _open_links(
-    session: GaussianSession, links: StatedLinks, evidence: Evidence, name: str, radius: float
+    session: GaussianSession, links: Articulation, evidence: Evidence, name: str, radius: float
 ) -> dict[int, tuple[Tensor, Tensor]]:
     """Return, by link whose opening was not recorded, the half spaces in which it lies at rest: a point [3] mm and unit
     directions [K, 3], to the side to which it opens and, where its heading is found, beyond its pivot.
@@ -180,7 +181,7 @@ def _open_links(
     instrument = next(item for item in session.scene.instruments if item.name == name)
     sides: dict[int, tuple[Tensor, Tensor]] = {}
     for reading in instrument.unrecorded:
-        opening = links.opened_by(reading)
+        opening = _opened_by(links, reading)
         if not opening:
             continue
         low, high = instrument.joints[reading] or (0.0, 0.0)
@@ -201,14 +202,36 @@ def _open_links(
             column = session.refinement.readings.index((name, reading))
             session.refinement.joints[:, column] = values[best] - instrument.halfway(reading)
         for link, (joint, sense) in opening.items():
-            pivot, ahead, towards = links.plane_between(joint, turned)
+            pivot, ahead, towards = _plane_between(links, joint, turned)
             opens_to = sense * towards
             sides[link] = (pivot, torch.stack([ahead, opens_to]) if found else opens_to[None])
     return sides
 
 
+def _opened_by(links: Articulation, reading: str) -> dict[int, tuple[int, float]]:
+    """Return {link: (joint, sense)} of links that a reading turns about one axis in opposite directions."""
+    found: dict[int, tuple[int, float]] = {}
+    for joint, own in enumerate(links.gains[:, :, links.reading_names.index(reading)]):  # [L - 1]
+        if bool((own > 0).any()) and bool((own < 0).any()) and not links.slides[joint]:
+            found |= {k + 1: (joint, 1.0 if gain > 0 else -1.0) for k, gain in enumerate(own.tolist()) if gain}
+    return found
+
+
+@torch.no_grad()
+def _plane_between(links: Articulation, joint: int, heading: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return (pivot [3] mm, unit directions [3] of the links beyond and of positive rotation) at rest, for links turned
+    by `heading` (rad) about the joint's axis from the line of those before."""
+    pivots, axes = links.axes()
+    line = links.rest_line()
+    along = links.shaft()[1] if line is None else line[1]
+    turn = along.new_tensor([heading])
+    ahead = rotate_about(along[None], axes[joint], torch.zeros_like(along), turn)[0]
+    towards = torch.linalg.cross(axes[joint], ahead)
+    return pivots[joint], nn.functional.normalize(ahead, dim=0), nn.functional.normalize(towards, dim=0)
+
+
 def _plane_evidence(
-    links: StatedLinks,
+    links: Articulation,
     evidence: Evidence,
     name: str,
     radius: float,
@@ -223,7 +246,7 @@ def _plane_evidence(
     for link, (joint, sense) in opening.items():
         points = []
         for heading in HEADINGS.tolist():
-            pivot, ahead, towards = (part.to(own) for part in links.plane_between(joint, heading))
+            pivot, ahead, towards = (part.to(own) for part in _plane_between(links, joint, heading))
             axis = torch.linalg.cross(ahead, towards)
             points.append(pivot + far * ahead + along_axis * axis + sense * aside * towards)
         found, _ = score_points(evidence, own @ moved[:, link], torch.cat(points))
@@ -238,7 +261,7 @@ def readings_of(session: GaussianSession, evidence: Evidence, name: str) -> list
     return [dict(by_name[frame.name].instruments[name].joints) for frame in evidence.frames]
 
 
-def link_motions(links: StatedLinks, readings: list[dict[str, float]]) -> Tensor:
+def link_motions(links: Articulation, readings: list[dict[str, float]]) -> Tensor:
     """Return the motion [F, L, 4, 4] of every link from rest, instrument frame, at each frame's readings."""
     frame = torch.eye(4, device=links.points.device)[:, :3]  # origin and axes, as points
     corners = torch.cat([frame[3:4], frame[:3]])  # [4, 3]
@@ -252,9 +275,21 @@ def link_motions(links: StatedLinks, readings: list[dict[str, float]]) -> Tensor
     return torch.stack(moved).reshape(len(readings), links.link_count, 4, 4)
 
 
+def _extent_of(links: Articulation, link: int, reach: float, margin: float) -> tuple[Tensor, Tensor]:
+    """Return cubes at rest that contain a link: centres [K, 3] mm, half sizes [K] mm. They reach `reach` from its pivot
+    where no link follows, else to the pivots beyond plus `margin`."""
+    pivots, own = links.axes()[0], links.joint_of(link)
+    beyond = [j for j, group in enumerate(links.joint_groups) if links.link_of(group[0].parent) == link]
+    if not beyond:
+        return pivots[own][None], pivots.new_tensor([reach])
+    middle = torch.stack([(pivots[own] + pivots[j]) / 2 for j in beyond])
+    half = torch.stack([(pivots[own] - pivots[j]).norm() / 2 + margin for j in beyond])
+    return middle, half
+
+
 def _on_link(
     views: list[PosedViews],
-    links: StatedLinks,
+    links: Articulation,
     link: int,
     radius: float,
     *,
@@ -266,7 +301,7 @@ def _on_link(
     in the half spaces `side` (point mm, unit directions) where given."""
     device = links.points.device
     centers, reaches = (
-        part.to(device) for part in links.extent_of(link, LINKS.reach_radii * radius, LINKS.margin_radii * radius)
+        part.to(device) for part in _extent_of(links, link, LINKS.reach_radii * radius, LINKS.margin_radii * radius)
     )
     total = LINKS.candidates_per_seed * count
     random = torch.rand(total, 4, generator=generator, device=generator.device).to(device)
@@ -305,7 +340,7 @@ class DoubtedReadings:
 
 @torch.no_grad()
 def doubted_readings(
-    session: GaussianSession, links: StatedLinks, evidence: Evidence, instrument: Instrument, readings: list[Readings]
+    session: GaussianSession, links: Articulation, evidence: Evidence, instrument: Instrument, readings: list[Readings]
 ) -> DoubtedReadings | None:
     """Return what to doubt where the links keep more of their volume on evidence with two readings exchanged or one's
     sign reversed. `readings`: those of every frame of the evidence.
@@ -318,10 +353,10 @@ def doubted_readings(
     for one, other in combinations(recorded, 2):
         if instrument.slides(one) == instrument.slides(other):
             words = f"with the readings of {one} and {other} exchanged: which log is which?"
-            changes.append(((one, other), words, partial(_exchanged, one, other)))
+            changes.append(((one, other), words, partial(_changed, {one: (1.0, other), other: (1.0, one)})))
     for name in recorded:
         words = f"with the sign of {name} reversed: is its axis, or its gain, the wrong way round?"
-        changes.append(((name,), words, partial(_reversed, name)))
+        changes.append(((name,), words, partial(_changed, {name: (-1.0, name)})))
     found = [(volumes.with_readings(change), index) for index, (_, _, change) in enumerate(changes)]
     most, index = max(found, default=(0.0, 0))
     if most <= LINKS.min_volume_ratio * named:
@@ -330,25 +365,15 @@ def doubted_readings(
     return DoubtedReadings(names, most / max(named, 1), words, change)
 
 
-def note_doubt(session: GaussianSession, name: str, doubt: DoubtedReadings) -> None:
-    """Warn of an instrument's doubted readings, and note them in `scene.diagnostics["doubted_readings"]`."""
-    session.report(f"warning: {name}: its links fit the images {doubt.ratio:.1f} times as well {doubt.words}")
-    warnings = session.scene.diagnostics.setdefault("doubted_readings", {})
-    warnings |= {f"{name}.{reading}": f"the links fit the images better {doubt.words}" for reading in doubt.names}
-
-
-def _exchanged(one: str, other: str, given: Readings) -> Readings:
-    return {**given, one: given[other], other: given[one]}
-
-
-def _reversed(name: str, given: Readings) -> Readings:
-    return {**given, name: -given[name]}
+def _changed(taken: dict[str, tuple[float, str]], readings: Readings) -> Readings:
+    """Return `readings` with some `taken` as (sign, of which reading)."""
+    return {**readings, **{name: sign * readings[source] for name, (sign, source) in taken.items()}}
 
 
 class _Volumes:
     """Volume that stays on evidence, counted in sample points of all links together."""
 
-    def __init__(self, links: StatedLinks, evidence: Evidence, name: str, readings: list[Readings], seed: int) -> None:
+    def __init__(self, links: Articulation, evidence: Evidence, name: str, readings: list[Readings], seed: int) -> None:
         step = max(1, len(readings) // LINKS.max_check_frames)
         self.links, self.readings = links, readings[::step]
         self.evidence = evidence.subset(torch.arange(0, len(readings), step))
@@ -361,7 +386,9 @@ class _Volumes:
         radius = float(self.links.radius)
         centers, half = (
             part.cpu()
-            for part in self.links.extent_of(link, LINKS.check_reach_radii * radius, LINKS.check_margin_radii * radius)
+            for part in _extent_of(
+                self.links, link, LINKS.check_reach_radii * radius, LINKS.check_margin_radii * radius
+            )
         )
         which = torch.randint(len(centers), (LINKS.check_points,), generator=generator)
         away = 2 * torch.rand(LINKS.check_points, 3, generator=generator) - 1

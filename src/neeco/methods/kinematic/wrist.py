@@ -43,6 +43,14 @@ class WristSettings:
 WRIST = WristSettings()
 
 
+@dataclass(frozen=True)
+class Spin(Perturbation):
+    """`shaft_roll`: angle in rad by which everything behind the wrist is spun about the shaft (a surface of revolution
+    looks the same)."""
+
+    shaft_roll: float = 0.0
+
+
 @torch.no_grad()
 def place_wrists(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Set every wrist to its estimated position."""
@@ -93,7 +101,7 @@ def _spun_error(
     direction. Sets the wrist to `start`."""
     articulated.articulations[index].wrist_start.fill_(start)
     return sum(
-        _image_error(session, frame, articulated.spin_perturbation(-WRIST.spin_angle if k % 2 else WRIST.spin_angle))
+        _image_error(session, frame, Spin(shaft_roll=-WRIST.spin_angle if k % 2 else WRIST.spin_angle))
         for k, frame in enumerate(frames)
     )
 

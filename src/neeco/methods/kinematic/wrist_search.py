@@ -18,8 +18,8 @@ import torch
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.evidence.carving import CarvedShape, Evidence
 from neeco.geometry.rotations import rigid
+from neeco.methods.kinematic.articulation import Articulation
 from neeco.methods.kinematic.link_registration import CAPSULES, SilhouetteProblem, minimised
-from neeco.methods.kinematic.stated_links import StatedLinks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ def search_wrist(
     closed = {joint: min(given[joint] for given in readings) for joint in (*joints, *others)}
 
     def problem_of(wrist: _Wrist, readings: Sequence[Mapping[str, float]] = readings) -> SilhouetteProblem:
-        links = StatedLinks(wrist.tree(shape, closed)).to(evidence.device)
+        links = Articulation(wrist.tree(shape, closed)).to(evidence.device)
         line = links.rest_line()
         assert line is not None
         problem = SilhouetteProblem(links, evidence, name, shape, line, readings)

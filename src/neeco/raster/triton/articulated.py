@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from neeco.raster.triton.geometry import quadruple, triple
+from neeco.raster.triton.geometry import put_four, put_three, quadruple, triple
 from neeco.raster.triton.ready import working_on
 
 # offsets into the numbers of a body
@@ -216,19 +216,6 @@ def pose_kernel(
     put_three(to_scales + g * 3, sx, sy, sz, inside)
     put_four(to_quats + g * 4, qw, qx, qy, qz, inside)
     put_four(to_frames + g * 4, fw, fx, fy, fz, inside)
-
-
-@triton.jit
-def put_three(at, a, b, c, inside):
-    tl.store(at, a, inside)
-    tl.store(at + 1, b, inside)
-    tl.store(at + 2, c, inside)
-
-
-@triton.jit
-def put_four(at, a, b, c, d, inside):
-    tl.store(at, a, inside)
-    put_three(at + 1, b, c, d, inside)
 
 
 @triton.jit

@@ -158,6 +158,21 @@ def quadruple_at(at, mask):
 
 
 @triton.jit
+def put_three(at, a, b, c, mask):
+    """Store three consecutive numbers."""
+    tl.store(at, a, mask)
+    tl.store(at + 1, b, mask)
+    tl.store(at + 2, c, mask)
+
+
+@triton.jit
+def put_four(at, a, b, c, d, mask):
+    """Store four consecutive numbers."""
+    tl.store(at, a, mask)
+    put_three(at + 1, b, c, d, mask)
+
+
+@triton.jit
 def triple(base, index, mask):
     """Load rows of three floats."""
     return triple_at(base + index * 3, mask)

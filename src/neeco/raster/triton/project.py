@@ -16,6 +16,7 @@ from neeco.raster.triton.geometry import (
     finite,
     headlight,
     projected,
+    put_four,
     quadruple,
     rotation_matrix,
     sh_color,
@@ -130,15 +131,6 @@ def project_kernel(
     put_four(records + g * RECORD + 4, c, log2_opacity, red, green, seen)
     tl.store(records + g * RECORD + 8, blue, seen)
     tl.store(records + g * RECORD + 9, z, seen)
-
-
-@triton.jit
-def put_four(at, a, b, c, d, mask):
-    """Store four consecutive numbers."""
-    tl.store(at, a, mask)
-    tl.store(at + 1, b, mask)
-    tl.store(at + 2, c, mask)
-    tl.store(at + 3, d, mask)
 
 
 @triton.jit

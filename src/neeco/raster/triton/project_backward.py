@@ -1,7 +1,5 @@
 """Stage 5: gradients of the Gaussians and of the camera from those of the projected Gaussians."""
 
-from dataclasses import dataclass
-
 import torch
 import triton
 import triton.language as tl
@@ -25,23 +23,6 @@ from neeco.raster.triton.project import RECORD, Inputs, Projected, turned
 
 BLOCK = 128
 CAMERA_SUMS = tl.constexpr(18)  # camera_from_world (rotation 9, translation 3), centre 3, vignette 2, nothing
-
-
-@dataclass(frozen=True, kw_only=True)
-class Gradients:
-    """Gradients of all inputs, and of the projected centres."""
-
-    centers: Tensor  # [N, 2]
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh: Tensor | None  # None: not wanted
-    falloff: Tensor | None
-    left: Tensor | None
-    channels: Tensor | None
-    vignette: Tensor | None
-    pose: Tensor | None
 
 
 @triton.jit
@@ -232,8 +213,9 @@ def project_backward_kernel(
 
 def project_backward(
     inputs: Inputs, projected: Projected, camera: Camera, sums: Tensor, want_sh: bool, want_camera: bool
-) -> Gradients:
-    """Return gradients of the Gaussians from their `sums` [N, 10 + C], and of pose and vignette if `want_camera`."""
+) -> tuple[Tensor, list[Tensor | None]]:
+    """Return gradients of the projected centres [N, 2], and of the inputs in their order but for background and frames,
+    from the Gaussians' `sums` [N, 10 + C]; of pose and vignette if `want_camera`."""
     n, device = len(inputs), inputs.means.device
     programs = triton.cdiv(n, BLOCK)
     partial = torch.zeros(programs, CAMERA_SUMS.value, device=device) if want_camera else None
@@ -255,19 +237,7 @@ def project_backward(
         total = partial.double().sum(0)
         pose, vignette = _pose_gradient(total, inputs.pose.double()), total[15:17].float()
     channels = None if inputs.channels is None else sums[:, HEAD.value :]
-    return Gradients(
-        centers=centers,
-        means=to[0],
-        quats=to[1],
-        scales=to[2],
-        opacities=to[3],
-        sh=to_sh,
-        falloff=to_falloff,
-        left=to_left,
-        channels=channels,
-        vignette=vignette,
-        pose=pose,
-    )
+    return centers, [*to, to_sh, to_falloff, channels, to_left, vignette, pose]
 
 
 def _pose_gradient(total: Tensor, pose: Tensor) -> Tensor:
