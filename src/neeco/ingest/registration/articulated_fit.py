@@ -41,7 +41,6 @@ class ArticulatedFitSettings:
     steps: tuple[float, float, float] = (0.005, 0.3, 0.01)  # finite differences: turns rad, shifts mm, clock s
     parameter_step: float = 0.1  # finite difference of a parameter, standard deviations of its prior
     inside_px: float = -0.7  # signed distance from another cone's outline, above which a point is no outline
-    reach_rad: float = 0.5  # angle from a head's direction within which its outline tells how far it reaches
     max_turn_rad: float = 0.15  # maximum turn of one step
     max_shift_mm: float = 12.0  # maximum shift of one step
     max_sds: float = 2.0  # maximum step of the model's parameters, standard deviations
@@ -145,11 +144,8 @@ def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
     others[:, 1, owner == 0] = others[:, 0, owner == 1] = -1e3  # the tube continues in its end
     valid = projected.valid[:, owner] & (others.max(1) < LINKED_FIT.inside_px)
     valid &= problem.silhouettes.inside(points, margin=1.0 + SHAFT_LINES.edge_px)
-    on_masks, contours = np.isfinite(problem.contours[..., 0]), np.nan_to_num(problem.contours)
-    if not problem.readings:  # jaws may open as nothing says: of the head counts only how far it reaches
-        valid &= (owner < 2) | ((fit.model.places == 1) & (np.abs(fit.model.angles) < LINKED_FIT.reach_rad))
-        on_masks &= projected.distances(contours)[0].argmax(1) < 2
-    return _Points(valid, on_masks, contours)
+    on_masks = np.isfinite(problem.contours[..., 0])
+    return _Points(valid, on_masks, np.nan_to_num(problem.contours))
 
 
 def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points) -> np.ndarray:
