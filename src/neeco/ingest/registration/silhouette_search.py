@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.lines import unit
 from neeco.ingest.foreground.silhouettes import ShaftLines
-from neeco.ingest.registration.logged import MIDDLE, BasePrior, LoggedSilhouettes
+from neeco.ingest.registration.silhouette_fit import BasePrior
+from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSilhouettes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +139,7 @@ def search_bases(
         lines=problem.silhouettes.shafts if lines is None else lines,
         intrinsics=problem.silhouettes.intrinsics,
         camera_from_world=problem.camera_from_world,
-        base_from_instrument=problem.poses[MIDDLE],
+        base_from_instrument=problem.poses[len(CLOCK_SHIFTS_S) // 2],
         center=center,
         sd_mm=sd_mm,
         distance=distance,
