@@ -14,26 +14,26 @@ from source_trees import module_paths, module_trees
 
 # lines of Python: the limit, and the aim
 ROOMS = {
-    "cli": (2083, 1700),
-    "viewer": (3187, 2100),
+    "cli": (1785, 1700),
+    "viewer": (3099, 2100),
     "report": (1593, 1500),
-    "studies": (3002, 2600),
-    "ingest": (18_045, 10_500),
-    "tracking": (1410, 1200),
-    "synthesis": (4504, 3200),
-    "evaluation": (1407, 1200),
-    "labels": (926, 800),
-    "methods": (5295, 3500),
-    "training": (2041, 1700),
-    "states": (3361, 2600),
-    "evidence": (984, 1200),
-    "scene": (1999, 1800),
-    "capture": (4971, 3900),
-    "raster": (4055, 3800),
+    "studies": (2995, 2600),
+    "ingest": (17_461, 10_500),
+    "tracking": (1373, 1200),
+    "synthesis": (4330, 3200),
+    "evaluation": (1391, 1200),
+    "labels": (909, 800),
+    "methods": (5138, 3500),
+    "training": (2025, 1700),
+    "states": (3274, 2600),
+    "evidence": (975, 1200),
+    "scene": (1956, 1800),
+    "capture": (4724, 3900),
+    "raster": (3994, 3800),
     "geometry": (983, 1000),
-    "base": (1595, 1500),
+    "base": (1561, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (311, 240), (3638, 3000), (290, 300)
+FILES, FUNCTIONS, NUMBERS = (311, 240), (3464, 3000), (289, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

@@ -18,8 +18,8 @@ from neeco.base.errors import NeecoError
 from neeco.cli import main
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.viewer.controls import Controls
-from neeco.viewer.runs import ViewedRun
-from neeco.viewer.views import IMAGE, render_run, scored, views_of
+from neeco.viewer.runs import ViewedRun, score_frame
+from neeco.viewer.views import IMAGE, render_run, views_of
 
 slowly = pytest.mark.parametrize("word", SLOW_ON_CPU, indirect=True)
 Call = Callable[..., None]
@@ -147,12 +147,10 @@ def test_the_viewer_draws_every_view(run: str, device: torch.device) -> None:
     assert loaded.scene.center.device.type == device.type
     camera, controls = loaded.recorded.cameras[2], Controls(2.0)
     for view in views_of(loaded.scene, bool(loaded.frames)):
-        drawn, expected = (render_run(viewed, controls, camera, view) for viewed in (there, here))
-        difference = np.abs(drawn.picture.pixels.astype(float) - expected.picture.pixels)
+        (drawn, _), (expected, _) = (render_run(viewed.loaded, controls, camera, view) for viewed in (there, here))
+        difference = np.abs(drawn.pixels.astype(float) - expected.pixels)
         assert (difference > 2).mean() < 0.01, view
-    score = scored(drawn).score
-    assert score is not None
-    assert score.psnr > 20
+    assert score_frame(loaded, 2).psnr > 20
 
 
 def test_the_viewer_says_that_a_gpu_failed_and_goes_on(run: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,8 +162,8 @@ def test_the_viewer_says_that_a_gpu_failed_and_goes_on(run: str, monkeypatch: py
     with monkeypatch.context() as patch:
         patch.setattr(GaussianScene, "at", full)
         with pytest.raises(NeecoError, match=r"2\.50 GiB more were asked for"):
-            render_run(viewed, controls, camera, IMAGE)
-    assert render_run(viewed, controls, camera, IMAGE).picture.pixels.any()
+            render_run(viewed.loaded, controls, camera, IMAGE)
+    assert render_run(viewed.loaded, controls, camera, IMAGE)[0].pixels.any()
 
 
 @slowly
