@@ -14,13 +14,13 @@ from source_trees import module_paths, module_trees
 
 # lines of Python: the limit, and the aim
 ROOMS = {
-    "cli": (1785, 1700),
+    "cli": (1789, 1700),
     "viewer": (3099, 2100),
     "report": (1593, 1500),
     "studies": (2995, 2600),
     "ingest": (17_461, 10_500),
     "tracking": (1373, 1200),
-    "synthesis": (4330, 3200),
+    "synthesis": (4333, 3200),
     "evaluation": (1391, 1200),
     "labels": (909, 800),
     "methods": (5138, 3500),

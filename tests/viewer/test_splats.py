@@ -211,6 +211,9 @@ def test_the_format_is_that_of_the_ending(tmp_path: Path, capsys: pytest.Capture
     for words, ends in ((["b.splat"], ".ply or .spz or .usdc or .glb"), (["b.ply", "--format", "spz"], ".spz")):
         assert main(["export", str(run), "--output", *words]) == 1
         assert f"--output: {words[0]}: wrong file name extension; use {ends}\n" in capsys.readouterr().err
+    for words in (["--unit", "mm", "--format", "usdc"], ["--spz-version", "3"]):
+        assert main(["export", str(run), *words]) == 1
+        assert f"{words[0]}: applies to " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -51,6 +51,10 @@ def run(arguments: Arguments) -> int:
         require_ending("--output", arguments.output, *endings)
         if arguments.format is None and arguments.output.suffix:
             format = cast(Format, arguments.output.suffix[1:].lower())
+    if arguments.spz_version != 4 and format != "spz":
+        raise NeecoError("--spz-version: applies to spz only; leave it out")
+    if arguments.unit != "m" and format != "glb":
+        raise NeecoError("--unit: applies to glb only; leave it out")
     if format == "usdc":
         require_usd()
     with open_gaussian_run(arguments.run, "export", device_of(arguments.device)) as trained:

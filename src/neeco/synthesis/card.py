@@ -8,6 +8,7 @@ import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
 
 from neeco.base.files import write_atomically, write_text
@@ -216,10 +218,11 @@ def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: P
         for label in record["labels"]:
             _draw_label(axes, label, bones, np.array([x, y]), wide / record["width"])
     axes.imshow(sheet)
-    keys = [Patch(color=part_color(number), label=" ".join(name)) for number, name in enumerate(names, 1)]
+    keys: list[Any] = [Patch(color=part_color(number), label=" ".join(name)) for number, name in enumerate(names, 1)]
+    dot = partial(Line2D, [], [], marker="o", linestyle="", markeredgecolor=PREVIEW.bone)
     keys += [Patch(fill=False, color=PREVIEW.rectangle, label="minimum-area box")]
-    keys += [Patch(color=PREVIEW.hidden, label="keypoint occluded")]
-    axes.legend(handles=keys, loc="upper left", ncols=4, fontsize=PREVIEW.font)
+    keys += [dot(color=PREVIEW.box, label="keypoint seen"), dot(color=PREVIEW.hidden, label="keypoint occluded")]
+    axes.legend(handles=keys, loc="upper left", ncols=5, fontsize=PREVIEW.font)
     return figure
 
 
@@ -227,10 +230,10 @@ def _draw_label(axes: Axes, label: dict[str, Any], bones: Pairs, corner: np.ndar
     """Draw a label over its image, whose upper left corner [2] px is there, `scale` times its size."""
     if label["area"] > 0:
         x, y, width, height = (value * scale for value in label["box"])
-        x, y = x + corner[0], y + corner[1]
-        axes.add_patch(Rectangle((x, y), width, height, fill=False, color=PREVIEW.box))
+        axes.add_patch(Rectangle((x + corner[0], y + corner[1]), width, height, fill=False, color=PREVIEW.box))
         axes.add_patch(Polygon(corner + scale * np.array(label["rectangle"]), fill=False, color=PREVIEW.rectangle))
-        axes.text(x, y, label["name"], fontsize=PREVIEW.font, backgroundcolor=PREVIEW.box)
+        tag = {"facecolor": PREVIEW.box, "edgecolor": PREVIEW.box, "pad": 1}
+        axes.text(x + corner[0], y + corner[1] - 2, label["name"], fontsize=PREVIEW.font, bbox=tag)
     points = {name: (corner + scale * np.array([x, y]), v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
     for a, b in (bone for bone in bones if {*bone} <= points.keys()):
         axes.plot(*np.stack([points[a][0], points[b][0]], 1), color=PREVIEW.bone)
