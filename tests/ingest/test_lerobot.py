@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -424,7 +425,7 @@ def test_parquet_of_other_columns(tmp_path):
     for other, message in [
         (table.drop_columns([STATE]), f"has no column '{STATE}'; its columns are action, timestamp"),
         *((table.set_column(0, STATE, pyarrow.array([cell] * rows)), no_numbers)
-          for cell in ("x", "1.5", b"1.5", ["1.5"] * len(DVRK))),
+          for cell in ("x", "1.5", b"1.5", Decimal("1.5"), ["1.5"] * len(DVRK))),
         (table.set_column(0, STATE, pyarrow.array([[1.0] * (1 + row % 2) for row in range(rows)])), no_numbers),
         (table.set_column(0, STATE, pyarrow.array([[1.0]] * rows)), f"{STATE}: has 1 numbers a row, not 16"),
         (table.set_column(2, "timestamp", pyarrow.array([[]] * rows, pyarrow.list_(pyarrow.float64()))),
@@ -433,6 +434,15 @@ def test_parquet_of_other_columns(tmp_path):
     ]:  # fmt: skip
         pyarrow.parquet.write_table(other, file)
         assert re.search(message, refusal(path))
+
+
+def test_lists_where_the_length_of_an_episode_stands_are_refused(tmp_path: Path) -> None:
+    path = data_set(tmp_path, version="v3.0")
+    for file in path.glob("meta/episodes/**/*.parquet"):
+        table = pyarrow.parquet.read_table(file)
+        lists = pyarrow.array([[]] * len(table), pyarrow.list_(pyarrow.float64()))
+        pyarrow.parquet.write_table(table.set_column(table.schema.get_field_index("length"), "length", lists), file)
+    assert "length: has 0 numbers a row, not 1" in refusal(path)
 
 
 def test_numbers_come_of_every_arrow_type_that_holds_them(tmp_path: Path) -> None:

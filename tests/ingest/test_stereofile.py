@@ -208,6 +208,18 @@ def test_wrong_numbers_end_in_one_line(tmp_path, changes, message):
     assert str(caught.value).startswith(str(tmp_path))
 
 
+def test_an_inis_coefficients_end_at_the_first_gap_and_its_left_camera_stands_at_the_origin_but_for_rounding(tmp_path):
+    path = ini(tmp_path)
+    whole = path.read_text(encoding="utf-8")
+    path.write_text(whole.replace("kc_2=", "kd_2="), encoding="utf-8")
+    assert np.count_nonzero(read_stereo(path)[0].distortion) == 2
+    path.write_text(whole.replace("R_1=0.0\n", "R_1=5e-7\n", 1), encoding="utf-8")
+    assert len(read_stereo(path)) == 3
+    path.write_text(whole.replace("R_1=0.0\n", "R_1=5e-5\n", 1), encoding="utf-8")
+    with pytest.raises(NeecoError, match="the left camera must be the origin"):
+        read_stereo(path)
+
+
 def test_exchanged_files_are_named(tmp_path):
     ros_pair(tmp_path)
     left, right = (tmp_path / name for name in ("left.yaml", "right.yaml"))
@@ -231,3 +243,13 @@ def test_one_camera_is_no_rig(tmp_path):
 def test_no_bytes_make_reading_raise(tmp_path, write):
     path = write(tmp_path)
     refusals([path], [lambda: np.testing.assert_array_equal(np.isfinite(read_stereo(path)[2]), True)], 25)
+
+
+def test_the_right_camera_sees_a_point_where_opencv_projects_it(tmp_path):
+    _, right, right_from_left = read_stereo(opencv_yaml(tmp_path))
+    point = np.array([5.0, -3.0, 80.0])
+    image, _ = cv2.projectPoints(point[None], TURN.as_rotvec(), SHIFT, RIGHT, RIGHT_BENDS)
+    there = right_from_left[:3, :3] @ point + right_from_left[:3, 3]
+    matrix = np.array([[right.fl_x, 0, right.cx - 0.5], [0, right.fl_y, right.cy - 0.5], [0, 0, 1]])
+    drawn, _ = cv2.projectPoints(there[None], np.zeros(3), np.zeros(3), matrix, np.array(right.distortion))
+    np.testing.assert_allclose(drawn, image, atol=1e-6)

@@ -55,7 +55,7 @@ def require_replaceable(path: Path) -> None:
             raise NeecoError(f"{path}: is {kind}, not a file, and is not replaced; give another path, or remove it")
 
 
-def write_atomically(path: Path, write: Callable[[Path], object], *, synced: bool = True) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write(temporary_path)` produce a file next to `path`, sync it to disk and rename it to `path`.
 
     The user's umask decides who may read and write it. On any failure the temporary file is removed, and `path` holds
@@ -64,28 +64,27 @@ def write_atomically(path: Path, write: Callable[[Path], object], *, synced: boo
     path = Path(path)
     require_replaceable(path)
     try:
-        if not path.parent.is_dir():
-            _make_folders(path.parent)
+        _make_folders(path.parent)
         temporary, lock = begin_file(path)
-        try:
-            mode = stat.S_IMODE(os.fstat(lock).st_mode)
-            if not LOCKING:
-                os.close(lock)  # Windows renames no open file
-            write(temporary)
-            temporary.chmod(mode)  # some libraries replace the file
-            if synced:
-                with open(temporary, "rb") as stream:
-                    os.fsync(stream.fileno())
-            os.replace(temporary, path)
-            if synced:
-                _sync_folder(path.parent)
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                temporary.unlink()
-            if LOCKING:
-                os.close(lock)
+        mode = stat.S_IMODE(temporary.stat().st_mode)
     except OSError as error:
         raise cannot_write(path, error) from error
+    if not LOCKING:
+        os.close(lock)  # Windows renames no open file
+    try:
+        write(temporary)
+        temporary.chmod(mode)  # some libraries replace the file
+        with open(temporary, "rb") as stream:
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            temporary.unlink()
+        if LOCKING:
+            os.close(lock)
 
 
 def write_unsynced(path: Path, content: bytes) -> None:
@@ -94,7 +93,27 @@ def write_unsynced(path: Path, content: bytes) -> None:
     For the many files of a folder that counts as complete only after `sync_disk`: a killed process leaves each whole or
     absent, a power cut may leave some empty. Raises NeecoError naming `path` when the disk refuses.
     """
-    write_atomically(path, lambda temporary: temporary.write_bytes(content), synced=False)
+    require_replaceable(path)
+    try:
+        try:
+            temporary, handle = begin_file(path)
+        except FileNotFoundError:
+            _make_folders(path.parent)
+            temporary, handle = begin_file(path)
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(content)
+                if LOCKING:  # while its lock is held
+                    stream.flush()
+                    os.replace(temporary, path)
+            if not LOCKING:
+                os.replace(temporary, path)
+        except BaseException:
+            with contextlib.suppress(FileNotFoundError):
+                temporary.unlink()
+            raise
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 def sync_disk() -> None:

@@ -101,10 +101,11 @@ def run_jobs(
     """Run every job and return their results, in their order.
 
     workers 1: in this process, one after another; more, or where RAY_ADDRESS names a cluster: so many at once in
-    processes of their own, a job whose worker dies again from its checkpoint. record: gets all results known after each
-    job; finished: those of earlier starts, by the job's place. captures: those that are read already, by path. light:
-    small jobs, which workers do one after another, sharing the GPUs. Raises NeecoError before any work when a job's
-    folder is another job's or the cluster does not answer, and KeyboardInterrupt saying which job was stopped.
+    processes of their own (so that a script needs `if __name__ == "__main__"`), a job whose worker dies again from its
+    checkpoint. record: gets all results known after each job; finished: those of earlier starts, by the job's place.
+    captures: those that are read already, by path. light: small jobs, which workers do one after another, sharing the
+    GPUs. Raises NeecoError before any work when a job's folder is another job's or the cluster does not answer, and
+    KeyboardInterrupt saying which job was stopped.
     """
     device = device_of(jobs[0].device if jobs else "cpu", drawing=False)
     check_workers(workers, device, light)
@@ -185,8 +186,9 @@ def _run_in_workers(
 ) -> list[Result]:
     """`run_jobs` with `workers` jobs at once, each in a process of its own; light ones one after another in it.
 
-    A job's device is opened in its worker, who sees one GPU, that no other has. On a cluster, whose machines may have
-    GPUs that this one lacks, each worker is given a GPU unless the jobs ask for the CPU.
+    With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
+    device is opened in its worker, who sees one GPU, that no other has. On a cluster, whose machines may have GPUs that
+    this one lacks, each worker is given a GPU unless the jobs ask for the CPU.
     """
     folders = [job.folder.absolute().parent for job in jobs]
     how = Workers(

@@ -62,9 +62,11 @@ def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
             split = "test" if order % TEST_EVERY == FIRST_TEST else "train"
             parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
             parsed.places.append(place)
-    if len(parsed.frames) == len(table):
-        parsed.points = _points([frame.camera for frame in parsed.frames], table)
-    _warn_of_limits(root, parsed, file)
+    rows = table[[int(frame.state.time) for frame in parsed.frames]]  # those without a fault
+    poses = LLFF.camera_to_opencv(rows[:, :15].reshape(-1, 3, 5)[..., :4])
+    if len(rows) == len(table):
+        parsed.points = _points([frame.camera for frame in parsed.frames], poses, *table[:, 15:].T)
+    _warn_of_limits(root, poses, file)
     return parsed
 
 
@@ -117,24 +119,22 @@ def _camera(place: Node, values: np.ndarray) -> Camera:
     )
 
 
-def _points(cameras: Sequence[Camera], table: np.ndarray) -> PointCloud | None:
-    """Random points about the middle of the depth bounds of a table [N, 17]; None when the bounds are unusable."""
-    near, far = table[:, 15:].T
+def _points(cameras: Sequence[Camera], poses: np.ndarray, near: np.ndarray, far: np.ndarray) -> PointCloud | None:
+    """Random points about the middle of depth bounds [N] of cameras at poses [N, 3, 4]; None for unusable bounds."""
     with np.errstate(invalid="ignore"):
         if not ((near >= 0) & (near < far) & (far < 1e9)).all():  # nor when NaN
             return None
-    middles, poses = (near + far) / 2, LLFF.camera_to_opencv(table[:, :15].reshape(-1, 3, 5)[..., :4])
+    middles = (near + far) / 2
     centers = poses[:, :3, 3] + middles[:, None] * poses[:, :3, 2]
     slopes = np.array([0.5 * camera.width / camera.fx for camera in cameras])
     return random_points(centers.mean(axis=0), max((slopes * middles).max(), (0.5 * (far - near)).max()))
 
 
-def _warn_of_limits(root: Path, parsed: Parsed, file: Node) -> None:
+def _warn_of_limits(root: Path, poses: np.ndarray, file: Node) -> None:
     """Warn of what such a folder lacks, and of what in it is not read."""
     remedy = "only methods that need none can be trained, such as 3dgs"
     file.child("instruments").warning("no instrument states", remedy)
     file.child("units").warning("names no unit of length", "lengths are taken as mm: distances may be off")
-    poses = [frame.camera.world_from_camera.double().numpy() for frame in parsed.frames]
     if len(poses) > 1 and np.ptp(poses, axis=0).max() < MAX_STILL_CHANGE:
         message = "the camera never moves, so the images do not determine depth"
         file.child("poses").warning(message, "views other than the recorded one will be wrong")

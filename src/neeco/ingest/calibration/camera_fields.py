@@ -151,7 +151,7 @@ def _by_opencv(text: str) -> Any:
         return None
     try:
         return _value(storage.root()) if storage.isOpened() else None
-    except ValueError:  # a key stands there twice
+    except ValueError:  # parse_yaml names the line
         return None
     finally:
         storage.release()
@@ -160,7 +160,9 @@ def _by_opencv(text: str) -> Any:
 def _value(node: Any) -> Any:
     if node.isMap():
         names = node.keys()
-        return {name: _value(node.getNode(name)) for name, _ in zip(names, set(names), strict=True)}
+        if len(set(names)) < len(names):
+            raise ValueError("a key stands there twice")
+        return {name: _value(node.getNode(name)) for name in names}
     if node.isSeq():
         return [_value(node.at(index)) for index in range(node.size())]
     if node.isString():

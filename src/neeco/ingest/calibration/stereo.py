@@ -8,6 +8,7 @@ import configparser
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -182,27 +183,22 @@ def _of_ini(path: Path) -> dict[str, Any]:
     for section, side in (("StereoLeft", "left"), ("StereoRight", "right")):
         if not parser.has_section(section):
             raise NeecoError(f"{path}: [{section}]: missing; expected {EXPECTED}")
-        numbers: dict[str, list[float]] = {}
-        for stem, ends in (
-            ("fc", "xy"),
-            ("cc", "xy"),
-            ("res", "xy"),
-            ("kc", range(8)),
-            ("r", range(9)),
-            ("t", range(3)),
-        ):
-            texts = [parser[section].get(f"{stem}_{end}") for end in ends]
+        values, numbers = parser[section], dict[str, list[float]]()
+        ranges = {"fc": "xy", "cc": "xy", "res": "xy", "kc": range(8), "r": range(9), "t": range(3)}
+        for stem, ends in ranges.items():
+            keys = takewhile(values.__contains__, (f"{stem}_{end}" for end in ends))  # up to the first gap
+            texts = [values[key] for key in keys]
             try:
-                numbers[stem] = [float(text) for text in texts if text is not None]
+                numbers[stem] = [float(text) for text in texts]
             except ValueError:
-                what = f"{printable(', '.join(map(str, texts)))} are not all numbers; save the calibration again"
+                what = f"{printable(', '.join(texts))} are not all numbers; save the calibration again"
                 raise NeecoError(f"{path}: [{section}] {stem}_: {what}") from None
             if stem in ("fc", "cc") and len(numbers[stem]) != 2:
                 raise NeecoError(f"{path}: [{section}] {stem}_x, {stem}_y: missing; save the calibration again")
         size = numbers["res"] if len(numbers["res"]) == 2 else [None, None]
         converted[side] = _camera_keys(numbers["fc"], numbers["cc"], numbers["kc"], size)
         if side == "left" and (
-            any(numbers["t"]) or not np.allclose(numbers["r"], np.eye(3).ravel()[: len(numbers["r"])])
+            any(numbers["t"]) or not np.allclose(numbers["r"], np.eye(3).ravel()[: len(numbers["r"])], atol=1e-6)
         ):
             what = "the left camera must be the origin; give the right one's from it"
             raise NeecoError(f"{path}: [StereoLeft] R, T: {what}")

@@ -73,7 +73,7 @@ class BagLimits:
     chunk_bytes: int = 256 << 20  # limit on the unpacked bytes of a chunk; recorders write some MiB
     metadata_bytes: int = 16 << 20
     joints: int = 400  # limit on the joints of one topic
-    bodies: int = 2000  # limit on the bodies of all transforms
+    bodies: int = 2000  # limit on the streams: bodies of all transforms, and topics of the other kinds
     pixels: int = 90_000_000  # limit on the pixels of an image, as for files of images
     min_images: int = 2
     skipped_images: int = 30  # limit on the images read and dropped instead of a seek

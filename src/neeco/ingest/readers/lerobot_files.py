@@ -263,18 +263,32 @@ def read_columns(path: Path, widths: Mapping[str, int], episode: int | None = No
     columns = {}
     for name, width in widths.items():
         try:
-            numbers = np.array(table.column(name).to_pylist() or np.zeros((0, width)))
-            numbers = numbers.astype(np.str_ if numbers.dtype.kind in "SU" else np.float64)
-        except (ValueError, TypeError):  # rows of several lengths, or no numbers
-            numbers = np.array("")
-        if numbers.dtype.kind == "U":
+            numbers = _numbers(table.column(name).combine_chunks()) if len(table) else np.zeros((0, width))
+        except ValueError:
             kind = table.column(name).type
-            raise NeecoError(f"{path}: {name}: holds {kind}, no numbers, as many in each row; name another")
-        columns[name] = numbers.reshape(len(table), math.prod(numbers.shape[1:]))
-        if columns[name].shape[1] != width:
-            problem = f"has {columns[name].shape[1]} numbers a row, not {width}"
+            raise NeecoError(f"{path}: {name}: holds {kind}, no numbers, as many in each row; name another") from None
+        if numbers.shape[1] != width:
+            problem = f"has {numbers.shape[1]} numbers a row, not {width}"
             raise NeecoError(f"{path}: {name}: {problem}; download the data set again")
+        columns[name] = numbers
     return columns
+
+
+def _numbers(column: Any) -> np.ndarray:
+    """Return [R, C] of numbers or of lists of them, all of one length; NaN of what is null. Raises ValueError."""
+    from pyarrow import ExtensionArray, FixedSizeListArray, LargeListArray, ListArray, compute, types
+
+    count = len(column)
+    while isinstance(column, ExtensionArray | ListArray | LargeListArray | FixedSizeListArray):
+        if isinstance(column, ExtensionArray):
+            column = column.storage
+        elif len(compute.list_value_length(column).unique()) > 1:
+            raise ValueError("lists of several lengths")
+        else:
+            column = column.flatten()
+    if not any(is_kind(column.type) for is_kind in (types.is_floating, types.is_integer, types.is_boolean)):
+        raise ValueError("no numbers")
+    return np.asarray(column.to_numpy(zero_copy_only=False), np.float64).reshape(count, -1)
 
 
 def _fragment(path: Path) -> Any:

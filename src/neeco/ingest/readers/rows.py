@@ -15,6 +15,7 @@ from neeco.ingest.readers.columns import JointColumns, PoseColumns, RecognisedCo
 
 DAY_S = 86400.0  # a clock that shows the time of day begins anew
 COUNTERS = (2.0**32, 2.0**16)  # values at which unsigned counters begin anew
+MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"))  # words for no sample
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +24,7 @@ class RowSettings:
 
     min_samples: int = 4  # least rows of a usable log
     max_wrong: float = 0.05  # limit on the share of wrong (not missing) rows; with more, the file is refused
+    max_unreadable: float = 0.5  # limit on the share of rows whose cells are no numbers, nor state that one is missing
     states: int = 8  # number of states listed in the notes on dropped rows
     max_same_time: float = 0.5  # limit on the share of rows at the time of another; with more, the times are too coarse
     stuck_s: float = 0.5  # time in s without change of a pose, which a tracker's noise rules out,
@@ -116,18 +118,33 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, recognised: Recog
 
 
 def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
-    """Return numbers [R, C], and drop rows without all of them. Raises NeecoError when no row is left."""
+    """Return numbers [R, C], and drop rows without all of them. Raises NeecoError when most are unreadable, or when no
+    row is left."""
     table, values = rows.table, numbers(rows.table, names)
-    lacking = np.argwhere(np.isnan(values) & rows.keep[:, None])
-    if len(lacking):
-        row, slot = lacking[0].tolist()
+    lacking, unreadable = dict[int, str](), dict[int, str]()  # the first such cell of each row, in words
+    for row, slot in np.argwhere(np.isnan(values) & rows.keep[:, None]).tolist():
         cell = str(table.rows[row, column_index(table, names[slot])])
-        first = f"{names[slot]} is {printable(cell, 24)}, not a number"
-        rows.drop(np.isnan(values).any(axis=1), f"values are missing, first: {first}")
-        if not rows.keep.any():
-            what = f"{table.record} {table.lines[row]}: {first}, and no row has values of {', '.join(names)}"
-            raise NeecoError(f"{table.where}: {what}; name other columns or another file in the recording")
+        for found in (lacking, unreadable) if not _is_readable(cell) else (lacking,):
+            found.setdefault(row, f"{names[slot]} is {printable(cell, 24)}, not a number")
+    rows.drop(list(lacking), f"values are missing, first: {next(iter(lacking.values()), '')}")
+    too_many = len(unreadable) > max(3, SETTINGS.max_unreadable * (len(unreadable) + rows.keep.sum()))
+    if too_many or (lacking and not rows.keep.any()):
+        row, first = next(iter((unreadable if too_many else lacking).items()))
+        what = f"{table.where}: {table.record} {table.lines[row]}: {first}"
+        if too_many:
+            similar = f"{len(unreadable)} of {counted(len(table.rows), 'row')} like it"
+            raise NeecoError(f"{what} ({similar}); name other columns or repair the file")
+        what = f"{what}, and no row has values of {', '.join(names)}"
+        raise NeecoError(f"{what}; name other columns or another file in the recording")
     return values
+
+
+def _is_readable(cell: str) -> bool:
+    """Return whether a cell holds a number, also one that stands for none, or a word for a missing sample."""
+    try:
+        return cell.lower() in MISSING or ("_" not in cell and float(cell) is not None)
+    except ValueError:
+        return False
 
 
 def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:

@@ -42,9 +42,7 @@ class ArticulationSettings:
     max_gate_width_mm: float = 1e6  # the same, of the gate's width
     side_logits: float = 2.0  # per shaft radius by which a Gaussian lies on the wrong side of a joint
     side_start: float = 0.4  # shaft radii beyond the pivot where sides change
-    prongs: float = (
-        0.7  # shaft radii by which they change farther out at the ends of the axis, which hold the next link
-    )
+    prongs: float = 0.7  # shaft radii by which they change farther out at the axis's ends, which hold the next link
     prongs_from: float = 0.3  # shaft radii along the axis, where that begins
     prongs_to: float = 0.7  # shaft radii along the axis, where it is reached
     min_step_mm: float = 1.0  # between two pivots that define a direction

@@ -70,9 +70,12 @@ def labelled_count(word: str, frames: int) -> int:
 
 
 def labelled_frames(frames: int, count: int, fold: int) -> list[int]:
-    """Choose the `count` of so many recorded frames that are labelled in a fold, in their order: the additive
-    recurrence of the golden ratio from a start of the fold's own, whose first points are spread evenly whatever their
-    number (Steinhaus' three-gap theorem); of a frame taken already the next one."""
+    """Choose the `count` of so many recorded frames that are labelled in a fold, in their order.
+
+    Those of a smaller count are among those of a larger one, and the same for every condition and model of a fold: the
+    additive recurrence of the golden ratio from a start of the fold's own, whose first points are spread evenly
+    whatever their number (Steinhaus' three-gap theorem); of a frame taken already the next one.
+    """
     start = np.random.default_rng(np.random.SeedSequence([fold, 0])).random()
     free = np.ones(frames, bool)
     for k in range(count):
