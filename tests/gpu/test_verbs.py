@@ -170,3 +170,9 @@ def test_the_viewer_says_that_a_gpu_failed_and_goes_on(run: str, monkeypatch: py
 def test_demo(verb: Call) -> None:
     verb("demo", "--minutes", "0.05", "--output", "demo")
     assert Path("demo/run/report.html").exists()
+
+
+@slowly
+def test_ablate(verb: Call, capture: str) -> None:
+    verb("ablate", capture, "--tables", "kinematic", "--iterations", "3", "--output", "out")
+    assert Path("out/report.html").exists()

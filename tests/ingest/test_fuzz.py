@@ -7,14 +7,21 @@ import pytest
 from damaged_files import refusals
 
 from neeco.base.errors import NeecoError
+from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.readers.video import open_video
+from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.template import write_template
 
 POSES, COUNTS, TABLE = "instrument.csv", "jaw.csv", "table.csv"
 CELLS = ["", "nan", "inf", "-inf", "1e300", "1e19", "0", "-1", "x", "1,5", '"', "1e400", "\u00e9", "=1+1", "0x1F"]
 NAMES = ["", "t", "time", "t_ns", "x_m", "qx", "x_mm", "Frame", "State", "q0", "roll", "t_s#2", "\u00b5", "12"]
+YAML = [
+    "", "null", "[]", "{}", "3", "-1", ".nan", ".inf", "1e999", "'x'", "[1, 2]", "{a: 1}", "*a", "!!python/none", "@",
+    "yes", "2020-13-45", "video.mp4", "..", "/", "'\\0'", '"\\0"', "[[1]]", "10" * 30, "&a [*a]",
+]  # fmt: skip
 
 
 def cut(lines, pick):
@@ -130,3 +137,29 @@ def test_no_bytes_of_a_film_make_reading_raise(world):
         assert len(list(video.read(range(len(video.times))))) == len(video.times)
 
     refusals([path], [read], 40)
+
+
+@pytest.mark.parametrize("seed", range(120))
+def test_no_recording_makes_reading_raise(folder, seed):
+    (folder / "video.mp4").write_bytes(b"film")
+    lines = write_template(folder).splitlines()
+    lines = [line for line in lines if line.strip() and not line.startswith("#")]
+    pick = np.random.default_rng(seed)
+    for _ in range(int(pick.integers(1, 4))):
+        row = int(pick.integers(0, len(lines)))
+        key, colon, _ = lines[row].partition(":")
+        match int(pick.integers(0, 4)):
+            case 0:
+                del lines[row]
+            case 1:
+                lines[row] = key[1:] + lines[row][len(key) :]
+            case 2:
+                lines.insert(row, lines[int(pick.integers(0, len(lines)))])
+            case _:
+                lines[row] = f"{key}{colon} {pick.choice(YAML)}"
+        if not lines:
+            break
+    (folder / "recording.yaml").write_text("\n".join(lines), encoding="utf-8")
+    refused(lambda: read_recording(folder / "recording.yaml"), "recording.yaml")
+    (folder / "lens.yaml").write_text("\n".join(lines).replace("video", "camera_matrix"), encoding="utf-8")
+    assert refused(lambda: read_lens(folder / "lens.yaml"), "lens.yaml")

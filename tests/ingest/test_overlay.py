@@ -63,3 +63,7 @@ def test_what_the_border_hides_anyway_does_not_count() -> None:
     pictures, where = with_console(scene(3.0))
     visible = ~ndimage.binary_dilation(where, iterations=6)
     assert find_overlay(pictures, visible) is None
+
+
+def test_few_images_decide_nothing() -> None:
+    assert find_overlay(with_console(scene(3.0))[0][:5], None) is None

@@ -11,6 +11,7 @@ import pytest
 from bag_world import KINDS, BagWriter, known, refusal
 from scipy.spatial.transform import Rotation
 
+from neeco.base.errors import NeecoError
 from neeco.ingest.readers import (
     Kind,
     VideoSource,
@@ -442,3 +443,18 @@ def test_an_mcap_file_need_not_name_a_profile_and_other_messages_are_called_what
     else:
         said = refusal(lambda: known(path).streams(path))
         assert "/psm1 (geometry_msgs/PoseStamped) is written as own, not as cdr" in said
+
+
+@pytest.mark.parametrize(
+    ("baseline", "left", "right", "words"),
+    [
+        (0.0, "left", "right", "/stereo/right/camera_info: projection_matrix: has no baseline (its 4th number is 0)"),
+        (0.0055, "right", "left", "/stereo/right/camera_info: projection_matrix: has a baseline, so it is the right"),
+        (0.5, "left", "right", "/stereo/right/camera_info: T: 0.5 long, which is no stereo scope's"),
+    ],
+)
+def test_a_calibration_of_no_stereo_scope_is_refused(tmp_path, baseline, left, right, words):
+    path = write_stereo(tmp_path, baseline=baseline)
+    with pytest.raises(NeecoError) as caught:
+        known(path).stereo(path, f"/stereo/{left}/image_raw", f"/stereo/{right}/image_raw")
+    assert words in str(caught.value)

@@ -16,6 +16,7 @@ from articulated_worlds import Tree, assert_same_as_definition, hinges, make_wor
 
 from neeco.base.errors import NeecoError
 from neeco.geometry.rotations import quat_to_matrix
+from neeco.raster import kernels
 from neeco.raster.articulated import MAX_JOINTS, ArticulatedBody, pose_bodies
 from neeco.raster.native import set_threads
 
@@ -170,3 +171,13 @@ def test_a_body_of_too_many_joints_is_refused() -> None:
     world = make_world((2,), (hinges(MAX_JOINTS + 1),))
     with pytest.raises(NeecoError, match="a body of 32 joints and 33 links; at most 31 and 32"):
         posed(world, torch.float32)
+
+
+def test_plain_torch_takes_the_place_of_the_kernel() -> None:
+    world = make_world((20, 20), (None, hinges(1)), roll=1.0)
+    native = posed(world, torch.float32)
+    with kernels("torch"):
+        plain = posed(world, torch.float32)
+    for a, b in zip(native[0], plain[0], strict=True):
+        assert torch.allclose(a, b, atol=1e-5)
+    assert any(not torch.equal(a, b) for a, b in zip(native[0], plain[0], strict=True))

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from threading import Thread
 
 import pytest
 import torch
 
+sys.path.insert(0, str(Path(__file__).parent))
+from raster_scenes import draw, leaves, make_scene
+
 from neeco.base.errors import NeecoError
-from neeco.raster import kernels
+from neeco.raster import kernels, rasterize
 from neeco.raster.devices import CachedPredicate, constant, tf32_products
-from neeco.raster.native import runs_native
+from neeco.raster.losses import photometric_loss
+from neeco.raster.native import Family, runs_native, torch_threads
+from neeco.raster.optimizer import adam_step
 from neeco.raster.triton import ready
 
 CPU, CUDA, META = torch.device("cpu"), torch.device("cuda"), torch.device("meta")
@@ -73,6 +80,40 @@ def test_kernels_are_launched_for_float32_on_cuda_devices_alone(monkeypatch: pyt
     finally:
         ready.require_triton.cache_clear()
         ready.starts_on.cache_clear()
+
+
+LEARNED = {"means": 0.02, "quats": 0.002, "scales": 0.01, "opacities": 0.002, "sh": 0.01, "falloff": 0.01}
+
+
+def train(family: Family, steps: int) -> tuple[list[float], dict[str, torch.Tensor]]:
+    """Losses and end of Gaussians that learn to look like others."""
+    scene, other = (make_scene(30, 4, 0, seed=seed, width=24, height=20) for seed in (1, 2))
+    target = draw(other, torch.float32, "cpu", torch.ones(20, 24))[0].color.detach().clamp(0, 1)
+    mask = torch.ones(20, 24, dtype=torch.bool)
+    mask[:5] = False
+    t, gaussians, camera = leaves(scene, torch.float32)
+    moments = {name: torch.zeros(2, *t[name].shape) for name in LEARNED}
+    losses = []
+    with kernels(family), torch_threads(1):
+        for step in range(1, steps + 1):
+            loss = photometric_loss(rasterize(gaussians, camera).color, target, mask, 0.2)
+            loss.backward()
+            losses.append(float(loss.detach()))
+            for name, lr in LEARNED.items():
+                adam_step(t[name].detach(), t[name].grad, *moments[name], lr=lr, step=step)
+                t[name].grad = None
+    return losses, t
+
+
+def test_two_hundred_steps_learn_the_same() -> None:
+    native, ended_native = train("native", 200)
+    plain, ended_plain = train("torch", 200)
+    assert native[-1] < 0.8 * native[0], "there is something to learn"
+    assert plain[:20] == pytest.approx(native[:20], rel=1e-4)
+    assert plain == pytest.approx(native, rel=0.02)  # rounding grows from step to step
+    assert plain != native, "the switch switches"
+    for name in LEARNED:
+        assert (ended_plain[name] - ended_native[name]).norm() < 0.05 * ended_native[name].norm(), name
 
 
 def test_the_switch_holds_for_its_block_and_its_thread() -> None:

@@ -284,3 +284,13 @@ def test_depth_maps_are_alpha_and_depth_of_the_whole_rendering(simd: str) -> Non
         assert float(whole.alpha.max()) > 0.9
         assert torch.equal(layer.alpha, whole.alpha)
         assert torch.equal(layer.depth, whole.depth)
+
+
+def test_kernels_and_reference_cast_the_same_shadow() -> None:
+    gaussians = scene(torch.tensor([12.0, 5.0, 1.0]), sh_count=4)
+    camera = replace(CAMERA, fx=40.0, fy=40.0, cx=20.0, cy=16.0, width=40, height=32)
+    with torch.no_grad():
+        ours, theirs = (rasterize(gaussians, camera, backend=backend).color for backend in ("cpu", "reference"))
+        unlit = rasterize(replace(gaussians, headlight=None), camera, backend="cpu").color
+    assert float((ours - theirs).abs().max()) < 1e-3
+    assert float((ours - unlit).abs().max()) > 0.1

@@ -24,9 +24,10 @@ from worker_tasks import seen_gpu
 from neeco.base import workers
 from neeco.base.errors import NeecoError
 from neeco.base.settings import with_fields
+from neeco.capture import read_capture
 from neeco.scene.training_session import UNLIMITED
 from neeco.studies import study
-from neeco.studies.study import check_workers, run_jobs
+from neeco.studies.study import check_workers, run_jobs, threads_per_worker
 from neeco.studies.training_job import Curve, phase_1_psnr, psnr_at
 from neeco.training import train as train_module
 from neeco.training.run import checkpoint_path, write_config
@@ -424,3 +425,25 @@ def test_psnr_at_a_share_of_the_run_is_the_nearest_row_of_its_split() -> None:
     curve.append({"split": "unseen", "progress": 0.2, "psnr": 1.0})
     assert psnr_at(curve, "test", 0.2) == pytest.approx(20.17)
     assert psnr_at(curve, "test", 0.4) is None
+
+
+def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
+    from neeco.training.run import load_run
+
+    job = make_job("kinematic")  # the bar has no joint to find a wrist by
+    result = job.run()
+    assert float(load_run(job.folder).scene.deformation.articulations[0].wrist_start) == float("-inf")
+    assert result["splits"]["test"]["psnr"] > 5
+
+
+def test_workers_share_the_cores(monkeypatch) -> None:
+    monkeypatch.setattr(study, "usable_cores", lambda: 8)
+    assert [threads_per_worker(workers) for workers in (1, 2, 3, 16)] == [8, 4, 2, 1]
+
+
+def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:
+    made = read_capture(capture)
+    gaussians, field = (Curve(capture / "curve.jsonl", made, ("train",), field=kind) for kind in (False, True))
+    assert len(field.frames["train"]) < len(gaussians.frames["train"])
+    assert len(field.shares) < len(gaussians.shares)
+    assert field.shares[-1] == gaussians.shares[-1] == 1  # both end with the finished scene

@@ -122,3 +122,19 @@ def test_users_of_what_went_are_told_what_to_type(tmp_path: Path, capsys: pytest
     assert "neeco train --method 3dgs FOOTAGE --output RUN2" in capsys.readouterr().err
     assert main(["track", "run", str(video), "--output", output]) == 1
     assert f"neeco ingest --video {video} --output FOOTAGE" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("what", ["no instrument", "black"])
+def test_footage_without_the_instrument_is_trusted_nowhere(tracked_run, other_footage, other_tissue, tmp_path, what):
+    wall = TissueRenderer(other_wall()).render(CAMERA, None)
+    frames = []
+    for frame in other_footage.frames[:2]:
+        path = tmp_path / f"{frame.name}.png"
+        write_image(path, wall if what == "no instrument" else torch.zeros_like(wall))
+        frames.append(replace(frame, image_path=path))
+    footage = replace(other_footage, frames=tuple(frames))
+    tracked = track_footage(tracked_run, footage, tmp_path / "out", tissue=other_tissue)
+    assert tracked.written == 0
+    assert max(rec["trust"]["value"] for rec in tracked.records) < 0.5
+    with pytest.raises(NeecoError, match=r"no frame has a trust of"):
+        tracked.require_trusted()

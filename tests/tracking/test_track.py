@@ -247,7 +247,7 @@ def test_an_instrument_is_found_where_nothing_is_known(tracked_run, footage, tmp
 def test_footage_without_the_instrument_is_trusted_nowhere(tracked_run, footage, tmp_path):
     wall = TissueRenderer(tracked_run.scene).render(CAMERA, None)
     frames = []
-    for k, pixels in enumerate((wall, 1 - wall)):
+    for k, pixels in enumerate((wall, torch.zeros_like(wall), 1 - wall)):
         path = tmp_path / f"{k}.png"
         write_image(path, pixels)
         frames.append(replace(footage.frames[k], image_path=path, state=State({}, k / 25)))

@@ -310,3 +310,23 @@ def test_rows_that_a_full_disk_cut_off_are_written_again(unfinished, tmp_path):
     train(capture, tmp_path / "cut", CONFIG, resume=True)
     rows = [json.loads(line) for line in (tmp_path / "cut" / "metrics.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows] == list(range(5, 61, 5))
+
+
+def test_a_capture_that_changed_is_not_trained_on(capture, tmp_path, capsys):
+    words = ["train", str(capture), "--output", str(tmp_path / "run"), "--method", "3dgs", "--iterations", "60"]
+    with pytest.raises(KeyboardInterrupt):
+        train(
+            capture,
+            tmp_path / "run",
+            training_config("3dgs", {"iterations": 60}, ["log_interval=5"]),
+            progress=interrupt,
+        )
+    image = capture / "images" / "000003.png"
+    content = image.read_bytes()
+    Image.new("RGB", (32, 24)).save(image)
+    assert main([*words, "--resume"]) == 1
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert f"config.yaml: capture: {capture} has changed since this run was begun; put its files back" in told
+    assert not (tmp_path / "run" / "scene.safetensors").exists()
+    image.write_bytes(content)
+    assert main([*words, "--resume"]) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
+from neeco.capture import read_capture
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
 from neeco.methods.kinematic.deformation import observe_silhouettes
@@ -19,6 +21,9 @@ from neeco.methods.kinematic.finish import drop_refuted
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
+from neeco.scene.training_views import TrainingViews
+from neeco.training.config import training_config
+from neeco.training.initial import begin_session
 from neeco.training.session import GaussianSession
 from neeco.training.silhouettes import INSTRUMENT, UNKNOWN, Silhouettes
 
@@ -181,3 +186,22 @@ def test_what_training_images_refute_is_dropped_within_the_uncertainty_of_their_
     assert (float(columns.min()), float(columns.max())) == pytest.approx((32.5, 62.0), abs=1)
     assert (float(kept.min()) > 33.5) == dropped  # the image shows the instrument in columns 36 .. 61
     assert int(((columns > 38) & (columns < 59)).sum()) == int(((kept > 38) & (kept < 59)).sum())
+
+
+def test_a_checkpoint_brings_them_back(capture: Path) -> None:
+    views = TrainingViews.read(read_capture(capture).split("train"))
+    first, second = (
+        begin_session(
+            read_capture(capture), views, training_config("nps", {"iterations": 20}, ["deformation.width=16"]), print
+        )
+        for _ in range(2)
+    )
+    frames = (torch.arange(6, dtype=torch.uint8).view(2, 3), torch.arange(8, dtype=torch.uint8).view(4, 2))
+    second.restore(*first.pack())
+    assert second.silhouettes is None
+    first.silhouettes = Silhouettes(frames, 0.0125)
+    second.restore(*first.pack())
+    back = second.silhouettes
+    assert back is not None
+    assert back.noise == 0.0125
+    assert all(torch.equal(a, b) for a, b in zip(back.values, frames, strict=True))

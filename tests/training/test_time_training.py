@@ -11,6 +11,8 @@ from capture_files import write_capture
 
 from neeco.base.errors import NeecoError
 from neeco.methods.hexplane import HexPlane
+from neeco.methods.time_mlp import TimeMLP
+from neeco.scene.deformation import UNPERTURBED
 from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train
@@ -72,3 +74,23 @@ def test_planes_are_regularised_from_the_moment_they_wake(tmp_path: Path, monkey
     config = training_config("4dgs", {"iterations": 34}, SMALL["4dgs"])
     train(write_capture(tmp_path / "capture"), tmp_path / "run", config)
     assert asked == [False] * 29  # resting while done / 34 < 3 / 17: through the fifth step
+
+
+def test_training_disturbs_the_time_until_half_of_the_run_and_drawing_never_does(tmp_path, monkeypatch):
+    asked: list[tuple[bool, float]] = []
+    real = TimeMLP.pose
+
+    def pose(self, canonical, state, perturbation=UNPERTURBED):
+        asked.append(
+            (torch.is_grad_enabled() and canonical.means.requires_grad, getattr(perturbation, "time_noise", 0.0))
+        )
+        return real(self, canonical, state, perturbation)
+
+    monkeypatch.setattr(TimeMLP, "pose", pose)
+    config = training_config("deformable-3dgs", {"iterations": 10}, SMALL["deformable-3dgs"])
+    scene = load_run(train(write_capture(tmp_path / "capture"), tmp_path / "run", config)).scene
+    trained = [noise for training, noise in asked if training]
+    assert trained == pytest.approx([0.08, 0.06, 0.04, 0.02, 0, 0, 0, 0, 0, 0], abs=1e-9)
+    asked.clear()
+    scene.at(scene.recorded.states[0])
+    assert asked == [(False, 0.0)]

@@ -109,3 +109,15 @@ def test_what_two_servers_keep_at_once_is_all_kept(loaded: LoadedRun, tmp_path: 
     assert sorted(counts) == list(range(1, 9))
     assert len(servers[0].read(loaded)) == 8
     assert len(set(images)) == 2
+
+
+def test_what_was_kept_before_stays(saved: SavedStates, loaded: LoadedRun, tmp_path: Path) -> None:
+    saved.add(loaded, some_state(loaded), VIEW)
+    before = saved.states_path.read_text()
+    assert SavedStates(tmp_path / "run").add(loaded, some_state(loaded, roll=1.0), VIEW) == 2
+    assert saved.states_path.read_text().startswith(before)
+
+
+def test_images_are_numbered_on(saved: SavedStates, loaded: LoadedRun) -> None:
+    names = [saved.save_image(loaded, some_state(loaded, roll=roll), VIEW).name for roll in (0.0, 0.5)]
+    assert names == ["000000.png", "000001.png"]

@@ -260,3 +260,8 @@ def test_a_size_asked_for_is_rendered_whatever_it_takes() -> None:
     assert asked.height(True, 2000, 1.6) == 1280
     assert asked.height(True, 900, 1.6) == 900  # all that the window shows
     assert asked.height(False, 2000, 1.6) < 100
+
+
+def test_a_taken_port_gives_the_next_one(made_run: Path, serve: Serve) -> None:
+    first = port_of(serve(made_run))
+    assert port_of(serve(made_run, port=first)) > first
