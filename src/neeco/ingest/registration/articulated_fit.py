@@ -10,6 +10,7 @@ motion of the shaft would seem to determine the base far better than it does.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
@@ -17,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.ingest.foreground.silhouettes import SHAFT_LINES, border_of
-from neeco.ingest.registration.silhouette_fit import POSE_SDS, BasePrior
-from neeco.ingest.registration.silhouette_model import (
+from neeco.ingest.registration.logged import (
     BASE,
     CLOCK_SHIFTS_S,
+    BasePrior,
     LoggedSilhouettes,
     moved_base,
     poses_at_clock,
@@ -46,16 +47,20 @@ class ArticulatedFitSettings:
     damping: float = 1e-2  # initial Levenberg-Marquardt damping
     tolerance: float = 1e-4  # share of the cost below which steps end
     pose_blocks: int = 2  # blocks of the recording after which errors of logged poses are independent
+    # errors of a log's poses that last, rad and mm along each axis: trackers and robots drift by 0.2 to 0.4 mm
+    pose_sd_rad: float = 0.0015
+    pose_sd_mm: float = 0.3
 
 
 LINKED_FIT = ArticulatedFitSettings()
 
+POSE_SDS = np.repeat([LINKED_FIT.pose_sd_rad, LINKED_FIT.pose_sd_mm], 3)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArticulatedProblem(LoggedSilhouettes):
-    """Silhouettes, joint values at the clocks of the poses, and the model that is to explain them."""
+    """Silhouettes, and joint values at the clocks of the poses."""
 
-    model: ArticulatedModel
     contours: np.ndarray  # [F, N, 2] px of the masks' outlines; NaN: no point
     readings: dict[str, np.ndarray]  # [S, F] by name
     values: np.ndarray  # [S, F, 2 L] of all links' joints, rad or mm, as `with_motion` has them
@@ -75,16 +80,22 @@ class ArticulatedProblem(LoggedSilhouettes):
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ArticulatedFit:
-    """A base, the clock s by which the log is ahead, and the model's parameters [P]."""
+    """A base, the clock s by which the log is ahead, and a model of the instrument with its parameters [P]."""
 
+    model: ArticulatedModel
     world_from_base: np.ndarray
-    clock: float
     parameters: np.ndarray
+    clock: float = 0.0
     pose_errors: np.ndarray | None = None  # [F, 6] rad, mm: turns about the root, shifts, world; None: not fitted
     cost: float = np.inf  # robust loss of the residuals and the priors' squares
     residual_px: float = np.inf  # median
+
+    @classmethod
+    def start(cls, model: ArticulatedModel, world_from_base: np.ndarray) -> Self:
+        """A model as expected, in some base."""
+        return cls(model=model, world_from_base=world_from_base, parameters=model.means.copy())
 
 
 def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
@@ -122,12 +133,12 @@ def outlines(problem: ArticulatedProblem, fit: ArticulatedFit) -> Outlines:
         root[:, :3, 3] += fit.pose_errors[:, 3:]
     root = problem.camera_from_world @ root
     values = poses_at_clock(problem.values, fit.clock)
-    return problem.model.outlines(fit.parameters, values, root, problem.silhouettes.intrinsics)
+    return fit.model.outlines(fit.parameters, values, root, problem.silhouettes.intrinsics)
 
 
 def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
-    projected, owner = outlines(problem, fit), problem.model.owner
-    points = problem.model.outline_points(projected)
+    projected, owner = outlines(problem, fit), fit.model.owner
+    points = fit.model.outline_points(projected)
     others = projected.distances(points)[0]
     others[:, owner, np.arange(len(owner))] = -1e3
     others[:, 1, owner == 0] = others[:, 0, owner == 1] = -1e3  # the tube continues in its end
@@ -140,7 +151,7 @@ def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
 def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points) -> np.ndarray:
     """Residuals [F, N + M] px: positive where the model is too small."""
     projected = outlines(problem, fit)
-    ahead, _ = problem.silhouettes.look_up(problem.model.outline_points(projected))
+    ahead, _ = problem.silhouettes.look_up(fit.model.outline_points(projected))
     back = -projected.distances(use.contours)[0].max(1)
     return np.concatenate([np.where(use.model, ahead, 0.0), np.where(use.masks, back, 0.0)], 1)
 
@@ -150,17 +161,18 @@ def moved(problem: ArticulatedProblem, fit: ArticulatedFit, step: np.ndarray) ->
     count = BASE + len(fit.parameters)
     errors = fit.pose_errors
     return ArticulatedFit(
-        moved_base(fit.world_from_base, problem.pivot(fit.world_from_base), step[:6]),
-        float(np.clip(fit.clock + step[6], CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])),
-        fit.parameters + step[BASE:count],
-        errors if errors is None or len(step) == count else errors + step[count:].reshape(errors.shape),
+        model=fit.model,
+        world_from_base=moved_base(fit.world_from_base, problem.pivot(fit.world_from_base), step[:6]),
+        parameters=fit.parameters + step[BASE:count],
+        clock=float(np.clip(fit.clock + step[6], CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])),
+        pose_errors=errors if errors is None or len(step) == count else errors + step[count:].reshape(errors.shape),
     )
 
 
 def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, free: np.ndarray) -> np.ndarray:
     """Derivatives [F, N + M, free] of the residuals, through those of the cones' images; and where poses' errors are
     fitted, by those of the own frame [F, N + M, free + 6]."""
-    projected, model = outlines(problem, fit), problem.model
+    projected, model = outlines(problem, fit), fit.model
     _, slope = problem.silhouettes.look_up(model.outline_points(projected))
     distances, places, ways = projected.distances(use.contours)
     nearest = distances.argmax(1)
@@ -226,7 +238,7 @@ def _scores(columns: np.ndarray, weighted: np.ndarray, free: int) -> np.ndarray:
 def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np.ndarray, np.ndarray]:
     """Residuals [BASE + P] of all priors in standard deviations, and the inverse standard deviations [BASE + P]; with
     poses' errors [BASE + P + 6 F]."""
-    model = problem.model
+    model = fit.model
     off, sds = problem.prior.offsets(problem, fit.world_from_base, fit.clock)
     off, sds = np.append(off, fit.parameters - model.means), np.append(sds, model.sds)
     if fit.pose_errors is not None:
@@ -234,9 +246,8 @@ def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[n
     return off * (1 / sds), 1 / sds
 
 
-def _free(problem: ArticulatedProblem, rough: bool = False) -> np.ndarray:
+def _free(problem: ArticulatedProblem, model: ArticulatedModel, rough: bool = False) -> np.ndarray:
     """Parameters that are fitted; rough: base, clock and the most important of the model's."""
-    model = problem.model
     count = BASE + len(model.means)
     free = np.isin(np.arange(count), [*range(BASE), BASE + model.tube, BASE + model.mean_length]) | (not rough)
     free[6] = problem.prior.sd_clock > 0
@@ -255,8 +266,8 @@ def minimise(
     problem: ArticulatedProblem, fit: ArticulatedFit, width: float, max_steps: int = 12, *, rough: bool = False
 ) -> ArticulatedFit:
     """The nearest fit under a Cauchy loss of a width px (of masks 160 wide); rough: of few parameters."""
-    free, width, noise = _free(problem, rough), width * problem.px_scale, LINKED_FIT.noise_px * problem.px_scale
-    sds = problem.model.sds
+    free, sds = _free(problem, fit.model, rough), fit.model.sds
+    width, noise = width * problem.px_scale, LINKED_FIT.noise_px * problem.px_scale
     count = BASE + len(sds)
 
     def linearise(fit: ArticulatedFit) -> Linearisation[ArticulatedFit]:
@@ -318,7 +329,7 @@ def with_pose_errors(problem: ArticulatedProblem, fit: ArticulatedFit, max_steps
 def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     """Covariance [BASE + P, BASE + P] at a minimum, with outlines' and poses' errors that are correlated within the
     recording's blocks (sandwich estimator); the clock's rows are 0 where it is known."""
-    free, px_scale = _free(problem), problem.px_scale
+    free, px_scale = _free(problem, fit.model), problem.px_scale
     width, noise = LINKED_FIT.widths_px[-1] * px_scale, LINKED_FIT.noise_px * px_scale
     use = _points(problem, fit)
     px = _residuals(problem, fit, use)
@@ -326,7 +337,7 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     weights = _weights(px, width, noise)
     scores = _scores(columns, weights * px, len(free))
     scale = prior_residuals(problem, fit)[1]
-    count = BASE + len(problem.model.means)
+    count = BASE + len(fit.parameters)
     prior = np.diag(scale[free] ** 2)
     prior_information = np.diag(np.append(scale[free], scale[count:]) ** 2)
     inverse = np.linalg.inv(_information(columns, weights, len(free)) + prior_information)[: len(free)]
