@@ -145,7 +145,7 @@ def test_the_bend_of_a_wrist_tells_the_place_along_the_shaft(masks):
         blocks=np.arange(len(rows)) // 2,
         prior=BasePrior.of((given, 5.0, 3.0), 0.1),
     )
-    fit = fit_articulated(problem, ArticulatedFit.start(model, given), max_steps=8)
+    fit = fit_articulated(problem, ArticulatedFit.start(model, given).in_frames(problem), max_steps=8)
     turn, shift = _off(fit.world_from_base)
     sd = np.sqrt(np.diag(covariance(problem, fit)))
     assert np.abs(shift).max() < 1.2

@@ -41,6 +41,17 @@ def test_a_base_8_mm_and_5_degrees_off_is_found_with_its_clock():
     assert np.all(np.abs(off[:3]) < 2.5 * found.sd_mm)
 
 
+def test_a_base_is_found_although_a_wrist_bends_of_which_nothing_is_stated():
+    world = make_world(FRAMES, bends=True)
+    given = disturbed(8, 5, 1, world)
+    found = _find(world, (given, *ROUGH))
+    beside, _, degrees = errors(found.world_from_base, world.poses_at(0.0))
+    assert beside < 1.2
+    assert degrees < 2.5  # as the log is 3.5 s long
+    assert beside < 2 * found.sd_motion_mm < 6
+    assert found.overlap > 0.85 > found.overlap_before + 0.1
+
+
 @pytest.mark.slow
 def test_what_pure_insertion_leaves_open_is_said_and_stays_as_given():
     world = make_world(FRAMES, pure_insertion=True)

@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from neeco.base.errors import NeecoError
-from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
+from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
 from neeco.capture.model import evenly_spaced
 from neeco.geometry.lines import frame_about, nearest_point, unit
 from neeco.geometry.rotations import rigid
@@ -54,7 +55,7 @@ from neeco.ingest.registration.logged import (
     step_between,
 )
 from neeco.ingest.registration.silhouette_search import distance_to, search_bases
-from neeco.states.outline_model import ArticulatedModel, bends, joint_values, with_motion
+from neeco.states.outline_model import MODEL, ArticulatedModel, bends, joint_values, with_motion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,17 +85,21 @@ class ArticulatedSettings:
     exchanged_shares: tuple[float, float] = (0.37, 0.61)  # of the recording, by which poses are shifted for comparison
     clock_sd_s: float = 0.1  # standard deviation of a clock that nothing gives
     # of an instrument without links that bend: a tube, of which lines and tips in masks give a first guess, and a head
-    # minimum ratio of the cost with poses of other moments, where the overlap is less than usual: of right ones
-    # 13 to 105, of another moment's at most 5
-    rigid_exchanged: float = 6.0
-    rigid_scatter: float = 2.0  # factor on standard deviations: its shape makes up for slow errors of logs
+    # minimum ratio of the cost with poses of other moments: of right ones 11 to 120, of another moment's at most 6
+    swinging_exchanged: float = 8.0
+    rigid_scatter: float = 1.6  # factor on standard deviations: its shape makes up for slow errors of logs
     head_mm: float = 12.0  # distance from the tip to the tube's end
     head_sd_mm: float = 6.0  # standard deviation of the head's length
+    bend_sd_rad: float = 0.4  # standard deviation of its mean turns
     end_sd_mm: float = 30.0  # standard deviation of the place of the tube's end in the instrument's frame
     tilt_sd_rad: float = 0.5  # standard deviation of the tube's direction there
-    # of the instrument, tried before a camera that stands still: then hardly more than the tip tells how far it is
-    sizes: tuple[float, ...] = (0.85, 1.18)
-    size_sd: float = 0.03  # standard deviation of the logarithm of the size then: wrists and jaws blur the tip
+    # changes of a fit, tried after it: factors on the size before a camera that stands still, as then hardly more than
+    # the tip tells how far the instrument is
+    sizes: tuple[float, ...] = (0.7, 1.4, 0.87, 1.15)
+    end_steps_mm: tuple[float, ...] = (-6.0, 6.0)  # shifts of the tube's end along it
+    clock_steps_s: tuple[float, ...] = (-0.04, 0.04)  # changes of a clock that is not known
+    max_changes: int = 6  # maximum number of times that each of these is made, as long as it improves the fit
+    size_sd: float = 0.04  # standard deviation of the logarithm of the size: wrists and jaws blur the tip
     along_sd_mm: float = 3.0  # standard deviation along the shaft, which a tube hardly determines
     gap_mm: float = 3.0  # length between tube and head
     gap_sd_mm: float = 2.0  # standard deviation of that length
@@ -197,7 +202,7 @@ def problem_of(
     tree = motion.bending
     poses = np.stack([motion.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
     readings: dict[str, np.ndarray] = {}
-    values = np.zeros((*poses.shape[:2], len(_rigid_links(np.zeros(3), np.eye(3)))))
+    values = np.zeros((*poses.shape[:2], len(_swinging_links(np.zeros(3), np.eye(3)))))
     if tree is not None:
         by_shift = [motion.readings_at(float(shift)) for shift in CLOCK_SHIFTS_S]
         readings = {key: np.stack([at[key] for at in by_shift]) for key in tree.readings}
@@ -235,21 +240,48 @@ def _fits(problem: ArticulatedProblem, starts: list[ArticulatedFit]) -> list[Art
     """Fits from different starts, the best first; of similar ones the best."""
     few = problem.take(np.array(evenly_spaced(len(problem.blocks), LINKED.start_frames)))
     rough = bool(problem.readings)  # what is stated of links comes close
-    coarse = [fit_articulated(few, start, LINKED_FIT.widths_px[:2], 10, rough=rough) for start in starts]
-    chosen = _distinct(problem, coarse)[: LINKED.n_refined]
+    coarse = [fit_articulated(few, start.in_frames(few), LINKED_FIT.widths_px[:2], 10, rough=rough) for start in starts]
+    chosen = [fit.in_frames(problem) for fit in _distinct(problem, coarse)[: LINKED.n_refined]]
     fits = [fit_articulated(problem, fit, LINKED_FIT.widths_px[1:]) for fit in chosen]
-    if fits and not rough and problem.still:
+    if fits and not rough:
         best = min(fits, key=lambda fit: fit.cost)
-        others = [_resized(problem, best, factor) for factor in LINKED.sizes]
-        fits += [fit_articulated(problem, fit, LINKED_FIT.widths_px[2:]) for fit in others]
+        for change in _changes(problem):
+            for _ in range(LINKED.max_changes):
+                changed = fit_articulated(problem, change(best), LINKED_FIT.widths_px[2:])
+                fits.append(changed)
+                if changed.cost > best.cost:
+                    break
+                best = changed
     fits = _distinct(problem, fits)
     return [minimise(problem, fits[0], LINKED_FIT.widths_px[-1], 20), *fits[1:]] if fits else []
+
+
+def _changes(problem: ArticulatedProblem) -> list[Callable[[ArticulatedFit], ArticulatedFit]]:
+    """Changes of a tube's fit to which the masks respond little, so that least squares end before they make them."""
+
+    def size(factor: float, fit: ArticulatedFit) -> ArticulatedFit:
+        return _resized(problem, fit, factor)
+
+    def end(shift: float, fit: ArticulatedFit) -> ArticulatedFit:
+        parameters, pivot = fit.parameters.copy(), fit.model.pivots[fit.model.first]
+        assert pivot is not None
+        parameters[pivot : pivot + 3] += shift * fit.model.shaft_axis(parameters)
+        parameters[fit.model.mean_length] = max(parameters[fit.model.mean_length] - shift, MODEL.min_length_mm)
+        return replace(fit, parameters=parameters)
+
+    def clock(shift: float, fit: ArticulatedFit) -> ArticulatedFit:
+        return replace(fit, clock=float(np.clip(fit.clock + shift, CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])))
+
+    changes = [partial(size, factor) for factor in LINKED.sizes if problem.still]
+    changes += [partial(end, shift) for shift in LINKED.end_steps_mm]
+    changes += [partial(clock, shift) for shift in LINKED.clock_steps_s if problem.prior.sd_clock > 0]
+    return changes
 
 
 def _tube_in_world(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np.ndarray, np.ndarray]:
     """Places [F, 3] mm where the tube of an instrument without links ends, and its directions [F, 3]."""
     poses = fit.world_from_base @ poses_at_clock(problem.poses, fit.clock)
-    end = fit.model.link_poses(fit.parameters, np.zeros((1, 2)))[1][fit.model.first][0]
+    end = fit.model.link_poses(fit.parameters, np.zeros((1, 8)))[1][fit.model.first][0]
     return poses[:, :3, :3] @ end + poses[:, :3, 3], poses[:, :3, :3] @ fit.model.shaft_axis(fit.parameters)
 
 
@@ -303,22 +335,29 @@ def searched_starts(problem: ArticulatedProblem, model: ArticulatedModel | None,
     ]
 
 
-def _rigid_links(end: np.ndarray, basis: np.ndarray) -> tuple[Link, ...]:
-    """A tube to `end` [3] mm and a head, which turns as nothing says; basis [3, 3]: columns across and along."""
-    return Link("shaft"), Link("head", "shaft", REVOLUTE, rigid(np.eye(3), end), basis[:, 0])
+def _swinging_links(end: np.ndarray, basis: np.ndarray) -> tuple[Link, ...]:
+    """A tube to `end` [3] mm and a head, which swings as nothing states; basis [3, 3]: columns across and along."""
+    pitch = Link("pitch", "shaft", REVOLUTE, rigid(np.eye(3), end), basis[:, 0], body=False)
+    yaw = Link("yaw", "pitch", REVOLUTE, np.eye(4), basis[:, 1], body=False)
+    return Link("shaft"), pitch, yaw, Link("head", "yaw", PRISMATIC, np.eye(4), basis[:, 2])
 
 
 def _rigid_model(tip: np.ndarray, axis: np.ndarray) -> ArticulatedModel:
     """A tube with a head, of roughly a tip [3] mm and a direction [3] in the instrument's frame."""
-    links = _rigid_links(tip - LINKED.head_mm * axis, frame_about(axis))
+    links = _swinging_links(tip - LINKED.head_mm * axis, frame_about(axis))
     model = ArticulatedModel(KinematicTree(links), np.eye(4)[None])
-    pivot = model.pivots[model.first]
-    assert pivot is not None
     model.axis = axis
-    model.sds[pivot : pivot + 3] = LINKED.end_sd_mm
-    model.sds[model.tilt : model.tilt + 2] = LINKED.tilt_sd_rad
-    model.means[model.ears], model.sds[model.ears] = LINKED.gap_mm, LINKED.gap_sd_mm
-    model.sds[model.mean_length] = LINKED.head_sd_mm
+    pivot, head = model.pivots[model.first], model.cones[-1]
+    assert pivot is not None
+    shape = [*range(model.tube, model.tube + 2), *range(head.radii, head.radii + 4)]
+    sds = np.zeros(len(model.sds))
+    sds[shape] = model.sds[shape]
+    sds[pivot : pivot + 3] = LINKED.end_sd_mm
+    sds[model.tilt : model.tilt + 2] = LINKED.tilt_sd_rad
+    sds[model.ears], sds[model.mean_length] = LINKED.gap_sd_mm, LINKED.head_sd_mm
+    sds[[index for index in model.offsets[1:3] if index is not None]] = LINKED.bend_sd_rad
+    model.sds = sds
+    model.means[model.ears] = LINKED.gap_mm
     return model
 
 
@@ -334,8 +373,7 @@ def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[A
 
 def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
     """Whether poses and readings of other moments explain the masks about as well."""
-    usual = problem.readings or overlap(problem, fit) > LINKED.usual_overlap
-    least = LINKED.min_exchanged if usual else LINKED.rigid_exchanged
+    least = LINKED.min_exchanged if problem.readings else LINKED.swinging_exchanged
     width = LINKED_FIT.widths_px[1]
     for share in LINKED.exchanged_shares:
         by = round(share * len(problem.blocks))
@@ -352,7 +390,7 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], tree: Kinem
     scatter = LINKED.rigid_scatter if tree is None else LINKED.scatter
     spread = scatter**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
-        weight = float(np.exp(-0.5 * (other.cost - fits[0].cost)))
+        weight = float(np.exp(-0.5 * (other.cost - fits[0].cost) / scatter**2))
         off = step_between(best.world_from_base, other.world_from_base, problem.middle)
         spread = spread + weight / (1 + weight) * np.outer(off, off)
     in_view = in_camera(spread, problem.camera_from_world[0])
@@ -410,9 +448,10 @@ def _doubts(
                 f"the base found is {max(off):.1f} standard deviations from the one stated: check its transform, "
                 "axes and unit, and which arm it is of"
             )
+    if tree is None or reversed_:  # nothing is stated, or follows from the reversed joint
+        return doubts
     sds = (fit.parameters - model.means) / model.sds
-    # where a joint is reversed, they follow from it; without links, nothing is stated
-    for index in np.flatnonzero(np.abs(sds) > LINKED.max_sds) if tree is not None and not reversed_ else ():
+    for index in np.flatnonzero(np.abs(sds) > LINKED.max_sds):
         part = model.names[index]
         if part.startswith(("pivot", "offset")) and not any(part in words for words in doubts):
             doubts.append(

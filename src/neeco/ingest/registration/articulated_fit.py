@@ -50,10 +50,15 @@ class ArticulatedFitSettings:
     # errors of a log's poses that last, rad and mm along each axis: trackers and robots drift by 0.2 to 0.4 mm
     pose_sd_rad: float = 0.0015
     pose_sd_mm: float = 0.3
+    # of a head about which nothing is stated, in each frame: standard deviations of its turns, and of its place along
+    # itself, which opening jaws and further joints change
+    swing_sd_rad: float = 0.4
+    slide_sd_mm: float = 2.0
 
 
 LINKED_FIT = ArticulatedFitSettings()
 
+SWING_SDS = np.array([LINKED_FIT.swing_sd_rad, LINKED_FIT.swing_sd_rad, LINKED_FIT.slide_sd_mm])
 POSE_SDS = np.repeat([LINKED_FIT.pose_sd_rad, LINKED_FIT.pose_sd_mm], 3)
 
 
@@ -82,20 +87,49 @@ class ArticulatedProblem(LoggedSilhouettes):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArticulatedFit:
-    """A base, the clock s by which the log is ahead, and a model of the instrument with its parameters [P]."""
+    """A base, the clock s by which the log is ahead, and a model of the instrument with its parameters [P] and what it
+    has of its own in every frame."""
 
     model: ArticulatedModel
     world_from_base: np.ndarray
     parameters: np.ndarray
     clock: float = 0.0
-    pose_errors: np.ndarray | None = None  # [F, 6] rad, mm: turns about the root, shifts, world; None: not fitted
+    swings: np.ndarray  # [F, 3 or 0] rad and mm, added to the values of the first joints: turns and slide of a head
+    pose_errors: np.ndarray  # [F, 6 or 0] rad, mm: turns about the root and shifts, world; 0: not fitted
     cost: float = np.inf  # robust loss of the residuals and the priors' squares
     residual_px: float = np.inf  # median
 
     @classmethod
     def start(cls, model: ArticulatedModel, world_from_base: np.ndarray) -> Self:
-        """A model as expected, in some base."""
-        return cls(model=model, world_from_base=world_from_base, parameters=model.means.copy())
+        """A model as expected, in some base, of no frames yet."""
+        none = np.zeros((0, 0))
+        return cls(
+            model=model,
+            world_from_base=world_from_base,
+            parameters=model.means.copy(),
+            swings=none,
+            pose_errors=none,
+        )
+
+    def in_frames(self, problem: ArticulatedProblem) -> ArticulatedFit:
+        """The fit with what is expected in a problem's frames; where no readings bend the instrument, a head swings."""
+        count, swings = len(problem.blocks), 0 if problem.readings else len(SWING_SDS)
+        return replace(self, swings=np.zeros((count, swings)), pose_errors=np.zeros((count, 0)))
+
+    @property
+    def own(self) -> np.ndarray:
+        """Return what every frame has of its own [F, K]: swings, then errors of poses."""
+        return np.concatenate([self.swings, self.pose_errors], 1)
+
+    def with_own(self, own: np.ndarray) -> ArticulatedFit:
+        """The fit with other values [F, K] of every frame."""
+        swings, pose_errors = np.split(own, [self.swings.shape[1]], axis=1)
+        return replace(self, swings=swings, pose_errors=pose_errors)
+
+    @property
+    def own_sds(self) -> np.ndarray:
+        """Standard deviations [K] of what every frame has of its own."""
+        return np.append(SWING_SDS[: self.swings.shape[1]], POSE_SDS[: self.pose_errors.shape[1]])
 
 
 def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
@@ -127,12 +161,15 @@ class _Points:
 def outlines(problem: ArticulatedProblem, fit: ArticulatedFit) -> Outlines:
     """Project the fit's cones."""
     root = fit.world_from_base @ poses_at_clock(problem.poses, fit.clock)
-    if fit.pose_errors is not None:
+    if fit.pose_errors.size:
         root = root.copy()
         root[:, :3, :3] = Rotation.from_rotvec(fit.pose_errors[:, :3]).as_matrix() @ root[:, :3, :3]
         root[:, :3, 3] += fit.pose_errors[:, 3:]
     root = problem.camera_from_world @ root
     values = poses_at_clock(problem.values, fit.clock)
+    if fit.swings.size:
+        values = values.copy()
+        values[:, 1 : 1 + len(SWING_SDS)] += fit.swings
     return fit.model.outlines(fit.parameters, values, root, problem.silhouettes.intrinsics)
 
 
@@ -157,15 +194,15 @@ def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points) -
 
 
 def moved(problem: ArticulatedProblem, fit: ArticulatedFit, step: np.ndarray) -> ArticulatedFit:
-    """The fit after a step [BASE + P] in its parameters, or [BASE + P + 6 F] with the poses' errors."""
+    """The fit after a step in its parameters [BASE + P], or in these and what every frame has of its own
+    [BASE + P + F K]."""
     count = BASE + len(fit.parameters)
-    errors = fit.pose_errors
-    return ArticulatedFit(
-        model=fit.model,
+    own = fit.own + step[count:].reshape(fit.own.shape) if len(step) > count else fit.own
+    return replace(
+        fit.with_own(own),
         world_from_base=moved_base(fit.world_from_base, problem.pivot(fit.world_from_base), step[:6]),
         parameters=fit.parameters + step[BASE:count],
         clock=float(np.clip(fit.clock + step[6], CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])),
-        pose_errors=errors if errors is None or len(step) == count else errors + step[count:].reshape(errors.shape),
     )
 
 
@@ -200,11 +237,8 @@ def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, fr
     for index in free:
         step = steps[index] * np.eye(len(steps))[index]
         columns.append(slopes(moved(problem, fit, step), moved(problem, fit, -step), steps[index]))
-    errors = fit.pose_errors
-    if errors is not None:
-        for k, step in enumerate(np.diag(steps[:6])):  # all frames at once: each depends on its own pose only
-            plus_fit, minus_fit = replace(fit, pose_errors=errors + step), replace(fit, pose_errors=errors - step)
-            columns.append(slopes(plus_fit, minus_fit, steps[k]))
+    for step in np.diag(LINKED_FIT.parameter_step * fit.own_sds):  # all frames at once: each depends on its own only
+        columns.append(slopes(fit.with_own(fit.own + step), fit.with_own(fit.own - step), step.sum()))
     return np.stack(columns, -1)
 
 
@@ -236,20 +270,22 @@ def _scores(columns: np.ndarray, weighted: np.ndarray, free: int) -> np.ndarray:
 
 
 def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals [BASE + P] of all priors in standard deviations, and the inverse standard deviations [BASE + P]; with
-    poses' errors [BASE + P + 6 F]."""
+    """Residuals [BASE + P + F K] of all priors in standard deviations, and the inverse standard deviations
+    [BASE + P + F K]; 0 of parameters that are not fitted."""
     model = fit.model
     off, sds = problem.prior.offsets(problem, fit.world_from_base, fit.clock)
     off, sds = np.append(off, fit.parameters - model.means), np.append(sds, model.sds)
-    if fit.pose_errors is not None:
-        off, sds = np.append(off, fit.pose_errors), np.append(sds, np.tile(POSE_SDS, len(fit.pose_errors)))
-    return off * (1 / sds), 1 / sds
+    off, sds = np.append(off, fit.own), np.append(sds, np.tile(fit.own_sds, len(fit.own)))
+    scale = np.divide(1, sds, out=np.zeros(len(sds)), where=sds > 0)
+    return off * scale, scale
 
 
 def _free(problem: ArticulatedProblem, model: ArticulatedModel, rough: bool = False) -> np.ndarray:
-    """Parameters that are fitted; rough: base, clock and the most important of the model's."""
+    """Parameters that are fitted, those with a standard deviation; rough: base, clock and the most important of the
+    model's."""
     count = BASE + len(model.means)
     free = np.isin(np.arange(count), [*range(BASE), BASE + model.tube, BASE + model.mean_length]) | (not rough)
+    free[BASE:] &= model.sds > 0
     free[6] = problem.prior.sd_clock > 0
     return np.flatnonzero(free)
 
@@ -321,9 +357,8 @@ def fit_articulated(
 
 def with_pose_errors(problem: ArticulatedProblem, fit: ArticulatedFit, max_steps: int = 20) -> ArticulatedFit:
     """The nearest fit in which every frame's pose has an error of its own, under the narrowest loss."""
-    return minimise(
-        problem, replace(fit, pose_errors=np.zeros((len(problem.blocks), 6))), LINKED_FIT.widths_px[-1], max_steps
-    )
+    exact = replace(fit, pose_errors=np.zeros((len(problem.blocks), 6)))
+    return minimise(problem, exact, LINKED_FIT.widths_px[-1], max_steps)
 
 
 def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
@@ -345,9 +380,9 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     blocks = blocks - blocks.mean(0)
     scatter = blocks.T @ blocks * len(blocks) / max(len(blocks) - 1, 1)
     scatter[: len(free), : len(free)] += prior
-    if fit.pose_errors is not None:  # they last for a block or two, though the fit takes them to be independent
+    if fit.own.size:  # they last for a block or two, though the fit takes them to be independent
         apart = np.abs(problem.blocks[:, None] - problem.blocks) / LINKED_FIT.pose_blocks
-        scatter[len(free) :, len(free) :] += np.kron(np.clip(1 - apart, 0, 1), np.diag(scale[count : count + 6] ** 2))
+        scatter[len(free) :, len(free) :] += np.kron(np.clip(1 - apart, 0, 1), np.diag(fit.own_sds**-2.0))
     full = np.zeros((count, count))
     full[np.ix_(free, free)] = inverse @ scatter @ inverse.T
     return full
