@@ -10,8 +10,8 @@ from neeco.studies.study import JobEvent
 
 
 def ctrl_c_at(job: int, iteration: int | None = None) -> Callable[[JobEvent], None]:
-    """A `progress` of jobs that sends SIGINT in the training of the job at this place; of a run whose log_interval is 1,
-    after this iteration."""
+    """A `progress` of jobs that sends SIGINT in the training of the job at this place; after this
+    iteration, where its log_interval is 1."""
     said = "" if iteration is None else f"iteration {iteration} "
 
     def shown(event: JobEvent) -> None:

@@ -211,6 +211,7 @@ def test_bad_path_is_one_line_and_exit_1(verb, tmp_path, monkeypatch, capsys):
         (NeecoError("a\x1b[31mb\nc: \r is wrong"), 1, r"a\x1b["),  # names in damaged files command no terminal
         (OSError(2, "gone", "a\x1b[2Jb"), 1, r"a\x1b["),
         (KeyboardInterrupt(), 130, "neeco: interrupted: "),
+        (MemoryError(), 1, "neeco: error: memory: too little ("),
     ],
 )
 def test_an_error_is_told_in_one_printable_line(error, status, told, monkeypatch, capsys):
