@@ -50,10 +50,9 @@ def trained(world, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path
 
 
 @pytest.fixture
-def made(trained: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+def made(trained: tuple[Path, Path], inside: Path) -> dict[str, str]:
     """By verb, what it takes: a capture or a run. The working folder is one of its own."""
-    monkeypatch.chdir(tmp_path)
-    run = shutil.copytree(trained[1], tmp_path / "run")
+    run = shutil.copytree(trained[1], inside / "run")
     return dict.fromkeys(OF_A_RUN, str(run)) | dict.fromkeys(OF_A_CAPTURE, str(trained[0]))
 
 
