@@ -143,16 +143,16 @@ def test_python_of_the_first_pages_runs_as_written(page: str, folder: Path, monk
     for written, run in smaller.items():
         assert written in code or page == "README.md"
         code = code.replace(written, run)
-    monkeypatch.chdir(folder)
     if page == "README.md":  # the call is the other page's
         monkeypatch.setattr(neeco, "train", lambda capture, output, **options: neeco.load("runs/sample"))
     else:
         search_less(monkeypatch)
     names: dict[str, object] = {}
-    exec(compile(code, page, "exec"), names)
-    images = names["images"]
-    assert isinstance(images, neeco.LabelledImages)
-    assert images[1]["image"].shape[0] == 3
+    with contextlib.chdir(folder):
+        exec(compile(code, page, "exec"), names)
+        images = names["images"]
+        assert isinstance(images, neeco.LabelledImages)
+        assert images[1]["image"].shape[0] == 3
 
 
 def test_what_a_notebook_shows_of_an_object_is_one_short_line(folder: Path) -> None:

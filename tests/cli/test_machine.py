@@ -7,6 +7,7 @@ import io
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -63,8 +64,6 @@ def test_a_full_disk_behind_stdout_is_one_line() -> None:
 
 def test_letters_that_a_terminal_cannot_show_are_escaped(monkeypatch: pytest.MonkeyPatch) -> None:
     shown, told = (io.TextIOWrapper(io.BytesIO(), encoding="ascii") for _ in range(2))
-    monkeypatch.setattr(sys, "stdout", shown)
-    monkeypatch.setattr(sys, "stderr", told)
 
     def speak(words: list[str]) -> int:
         Console().print("für rich")
@@ -72,7 +71,8 @@ def test_letters_that_a_terminal_cannot_show_are_escaped(monkeypatch: pytest.Mon
         raise NeecoError("für/transforms.json: is wrong")
 
     monkeypatch.setattr(cli, "_dispatch", speak)
-    assert cli.main([]) == 1
+    with redirect_stdout(shown), redirect_stderr(told):
+        assert cli.main([]) == 1
     assert shown.buffer.getvalue() == rb"f\xfcr rich" + b"\n" + rb"f\xfcr print" + b"\n"  # type: ignore[attr-defined]
     assert told.buffer.getvalue().startswith(rb"neeco: error: f\xfcr/transforms.json")  # type: ignore[attr-defined]
 
