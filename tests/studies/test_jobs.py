@@ -177,16 +177,16 @@ def test_minutes_end_a_run_whatever_its_iterations(make_job) -> None:
     assert result["seconds"] == pytest.approx(0.3, abs=0.25)
 
 
-def test_time_of_watching_is_not_counted(unchanged_capture, make_job, tmp_path) -> None:
-    """Drawing the curve, which watches a job's training."""
-    job, now = make_job(), [0.0]
+def test_time_of_drawing_the_curve_is_not_counted(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    score = Curve.score
 
-    def watch(session) -> None:
-        now[0] += 100.0
+    def slow(self, scene, split):
+        time.sleep(0.1)
+        return score(self, scene, split)
 
-    train_module.train(job.capture, tmp_path / "run", job.config, watch=watch, clock=lambda: now[0])
-    rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
-    assert [row["seconds"] for row in rows] == [0.0] * 12
+    monkeypatch.setattr(Curve, "score", slow)
+    result = make_job().run()
+    assert result["seconds"] < 1.0  # ten moments of two splits took 2 s
 
 
 def test_one_failing_job_leaves_the_others_alone(make_job) -> None:
