@@ -45,8 +45,8 @@ class Bars:
     """A bar for each count and each running job on a terminal; elsewhere a line for each every `line_interval_s`. None
     before there is progress, so that bad input prints its one line alone."""
 
-    def __init__(self) -> None:
-        console = whole_lines(stderr=True)
+    def __init__(self, settings: ProgressSettings = PROGRESS) -> None:
+        self.settings, console = settings, whole_lines(stderr=True)
         columns = (
             TextColumn("{task.description}"),
             BarColumn(bar_width=20 if console.width >= PROGRESS.wide else 5),
@@ -73,10 +73,10 @@ class Bars:
             self.lines.join()
             if kind is None:
                 tasks = [task for task in self.bar.tasks if task.visible]  # none where all were jobs that ended
-                for task in [task for task in tasks[:-1] if (task.elapsed or 0) >= PROGRESS.min_shown_s] + tasks[-1:]:
+                others, least = tasks[:-1], self.settings.min_shown_s
+                for task in [task for task in others if (task.elapsed or 0) >= least] + tasks[-1:]:
                     self._print(_line(task))
-        passed = time.monotonic() - self.began
-        if kind is None and self.tasks and passed >= PROGRESS.min_shown_s:
+        if kind is None and self.tasks and (passed := time.monotonic() - self.began) >= self.settings.min_shown_s:
             self._print(f"total: {_duration(passed)}")
 
     def stage(self, what: str, done: int, total: int | None) -> None:
@@ -134,7 +134,7 @@ class Bars:
         self.bar.update(task, completed=total, total=total)
 
     def _print_lines(self) -> None:
-        while not self.left.wait(PROGRESS.line_interval_s):
+        while not self.left.wait(self.settings.line_interval_s):
             for task in [task for task in self.bar.tasks if task.visible and not task.finished]:
                 self._print(_line(task))
 
