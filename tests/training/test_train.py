@@ -11,7 +11,7 @@ from capture_files import train_interrupted
 
 from neeco.base.errors import NeecoError
 from neeco.training.config import TrainConfig, training_config
-from neeco.training.run import load_run
+from neeco.training.run import load_run, read_checkpoint
 from neeco.training.schedule import due
 from neeco.training.train import train
 
@@ -113,6 +113,18 @@ def test_a_scene_that_diverged_behind_a_finite_image_ends_the_run(capture: Path,
         if session.iteration == 60:
             session.scene.canonical.log_scales.data[3] = float("nan")
 
-    with pytest.raises(NeecoError, match=r"diverged: canonical\.log_scales contains NaN, .* after 60 iterations"):
+    with pytest.raises(NeecoError, match=r"diverged: scene/canonical\.log_scales contains NaN, .* after 60 iterations"):
         train(capture, tmp_path / "run", config_of("3dgs"), watch=watch)
     assert not (tmp_path / "run" / "scene.safetensors").exists()
+
+
+def test_a_checkpoint_that_no_run_could_read_does_not_replace_the_last_one(capture: Path, tmp_path: Path) -> None:
+    def watch(session) -> None:
+        if session.iteration == 30:
+            session.scene.canonical.log_scales.data[3] = -1e12  # of no size: the image stays finite
+
+    config = dataclasses.replace(config_of("3dgs"), checkpoint_interval=20)
+    with pytest.raises(NeecoError, match=r"diverged: .*log_scales contains .* beyond 1e.* after 40 iterations"):
+        train(capture, tmp_path / "run", config, watch=watch)
+    assert read_checkpoint(tmp_path / "run")[1]["iteration"] == 20
+    assert load_run(train(capture, tmp_path / "run", config, resume=True)).scene.diagnostics["iterations"] == 60

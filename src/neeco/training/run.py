@@ -227,11 +227,18 @@ def checkpoint_path(run: Path) -> Path:
 
 
 def save_checkpoint(session: Session, run: Path) -> None:
-    """Write the session's whole state atomically."""
+    """Write the session's whole state atomically. Raises NeecoError for one that diverged; the last one is kept."""
     scene_tensors, scene_header = pack_scene(session.scene)
     session_tensors, fields = session.pack()
     tensors = {f"scene/{name}": tensor for name, tensor in scene_tensors.items()} | session_tensors
     tensors |= {f"adam/{name}": tensor for name, tensor in session.adam.tensors().items()}
+    try:
+        require_numbers(tensors)
+    except ValueError as error:
+        raise NeecoError(
+            f"training: the scene diverged: {error} after {session.iteration} iterations; train anew with another "
+            "--seed or a milder schedule"
+        ) from None
     device = session.generator.device
     tensors |= {"random/torch": torch.get_rng_state(), "random/generator": session.generator.get_state()}
     if device.type == "cuda":
