@@ -85,10 +85,7 @@ class Comparison:
 
     @staticmethod
     @torch.no_grad()
-    def of(
-        scene: GaussianScene, state: State, camera: Camera, image: Tensor, mask: Tensor | None,
-        settings: ForegroundSettings = SETTINGS,
-    ) -> Comparison:  # fmt: skip
+    def of(scene: GaussianScene, state: State, camera: Camera, image: Tensor, mask: Tensor | None) -> Comparison:
         """Compare an image [H, W, 3] in [0, 1] of a `camera` with the scene in `state`."""
         posed, instruments = scene.at(state), scene.canonical.of_instruments
         whole = rasterize(posed, camera, channels=instruments.float()[:, None])
@@ -96,17 +93,17 @@ class Comparison:
         surface = rasterize(posed.select(~instruments), camera)
         tissue = surface.color.clamp(0, 1).cpu().numpy()
         depth = torch.where(surface.alpha < 0.5, torch.inf, surface.depth).cpu().numpy()
-        shown, window = image.cpu().numpy(), settings.window_px
+        shown, window = image.cpu().numpy(), SETTINGS.window_px
         over, under = (uniform_filter((other * tissue).sum(-1), window) for other in (shown, tissue))
         shade = over / np.maximum(under, 1e-6)
-        likely = np.clip(shade, *settings.shadow)
+        likely = np.clip(shade, *SETTINGS.shadow)
         off = np.abs(shown - likely[..., None] * tissue).mean(-1)
         # by both: a shadow may differ more than an instrument does, and a dark instrument is nearly a shade
         differences = np.stack([np.abs(shown - tissue).mean(-1), off], -1)
-        around = np.ones((2 * settings.outline_px + 1,) * 2, np.uint8)
+        around = np.ones((2 * SETTINGS.outline_px + 1,) * 2, np.uint8)
         most = cv2.dilate(uniform_filter(differences, (window, window, 1)), around)
         covered = (differences / np.maximum(most, 1e-6)).min(-1)
-        brightness = settings.dark + uniform_filter(likely * tissue.mean(-1), window)
+        brightness = SETTINGS.dark + uniform_filter(likely * tissue.mean(-1), window)
         label = whole.channels[..., 0].cpu().numpy()
         error = uniform_filter(np.abs(shown - whole.color.clamp(0, 1).cpu().numpy()).mean(-1), window)
         usable = np.ones(label.shape, bool) if mask is None else mask.cpu().numpy()
@@ -187,12 +184,12 @@ class Foreground:
 
 def _bins(residuals: np.ndarray, shades: np.ndarray, settings: ForegroundSettings) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of residuals and shades [...] in the densities."""
-    found = []
-    for values, (low, high, count) in (
-        (np.log(np.maximum(residuals, 1e-6)), settings.residuals), (shades, settings.shades)
-    ):  # fmt: skip
-        found.append(((values - low) / (high - low) * count).astype(int).clip(0, count - 1))
-    return found[0], found[1]
+    log_residuals = np.log(np.maximum(residuals, 1e-6))
+    rows, columns = (
+        ((values - low) / (high - low) * count).astype(int).clip(0, count - 1)
+        for values, (low, high, count) in ((log_residuals, settings.residuals), (shades, settings.shades))
+    )
+    return rows, columns
 
 
 def _counts(views: Sequence[Comparison], masks: Sequence[np.ndarray], settings: ForegroundSettings) -> np.ndarray:

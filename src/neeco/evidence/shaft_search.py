@@ -82,9 +82,8 @@ class CylinderViews:
 
     @staticmethod
     def of(
-        *, hits: Tensor, sizes: Tensor, intrinsics: Tensor, own: Tensor, exchanged: Tensor, world: Tensor,
-        distance: float, width: int,
-    ) -> CylinderViews:  # fmt: skip
+        *, hits: Tensor, sizes: Tensor, intrinsics: Tensor, distance: float, width: int, **poses: Tensor
+    ) -> CylinderViews:
         """Reduce evidence [F, H, W] in [0, 1] of images of `sizes` [F, 2] px to about `width` pixels."""
         pool = max(1, round(hits.shape[2] / width))
         small = avg_pool2d(hits[:, None], pool)[:, 0]
@@ -97,7 +96,7 @@ class CylinderViews:
         worth = torch.where(inside & moves, small - SETTINGS.threshold, 0.0)
         count = len(hits)
         rays = normalize(rays.reshape(count, -1, 3), dim=-1)
-        return CylinderViews(rays, worth.reshape(count, -1), own, exchanged, world, distance)
+        return CylinderViews(rays, worth.reshape(count, -1), distance=distance, **poses)
 
     def gains(
         self, transforms: Tensor, origins: Tensor, directions: Tensor, chunk: int = 64
@@ -106,9 +105,8 @@ class CylinderViews:
         [F, 4, 4] with the best radius and tip [C], what they gain more than in the opposite direction, as a share [C],
         and the radius [C], mm."""
         parts = [
-            self._gains(transforms, *lines)
-            for lines in zip(origins.split(chunk), directions.split(chunk), strict=True)
-        ]  # fmt: skip
+            self._gains(transforms, *lines) for lines in zip(origins.split(chunk), directions.split(chunk), strict=True)
+        ]
         gains, leads, radii = (torch.cat(values) for values in zip(*parts, strict=True))
         return gains, leads, radii
 

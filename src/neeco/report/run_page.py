@@ -64,7 +64,7 @@ IMAGE_SCORES = (
     Score("fps", "FPS", "{:.1f}", "Posed images rendered per second on the machine that evaluated."),
     Score("num_gaussians", "Gaussians", "{:,}", "Gaussians of the finished scene; finishing adds some, as of shafts."),
     Score("frames", "frames", "{}", "How many frames were scored."),
-)  # fmt: skip
+)
 LABEL_SCORES = (
     Score("mask_iou", "mask IoU", "{:.3f}", "Label mask against true mask: shared area over joint area; 1 is perfect."),
     Score("mask_precision", "mask precision", "{:.3f}", "How much of the label mask is truly instrument."),
@@ -72,7 +72,7 @@ LABEL_SCORES = (
     Score("estimated_iou", "estimated IoU", "{:.3f}", "The mask IoU, estimated from the images alone, without masks."),
     Score("shaft_recall", "recall on shafts", "{:.3f}", "How much of the true shafts is labelled instrument."),
     Score("shadow_labelled", "shadow labelled", "{:.1%}", "How much of the instruments' shadow on tissue is labelled."),
-)  # fmt: skip
+)
 SCORES = (*IMAGE_SCORES, *LABEL_SCORES)
 KINDS = {
     "given": "As given: rendered at the poses the capture states, tracker errors included",

@@ -399,8 +399,8 @@ class Refinement:
                 item_state = state.instruments[item.name]
                 turn = camera.world_from_camera[:3, :3].cpu().double().T @ item_state.pose[:3, :3].cpu().double()
                 shifts = (turn.square() @ deviations[pose][3:].square()).sqrt()  # along the camera's axes
-                units = [value if slides else math.degrees(value)
-                         for value, slides in zip(deviations[joints].tolist(), item.slides, strict=True)]  # fmt: skip
+                joint_sds = zip(deviations[joints].tolist(), item.slides, strict=True)
+                units = [value if slides else math.degrees(value) for value, slides in joint_sds]
                 instruments[item.name] = {
                     "pose": item_state.pose.cpu().double().tolist(),
                     "joints": {joint: float(value) for joint, value in item_state.joints.items()},
@@ -446,8 +446,8 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
         number = numbers.setdefault((frame.state.time, *poses), len(numbers))
         times += [frame.state.time] if number == len(times) else []
         instants.append(number)
-    near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and abs(times[k] - t) < LIMITS.max_neighbour_s] or [i]
-            for i, t in enumerate(times)]  # fmt: skip
+    pairs = [[k for k in (i - 1, i + 1) if 0 <= k < len(times)] for i in range(len(times))]
+    near = [[k for k in ks if abs(times[k] - times[i]) < LIMITS.max_neighbour_s] or [i] for i, ks in enumerate(pairs)]
     return instants, near
 
 

@@ -66,10 +66,8 @@ class LeRobot(RecordingFormat):
         names, name = data.features[key].names, f"episode {episode.number}/{key}"
         times, order, _, notes = _times(data, episode)
         rows = np.column_stack([times, data.columns(episode, {key: len(names)})[key][order]])
-        return Table(
-            path, (TIME, *names), rows, np.arange(len(rows)), stream=name, record="frame", notes=notes,
-            meaning=_meaning(key, names),
-        )  # fmt: skip
+        lines, meaning = np.arange(len(rows)), _meaning(key, names)
+        return Table(path, (TIME, *names), rows, lines, stream=name, record="frame", notes=notes, meaning=meaning)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         data = self._data_set(path)
@@ -89,15 +87,15 @@ class LeRobot(RecordingFormat):
         if count > len(times):
             notes = (*notes, f"{film.name}: by timestamps, not all images have {noun}; the others are left out")
             noun, n_images = f"that the timestamps of episode {episode.number} reach", min(n_images, count)
-        notes = (*notes, *compare_counts(film, n_images, count, noun, remedy=remedy))
+        notes = (*notes, *compare_counts(film, n_images, count, noun, remedy=remedy), *video.notes)
         row = np.full(max(int(numbers[-1]) + 1, count), -1)
         row[places] = np.arange(len(times))
         usable = row[numbers] >= 0
         frames = tuple(np.flatnonzero(usable).tolist())
+        times = times[row[numbers[usable]]]
         return ChosenFrames(
-            video.path, video.size, (*notes, *video.notes), times[row[numbers[usable]]], video=video, frames=frames,
-            pixel_aspect=video.pixel_aspect,
-        )  # fmt: skip
+            video.path, video.size, notes, times, video=video, frames=frames, pixel_aspect=video.pixel_aspect
+        )
 
     def clock(self, path: Path, stream: str | None) -> str:
         match = _NAME.fullmatch(stream or "")
@@ -143,12 +141,9 @@ def _bodies(feature: Feature, stream: Stream) -> list[Stream]:
             continue
         of_body = [name for name in readings if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
         posed = replace(plain, kind=Kind.POSES, offered=True, body=body or UNNAMED, hints=meaning.hints)
-        streams.append(
-            replace(
-                posed, columns=tuple(name for name in columns if name not in readings), asks=meaning.asks,
-                joints=tuple((_joint_name(name, body), name) for name in of_body),
-            )
-        )  # fmt: skip
+        of_poses = tuple(name for name in columns if name not in readings)
+        joints = tuple((_joint_name(name, body), name) for name in of_body)
+        streams.append(replace(posed, columns=of_poses, asks=meaning.asks, joints=joints))
     return streams or [plain]
 
 

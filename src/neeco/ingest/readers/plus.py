@@ -35,9 +35,8 @@ GOOD = "ok"
 _ENDS = re.compile(r"(\w+?)To([A-Z0-9]\w*)")
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w{1,200})")
 _UCHAR = ("uchar", "unsigned char", "uint8", "uint8_t", "met_uchar")
-_META_READ = {
-    "ElementType": _UCHAR, "BinaryData": ("", "true"), "HeaderSize": ("", "0"), "CompressedData": ("", "true", "false"),
-}  # fmt: skip
+_META_READ = {"ElementType": _UCHAR, "BinaryData": ("", "true"), "HeaderSize": ("", "0")}
+_META_READ |= {"CompressedData": ("", "true", "false")}
 _SKIPS = dict.fromkeys(("line skip", "lineskip", "byte skip", "byteskip"), ("", "0"))
 _NRRD_READ = {"type": _UCHAR, "encoding": ("raw", "gzip", "gz"), **_SKIPS}  # the values of fields that can be read
 
@@ -307,10 +306,8 @@ class PlusSequence(RecordingFormat):
             if frame in sequence.times and len(words) == len(HEADER) - 1:
                 row[:-1] = [repr(sequence.times[frame]), *words]
             row[-1] = statuses[frame]
-        return Table(
-            path, (*HEADER, name + TRANSFORM + STATUS), rows, np.array(sorted(texts), np.int64), stream=name,
-            record="frame", stated_in=stated_in, meaning=meaning,
-        )  # fmt: skip
+        header, lines = (*HEADER, name + TRANSFORM + STATUS), np.array(sorted(texts), np.int64)
+        return Table(path, header, rows, lines, stream=name, record="frame", stated_in=stated_in, meaning=meaning)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         sequence = read_sequence(path)

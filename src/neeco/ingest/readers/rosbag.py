@@ -224,10 +224,10 @@ def _chained(survey: Survey, stream: str) -> Table:
     quats[known_rows] = Rotation.from_matrix(frame_from_child[known_rows, :3, :3]).as_quat()
     rows = np.column_stack([seconds, frame_from_child[:, :3, 3], quats])
     meaning = meaning_of(frame, _image_frames(survey), dvrk=of_dvrk(child))
+    lines = np.arange(1, len(rows) + 1)
     return Table(
-        survey.path, CHAIN_HEADER, rows, np.arange(1, len(rows) + 1), stream=stream, record="message",
-        stated_in=frame, meaning=meaning,
-    )  # fmt: skip
+        survey.path, CHAIN_HEADER, rows, lines, stream=stream, record="message", stated_in=frame, meaning=meaning
+    )
 
 
 def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str], list[str]]:
