@@ -53,10 +53,10 @@ def condensed(problems: Sequence[Problem]) -> list[Problem]:
         key = (VARYING.sub("#", part) for part in (problem.file, problem.field, problem.message, problem.remedy))
         groups.setdefault((problem.severity, *key), []).append(problem)
     merged = []
-    for first, *others in groups.values():
-        many = len(others) >= MIN_CONDENSED
-        merged.append(replace(first, message=f"{first.message} (and {len(others)} more like it)") if many else first)
-        merged += [] if many else others
+    for first, *similar in groups.values():
+        many = len(similar) >= MIN_CONDENSED
+        merged.append(replace(first, message=f"{first.message} (and {len(similar)} more like it)") if many else first)
+        merged += [] if many else similar
     return merged
 
 

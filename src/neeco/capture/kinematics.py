@@ -101,8 +101,8 @@ class KinematicTree:
         missing."""
         poses: dict[str, Array] = {}
         for link in self.links:
-            here = link.parent_from_link(readings)
-            poses[link.name] = here if link.parent is None else poses[link.parent] @ here
+            parent_from_link = link.parent_from_link(readings)
+            poses[link.name] = parent_from_link if link.parent is None else poses[link.parent] @ parent_from_link
         return poses
 
     def readings_of(self, name: str) -> set[str]:

@@ -103,8 +103,8 @@ def print_outcome(
         console.print(sentence, markup=False, highlight=False)
     for note in notes:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
-    for what, place in files.items():
-        console.print(f"{what}: {place}", markup=False, highlight=False, soft_wrap=True)
+    for title, place in files.items():
+        console.print(f"{title}: {place}", markup=False, highlight=False, soft_wrap=True)
     if not failed:
         return 0
     more = f" (and {len(failed) - 1} more, listed above)" if len(failed) > 1 else ""

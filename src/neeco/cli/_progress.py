@@ -188,20 +188,20 @@ def train_with_progress(
     from neeco.training.run import resume_command
     from neeco.training.train import train
 
-    run, how = shlex.quote(str(output)), f"go on with: {resume_command(capture, output)}"
+    run, hint = shlex.quote(str(output)), f"go on with: {resume_command(capture, output)}"
     started: list[int] = []  # the iteration of the first row
 
     def show(row: ProgressRow) -> None:
         if not row.note and not started:
             started.append(row.iteration)
             slow = "; a CUDA device would be used if there were one" if device.type == "cpu" else ""
-            left = row.seconds_left
-            whole = "begins" if left is None else f"takes about {_duration(row.seconds + left)} in all"
+            remaining = row.seconds_left
+            whole = "begins" if remaining is None else f"takes about {_duration(row.seconds + remaining)} in all"
             forecast = f"{whole}, estimated anew as it goes on"
             bars.training(replace(row, note=f"training on {device.type} {forecast}{slow}; watch it: neeco view {run}"))
         bars.training(row)
 
-    with Bars() as bars, resumable(output, how):
+    with Bars() as bars, resumable(output, hint):
         path = train(capture, output, config, device=device, resume=resume, progress=show)
         bars.end("training")
     return path

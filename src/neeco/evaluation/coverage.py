@@ -48,17 +48,17 @@ class Coverage:
     sizes: Tensor  # [V, 2] width, height of each view's map (maps are padded to a common size)
 
     def observed(self, points: Tensor) -> Tensor:
-        """Return bool [M]: which world points [M, 3] (mm) at least one training view observed unoccluded.
-
-        A view observed a point that projects into it no deeper than the surface rendered there, within 2% + 1 mm.
+        """Return bool [M]: world points [M, 3] (mm) that at least one training view observes unoccluded: they project
+        into it no deeper than the surface rendered there, within 2 % + 1 mm.
         """
         observed = torch.zeros(len(points), dtype=torch.bool)
         chunks = -(-len(self.depths) // SETTINGS.chunk_views)
         for start in range(chunks):  # views far apart in time first: each chunk takes every chunks-th view
-            left = torch.nonzero(~observed)[:, 0]
-            if len(left) == 0:
+            unseen = torch.nonzero(~observed)[:, 0]
+            if len(unseen) == 0:
                 break
-            observed[left] = self._observed_by(points[left], torch.arange(len(self.depths))[start::chunks]).any(dim=0)
+            views = torch.arange(len(self.depths))[start::chunks]
+            observed[unseen] = self._observed_by(points[unseen], views).any(dim=0)
         return observed
 
     def _observed_by(self, points: Tensor, views: Tensor) -> Tensor:

@@ -147,12 +147,12 @@ def gather_evidence(
         if unshaded:
             dimmed = (image * tissue).sum(-1, keepdim=True) / tissue.square().sum(-1, keepdim=True).clamp_min(1e-6)
             explanations.append((without_shadows, tissue * dimmed.clamp(CARVING.darkest_shadow, 1.0)))
-        for found, expected in explanations:
+        for maps, expected in explanations:
             residual = (expected - image).abs().mean(-1)
             if mask is not None:
                 residual = residual * mask
             smooth = avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
-            found.append(((smooth / exposure - settings.evidence_floor) / settings.evidence_range).clamp(0, 1))
+            maps.append(((smooth / exposure - settings.evidence_floor) / settings.evidence_range).clamp(0, 1))
         depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
     cameras, device = [frames[i].camera for i in picked], views.device
     return Evidence(
@@ -237,15 +237,15 @@ def posed_views(evidence: Evidence, name: str, settings: CarvingSettings, moved:
     """Return the views of instrument `name`, or of a link of it that each frame's readings move by `moved` [F, 4, 4].
 
     An exchange keeps the cameras and shifts poses and readings among the frames."""
-    own = camera_from_instrument(evidence, name)
-    own = own if moved is None else own @ moved
+    recorded_poses = camera_from_instrument(evidence, name)
+    recorded_poses = recorded_poses if moved is None else recorded_poses @ moved
     cameras = evidence.camera_from_world.double()
-    poses = torch.linalg.inv(cameras) @ own.double()
+    poses = torch.linalg.inv(cameras) @ recorded_poses.double()
     # uneven shifts, so that periodic motion does not come out the same
     count = settings.pose_shifts
     shifts = [round(len(poses) * (k + 0.1 * (k % 2)) / (count + 1)) for k in range(1, count + 1)]
     exchanged = torch.stack([(cameras @ poses.roll(shift, 0)).float() for shift in shifts])
-    return PosedViews(evidence, own, exchanged, settings.motion_ratio)
+    return PosedViews(evidence, recorded_poses, exchanged, settings.motion_ratio)
 
 
 @torch.no_grad()

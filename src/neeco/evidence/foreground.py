@@ -93,19 +93,19 @@ class Comparison:
         surface = rasterize(posed.select(~instruments), camera)
         tissue = surface.color.clamp(0, 1).cpu().numpy()
         depth = torch.where(surface.alpha < 0.5, torch.inf, surface.depth).cpu().numpy()
-        shown, window = image.cpu().numpy(), SETTINGS.window_px
-        over, under = (uniform_filter((other * tissue).sum(-1), window) for other in (shown, tissue))
+        observed, window = image.cpu().numpy(), SETTINGS.window_px
+        over, under = (uniform_filter((other * tissue).sum(-1), window) for other in (observed, tissue))
         shade = over / np.maximum(under, 1e-6)
         likely = np.clip(shade, *SETTINGS.shadow)
-        off = np.abs(shown - likely[..., None] * tissue).mean(-1)
+        off = np.abs(observed - likely[..., None] * tissue).mean(-1)
         # by both: a shadow may differ more than an instrument does, and a dark instrument is nearly a shade
-        differences = np.stack([np.abs(shown - tissue).mean(-1), off], -1)
+        differences = np.stack([np.abs(observed - tissue).mean(-1), off], -1)
         around = np.ones((2 * SETTINGS.outline_px + 1,) * 2, np.uint8)
         most = cv2.dilate(uniform_filter(differences, (window, window, 1)), around)
         covered = (differences / np.maximum(most, 1e-6)).min(-1)
         brightness = SETTINGS.dark + uniform_filter(likely * tissue.mean(-1), window)
         label = whole.channels[..., 0].cpu().numpy()
-        error = uniform_filter(np.abs(shown - whole.color.clamp(0, 1).cpu().numpy()).mean(-1), window)
+        error = uniform_filter(np.abs(observed - whole.color.clamp(0, 1).cpu().numpy()).mean(-1), window)
         usable = np.ones(label.shape, bool) if mask is None else mask.cpu().numpy()
         residual = uniform_filter(off, window) / brightness
         return Comparison(shade, residual, off / brightness, covered, depth, label, error=error, usable=usable)
@@ -152,8 +152,8 @@ class Foreground:
         of_tissue = np.concatenate([view.residual[mask] for view, mask in zip(views, far, strict=True)])
         noise = float(np.quantile(of_tissue, settings.noise_quantile))
         errors = np.concatenate([view.error[view.usable & ~view.near(settings.apart)] for view in views])
-        known = len(errors) >= settings.least_pixels
-        error = max(settings.least_error, float(np.quantile(errors, settings.error_quantile))) if known else math.inf
+        enough = len(errors) >= settings.least_pixels
+        error = max(settings.least_error, float(np.quantile(errors, settings.error_quantile))) if enough else math.inf
         instrument = _density(instrument, settings.unsampled_instrument, settings.smoothing)
         tissue = _density(tissue, settings.unsampled_tissue, settings.smoothing)
         return Foreground(np.log(instrument / tissue), noise, error, settings)

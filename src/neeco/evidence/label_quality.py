@@ -88,9 +88,9 @@ def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     across = np.ones((2 * foreground.settings.outline_px + 1,) * 2, np.uint8)  # outlines do not divide a body
     bodies = cv2.connectedComponents(cv2.dilate(instrument.astype(np.uint8), across))[1]
     areas = np.bincount(bodies[instrument], minlength=1)
-    shown = areas >= QUALITY.least_body * areas.max()
-    shown[bodies[instrument & label]] = True
-    missed = ~label & np.where(instrument, shown[bodies], ~tissue & _unexplained(view, foreground))
+    visible_bodies = areas >= QUALITY.least_body * areas.max()
+    visible_bodies[bodies[instrument & label]] = True
+    missed = ~label & np.where(instrument, visible_bodies[bodies], ~tissue & _unexplained(view, foreground))
     share = view.covered / foreground.settings.covered
     window = (2 * math.ceil(QUALITY.nearby * label.shape[1]) + 1,) * 2
     near_instrument, near_tissue = (1e-6 + cv2.blur(kind.astype(float), window) for kind in (instrument, tissue))

@@ -53,15 +53,15 @@ def undistorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray
     estimate = slopes.astype(np.float64)
     with np.errstate(all="ignore"):
         for _ in range(DISTORTION.n_newton_steps):
-            here = distorted(estimate, distortion)
+            projected = distorted(estimate, distortion)
             (a, c), (b, d) = (
                 (
-                    (distorted(estimate + DISTORTION.derivative_step * axis, distortion) - here)
+                    (distorted(estimate + DISTORTION.derivative_step * axis, distortion) - projected)
                     / DISTORTION.derivative_step
                 ).T
                 for axis in np.eye(2)
             )  # columns of the Jacobian
-            x, y = (slopes - here).T
+            x, y = (slopes - projected).T
             estimate = estimate + (np.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)).T
             estimate = np.clip(np.nan_to_num(estimate), -2 * DISTORTION.max_slope, 2 * DISTORTION.max_slope)
     return estimate

@@ -60,8 +60,8 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
         write_capture(capture, work / "capture")
     settled = ("instruments", "units")  # warnings that `_lacking` repeats; converting settles those of masks
     warnings = [problem for problem in report.problems if problem.severity == "warning" and problem.file != f"{MASKS}/"]
-    others = [str(problem) for problem in condensed(warnings) if problem.field not in settled]
-    return (*_lacking(parsed, masked=bool(tool_masks)), *others, *notes)
+    warning_texts = [str(problem) for problem in condensed(warnings) if problem.field not in settled]
+    return (*_lacking(parsed, masked=bool(tool_masks)), *warning_texts, *notes)
 
 
 def _absent_images(parsed: Parsed) -> list[str]:
@@ -175,9 +175,9 @@ def undistort_frames(frames: Sequence[Frame], folder: Path, border: Border | Non
     count = sum(bool(frame.camera.distortion) for frame in frames)
     if not count:
         return Undistorted(tuple(frames), None, [])
-    first, *others = {Lens.of(frame.camera): None for frame in frames}
-    lens = None if others else replace(first, border=border)
-    note = f"of their {1 + len(others)} lenses none is kept" if lens is None else "their lens is kept"
+    first, *other_lenses = {Lens.of(frame.camera): None for frame in frames}
+    lens = None if other_lenses else replace(first, border=border)
+    note = f"of their {1 + len(other_lenses)} lenses none is kept" if lens is None else "their lens is kept"
     straight = [_undistort(frame, folder / str(order)) for order, frame in enumerate(frames)]
     return Undistorted(tuple(straight), lens, [f"{count} of {len(frames)} images are undistorted; {note}."])
 

@@ -184,12 +184,12 @@ class Assessment:
     def lines(self) -> list[str]:
         """Return the verdict for a terminal: headline (in capitals if doubtful) and the first `max_shown` warnings."""
         verdict, _, rest = self.headline.partition(":")
-        others = self.others
+        more_warnings = self.others
         words = {"good": f"good. {self.headline}", "careful": self.headline, "bad": f"{verdict.upper()}:{rest}"}
         lines = [words[self.level]]
-        lines += [f"  - {warning}" for warning in others[: LIMITS.max_shown]]
-        left = len(others) - LIMITS.max_shown
-        return lines + ([f"  - and {left} more warnings"] if left > 0 else [])
+        lines += [f"  - {warning}" for warning in more_warnings[: LIMITS.max_shown]]
+        unlisted = len(more_warnings) - LIMITS.max_shown
+        return lines + ([f"  - and {unlisted} more warnings"] if unlisted > 0 else [])
 
     def as_json(self) -> dict[str, Any]:
         """Return the verdict for scripts (`--json`)."""
@@ -253,8 +253,8 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
     if result.in_video and any(item is not None and item.rotation_deg[2] >= UNKNOWN_DEG for item in deviations):
         words = "The instrument's roll is not known: log it, or pose frames by hand, before training."
         evidence.append(_Evidence.of(words, severe=False))
-    others = [problem for problem in problems if problem not in grave]
-    evidence += [_Evidence.of(_sentence(str(problem)), severe=False) for problem in others]
+    minor = [problem for problem in problems if problem not in grave]
+    evidence += [_Evidence.of(_sentence(str(problem)), severe=False) for problem in minor]
     if not capture.instruments:
         words = "No instrument was tracked: only methods without states, such as 3dgs, can be trained."
         evidence.append(_Evidence.of(words, severe=False))
@@ -362,8 +362,8 @@ def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Eviden
     limit_mm, limit_deg = (
         (HAND_EYE.placed_mm, HAND_EYE.placed_deg) if base.tracked else (LIMITS.base_mm, LIMITS.base_deg)
     )
-    what = f"the {'place' if base.tracked else 'base'} of {name}"
-    measured = [(what, "mm", limit_mm, base.sd_mm), (what, "deg", limit_deg, base.sd_deg)]
+    quantity = f"the {'place' if base.tracked else 'base'} of {name}"
+    measured = [(quantity, "mm", limit_mm, base.sd_mm), (quantity, "deg", limit_deg, base.sd_deg)]
     if base.shaft is not None and linked:
         sd_mm, sd_deg = base.deviations(frame_about(base.shaft).T)
         measured = [
@@ -373,11 +373,11 @@ def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Eviden
         ]
     elif np.isfinite(base.sd_motion_mm):
         measured = [(f"the motion of {name}", "mm", limit_mm, np.array(base.sd_motion_mm))]
-    for what, unit, limit, sds in measured:
+    for quantity, unit, limit, sds in measured:
         worst = float(np.max(sds))
         size = f"±{worst:.1f} {unit}" if np.isfinite(worst) else f"no {unit}"
-        fact = f"{what} is known to {size} (usual: {limit:g} or less)"
-        warning = f"{what[0].upper()}{what[1:]} is known to {size} only."
+        fact = f"{quantity} is known to {size} (usual: {limit:g} or less)"
+        warning = f"{quantity[0].upper()}{quantity[1:]} is known to {size} only."
         evidence.append(_Evidence(fact, 0 if worst <= limit else 1, warning))
     return evidence
 

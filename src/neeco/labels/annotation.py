@@ -143,7 +143,7 @@ def project_keypoints(drawing: LayeredDrawing, instrument: str) -> dict[str, Key
     Keypoints of an instrument that has no pixel even alone are OUTSIDE.
     """
     camera = drawing.camera
-    others = [drawing.tissue_depth] + [layer.depth for name, layer in drawing.layers.items() if name != instrument]
+    depths = [drawing.tissue_depth] + [layer.depth for name, layer in drawing.layers.items() if name != instrument]
     absent = not drawing.layers[instrument].mask.any()
     projected = {}
     for name, point in drawing.keypoints.get(instrument, {}).items():
@@ -152,7 +152,7 @@ def project_keypoints(drawing: LayeredDrawing, instrument: str) -> dict[str, Key
         if not absent and place is not None:
             x, y, z = place
             pixel = int(y), int(x)
-            hidden = any(0 < depth[pixel] < z - LABELS.occlusion_mm for depth in others)
+            hidden = any(0 < depth[pixel] < z - LABELS.occlusion_mm for depth in depths)
             hidden |= 0 < drawing.layers[instrument].depth[pixel] < z - LABELS.self_occlusion_mm
             projected[name] = Keypoint(round(x, 2), round(y, 2), OCCLUDED if hidden else VISIBLE)
     return projected

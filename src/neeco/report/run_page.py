@@ -192,12 +192,12 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
     tiles = []
     for split, numbers in evaluation["given"].items():
         if numbers["psnr"] is not None:
-            what = f"PSNR, {split} frames: similarity to the recorded (30 is close, 20 rough)"
-            tiles.append((f"{numbers['psnr']:.1f} dB", what))
+            meaning = f"PSNR, {split} frames: similarity to the recorded (30 is close, 20 rough)"
+            tiles.append((f"{numbers['psnr']:.1f} dB", meaning))
     for split, numbers in evaluation[labelled].items():
         if numbers["mask_iou"] is not None:
-            what = f"overlap of labels and true masks (IoU; 1 is perfect), {split} frames {KIND_NAMES[labelled]}"
-            tiles.append((f"{numbers['mask_iou']:.3f}", what))
+            meaning = f"overlap of labels and true masks (IoU; 1 is perfect), {split} frames {KIND_NAMES[labelled]}"
+            tiles.append((f"{numbers['mask_iou']:.3f}", meaning))
     doubts = evaluation.get("doubts", ())
     measured = any(numbers.get("estimated_iou") is not None for numbers in evaluation["given"].values())
     trust = "doubtful" if doubts else "no doubt" if measured else "unknown"

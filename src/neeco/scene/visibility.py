@@ -139,11 +139,11 @@ def count_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 def outside_all_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
     """Return which points [P, 3] mm of the world project into none of the images, [P] bool."""
-    left = torch.arange(len(points), device=points.device)
+    unseen = torch.arange(len(points), device=points.device)
     for camera in cameras:
-        left = left[~in_image(points[left], camera)]
+        unseen = unseen[~in_image(points[unseen], camera)]
     outside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    outside[left] = True
+    outside[unseen] = True
     return outside
 
 
@@ -202,13 +202,13 @@ def _filled(sums: np.ndarray) -> np.ndarray:
     """Return means [rows, columns, V] of the known cells around every cell, from sums [rows, columns, 1 + V]: over the
     smallest neighbourhood with enough of them, then smoothed."""
     means = np.zeros((*sums.shape[:2], sums.shape[2] - 1))
-    left = np.ones(sums.shape[:2], dtype=bool)
+    unfilled = np.ones(sums.shape[:2], dtype=bool)
     is_known = (sums[..., 0] > 0).astype(float)
     for sigma in SETTINGS.smoothing_cells:
         blurred = gaussian_filter(sums, (sigma, sigma, 0), mode="constant")
-        here = left & (gaussian_filter(is_known, sigma, mode="constant") > SETTINGS.min_known_share)
-        means[here] = blurred[here][:, 1:] / blurred[here][:, :1]
-        left &= ~here
+        fillable = unfilled & (gaussian_filter(is_known, sigma, mode="constant") > SETTINGS.min_known_share)
+        means[fillable] = blurred[fillable][:, 1:] / blurred[fillable][:, :1]
+        unfilled &= ~fillable
     mean = sums.sum((0, 1))
-    means[left] = mean[1:] / mean[0]
+    means[unfilled] = mean[1:] / mean[0]
     return gaussian_filter(means, (2.0, 2.0, 0), mode="nearest")

@@ -225,8 +225,8 @@ def single_length(lengths: Mapping[str, float | None], place: str) -> tuple[str,
     naming it behind `place` where nothing can be trained so long."""
     values = {key: value for key, value in lengths.items() if value is not None}
     if len(values) != 1:
-        what = f"{' and '.join(values)} are given" if values else "no length of the runs is given"
-        raise NeecoError(f"{what}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
+        problem = f"{' and '.join(values)} are given" if values else "no length of the runs is given"
+        raise NeecoError(f"{problem}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
     ((key, value),) = values.items()
     if not 0 < value < math.inf:
         field = f"--{key.replace('_', '-')}" if place == "--" else f"{place}{key}:"

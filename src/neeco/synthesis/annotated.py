@@ -116,8 +116,8 @@ def annotate_capture(
         train, drawings = trained_on.split("train"), []
         for k in range(min(N_REFERENCE_FRAMES, len(train))):
             frame = train[round(k * (len(train) - 1) / (N_REFERENCE_FRAMES - 1))]
-            shown = frame.load_image()
-            drawings.append((fitted(scene, labeller, frame, shown, None)[1], shown, frame.load_mask()))
+            image = frame.load_image()
+            drawings.append((fitted(scene, labeller, frame, image, None)[1], image, frame.load_mask()))
         typical = typical_errors_of(drawings)
         foreground = learned_foreground(scene, train)
         info["usual_errors"] = asdict(typical)

@@ -260,10 +260,10 @@ class RecordedMotion:
         """Return a motion for `state`."""
         if not self._instruments:
             return self._motions[self._frames.like(state, rng)]
-        *motions, own = (each._motions[each._frames.any(rng)] for each in (*self._instruments, self))
+        *motions, camera_motion = (each._motions[each._frames.any(rng)] for each in (*self._instruments, self))
         twists = {name: twist for motion in motions for name, twist in motion.instruments.items()}
         rates = {name: rates for motion in motions for name, rates in motion.joints.items()}
-        return Motion(twists, rates, own.camera)
+        return Motion(twists, rates, camera_motion.camera)
 
 
 def subframes(

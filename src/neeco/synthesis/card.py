@@ -191,8 +191,8 @@ def write_preview(root: Path, records: Sequence[Record], names: Pairs, bones: Pa
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         figure = preview_figure(root, chosen, names, bones)
-        how: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 1}}
-        write_atomically(root / "preview.png", lambda temporary: figure.savefig(temporary, **how))
+        save_options: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 1}}
+        write_atomically(root / "preview.png", lambda temporary: figure.savefig(temporary, **save_options))
 
 
 def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: Pairs = ()) -> Figure:

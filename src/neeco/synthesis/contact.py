@@ -69,8 +69,8 @@ class RestingTissue:
         self.rows: dict[str, Tensor] = {}  # of the opaque Gaussians of each instrument's working end
         bodies = [item.name for item in scene.instruments]
         for name, points in keypoints.items():
-            own = scene.canonical.bodies == 1 + bodies.index(name)
-            solid = (own & (posed.opacities > LABELS.surface_alpha)).nonzero()[:, 0]
+            of_instrument = scene.canonical.bodies == 1 + bodies.index(name)
+            solid = (of_instrument & (posed.opacities > LABELS.surface_alpha)).nonzero()[:, 0]
             tips = [point for key, point in points.items() if key.startswith("tip")] or list(points.values())[-1:]
             near = cdist(to_numpy(posed.means[solid]), tips).min(1) < CONTACT.end_mm
             if near.any():
@@ -99,8 +99,8 @@ def contact_of(scene: GaussianScene, drawing: LayeredDrawing, name: str) -> dict
     normal, a quantile over the working end's opaque Gaussians (one standard deviation thick); negative: distance above
     it, at most `reach_mm`. contact_box: x, y, width, height (px) of the tissue within `reach_mm`; None: no contact.
     """
-    known = drawing.keypoints.get(name)
-    tissue = known and (RestingTissue.of.get(scene) or RestingTissue.of.setdefault(scene, RestingTissue(scene)))
+    keypoints = drawing.keypoints.get(name)
+    tissue = keypoints and (RestingTissue.of.get(scene) or RestingTissue.of.setdefault(scene, RestingTissue(scene)))
     if not tissue or name not in tissue.rows:
         return {}
     state, posed, rows = drawing.state.instruments[name], drawing.posed, tissue.rows[name]

@@ -296,8 +296,8 @@ def writers() -> dict[str, type[Writer]]:
 def writer(name: str) -> type[Writer]:
     """Return the writer of the format `name`. Raises NeecoError when there is none."""
     if name not in writers():
-        known = ", ".join(writers())
-        raise NeecoError(f"--formats: {name!r} is unknown; choose of {known}, or install the package that has it")
+        available = ", ".join(writers())
+        raise NeecoError(f"--formats: {name!r} is unknown; choose of {available}, or install the package that has it")
     return writers()[name]
 
 

@@ -116,8 +116,8 @@ class Acceptance:
         labelled = drawing.parts.numpy() > 0
         if labelled.any() and unobserved[labelled].mean(dtype=np.float32) > self.max_unobserved:
             return UNOBSERVED_SIDE
-        for some, others in combinations(self.recorded_together, 2):
-            for a, b in product(some & drawing.layers.keys(), others & drawing.layers.keys()):
+        for group, rivals in combinations(self.recorded_together, 2):
+            for a, b in product(group & drawing.layers.keys(), rivals & drawing.layers.keys()):
                 first, second = drawing.layers[a], drawing.layers[b]
                 both = first.mask & second.mask & (first.depth > 0) & (second.depth > 0)
                 near = np.abs(first.depth - second.depth)[both] < ACCEPTED.min_gap_mm
@@ -277,8 +277,8 @@ def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
         if generator.sampler.prescribed:
             return skipped_sample(index, error.refused)
         raise
-    how: dict[str, Any] = {"refused": sample.refused, "facts": sample.facts, "quality": generator.settings.jpeg_quality}
-    return encoded_sample(index, sample.drawing, labels_of(generator.scene, sample.drawing, sample.labels), **how)
+    labels, quality = labels_of(generator.scene, sample.drawing, sample.labels), generator.settings.jpeg_quality
+    return encoded_sample(index, sample.drawing, labels, refused=sample.refused, facts=sample.facts, quality=quality)
 
 
 def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:

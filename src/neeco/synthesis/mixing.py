@@ -126,10 +126,10 @@ class Mixture:
         end = _working_end(scene, state, seen_by)
         shift = np.eye(4)
         own_tissue = self.own_tissue_alone[self.instrument_scenes.index(scene)]
-        here, there = tissue_depth(self.tissue_alone, camera, end), tissue_depth(own_tissue, seen_by, end)
-        if here > 0 and there > 0 and end[2] > 0:
+        target, source = tissue_depth(self.tissue_alone, camera, end), tissue_depth(own_tissue, seen_by, end)
+        if target > 0 and source > 0 and end[2] > 0:
             min_depth = min(self.min_depth[name] for name in registered.instruments)
-            depth = max(end[2] + here - there, min(min_depth, end[2]))
+            depth = max(end[2] + target - source, min(min_depth, end[2]))
             shift[:3, 3] = (depth / end[2] - 1) * end
         carry = to_numpy(camera.world_from_camera) @ shift @ camera_from_world
         return dict(with_poses(registered, lambda name, pose: carry @ pose).instruments)

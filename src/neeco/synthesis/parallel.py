@@ -65,8 +65,8 @@ class GeneratorSpec:
     def open(self) -> SampleGenerator:
         """The generator. Raises NeecoError where a file cannot be read or does not fit."""
         if not self.files:
-            scene, *others = (load_gaussians(path, "synthesize", torch.device(self.device)) for path in self.scenes)
-            return SampleGenerator.of(scene, self.settings, others)
+            scene, *rest = (load_gaussians(path, "synthesize", torch.device(self.device)) for path in self.scenes)
+            return SampleGenerator.of(scene, self.settings, rest)
         folder = tempfile.TemporaryDirectory()
         for name, content in self.files.items():
             file = Path(folder.name) / name

@@ -101,8 +101,8 @@ class Search:
         fits = [fitter.fit(view, state, prior, levels=(0.125, 0.25), steps=(6, 4)) for state in starts]
         fitted = _by_gain(fits)
         if fitted:
-            others = self._different(fitter.ranked(view, self.turned(fitted[0].state), 0.25), STARTS.n_turned)
-            fits = [fitter.fit(view, state, prior, levels=(0.25,), steps=(6,)) for state in others]
+            distinct_states = self._different(fitter.ranked(view, self.turned(fitted[0].state), 0.25), STARTS.n_turned)
+            fits = [fitter.fit(view, state, prior, levels=(0.25,), steps=(6,)) for state in distinct_states]
             fitted = _by_gain([*fitted, *fits])
         last = [
             fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4)) for fit in fitted[: STARTS.n_finalists]

@@ -332,9 +332,9 @@ def _first_state(footage: Capture, frame: Frame, scene: GaussianScene) -> State:
         stated = frame.state.instruments.get(item.name)
         missing = [name for name in item.joints if stated is not None and name not in stated.joints]
         if stated is None or missing:
-            what = f"instrument {item.name!r}" if stated is None else f"joint {missing[0]!r} of {item.name!r}"
+            absent = f"instrument {item.name!r}" if stated is None else f"joint {missing[0]!r} of {item.name!r}"
             raise NeecoError(
-                f"{footage.root}: {frame.name}: instruments: the first frame does not state {what}; state it there, "
+                f"{footage.root}: {frame.name}: instruments: the first frame does not state {absent}; state it there, "
                 "or use --start none"
             )
         states[item.name] = InstrumentState(stated.pose.double(), {name: stated.joints[name] for name in item.joints})

@@ -145,8 +145,8 @@ def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
     if not isinstance(group := values.get("deformation") or {}, Mapping):
         raise NeecoError(f"deformation: {group!r} is not a group of fields")
     settings = method_settings(method, group)
-    others = {name: value for name, value in values.items() if name not in ("deformation", *REMOVED_GROUPS)}
-    config = structure(TrainConfig, others, owner="the training config")
+    general = {name: value for name, value in values.items() if name not in ("deformation", *REMOVED_GROUPS)}
+    config = structure(TrainConfig, general, owner="the training config")
     return with_fields(config, {"deformation": settings})
 
 

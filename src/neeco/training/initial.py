@@ -49,8 +49,8 @@ def begin_session(
     session = new_session(scene.to(views.device), views, config, report)
     session.timed = capture.timed
     if is_new and (trees := scene.deformation.begin(session)):
-        found = [replace(item, kinematics=trees.get(item.name, item.kinematics)) for item in capture.instruments]
-        return begin_session(replace(capture, instruments=tuple(found)), views, config, report)
+        instruments = [replace(item, kinematics=trees.get(item.name, item.kinematics)) for item in capture.instruments]
+        return begin_session(replace(capture, instruments=tuple(instruments)), views, config, report)
     session.start()
     return session
 
@@ -155,8 +155,8 @@ def moving_joints(
 def _explained(design: np.ndarray, values: np.ndarray, stretches: int) -> float:
     """Return the share of the variance of values [N] that a linear fit to design [N, P] explains, of each of several
     stretches by the fit to the others: dozens of smooth frames fit a dozen numbers of a pose by chance."""
-    left = np.zeros(len(values))
+    residuals = np.zeros(len(values))
     for test in np.array_split(np.arange(len(values)), stretches):
         use = np.setdiff1d(np.arange(len(values)), test) if stretches > 1 else test
-        left[test] = values[test] - design[test] @ np.linalg.lstsq(design[use], values[use], rcond=1e-6)[0]
-    return 1 - float(np.square(left).mean() / values.var())
+        residuals[test] = values[test] - design[test] @ np.linalg.lstsq(design[use], values[use], rcond=1e-6)[0]
+    return 1 - float(np.square(residuals).mean() / values.var())

@@ -268,12 +268,12 @@ def read_checkpoint(run: Path) -> tuple[DrawableScene, dict[str, Any], dict[str,
             scene = unpack_scene(parts, header["scene"])
         except NeecoError as error:  # which knows no file
             raise ValueError(str(error)) from None
-        others = {name: t for name, t in tensors.items() if not name.startswith("scene/")}
-        require_numbers(others)
+        training_tensors = {name: t for name, t in tensors.items() if not name.startswith("scene/")}
+        require_numbers(training_tensors)
         json.dumps(header, allow_nan=False)  # raises ValueError for NaN and infinity
         if not all(isinstance(value, int | float) for row in header.get("window", []) for value in row):
             raise ValueError("window: losses that are no numbers")
-    return scene, header, others
+    return scene, header, training_tensors
 
 
 @contextmanager

@@ -180,13 +180,13 @@ def order_by_pose(states: np.ndarray) -> np.ndarray:
     centred = (states - states.mean(0)) / (states.std(0) + 1e-9)
     _, _, directions = np.linalg.svd(centred, full_matrices=False)
     current = int((centred @ directions[0]).argmin())
-    left = np.ones(len(states), bool)
+    unvisited = np.ones(len(states), bool)
     walk = []
     for _ in range(len(states)):
         walk.append(current)
-        left[current] = False
-        if left.any():
+        unvisited[current] = False
+        if unvisited.any():
             distance = ((centred - centred[current]) ** 2).sum(1)
-            distance[~left] = np.inf
+            distance[~unvisited] = np.inf
             current = int(distance.argmin())
     return np.array(walk)

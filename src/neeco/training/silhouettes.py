@@ -44,8 +44,8 @@ class Silhouettes:
         """Return the weighted cross entropy [] of the rendered label [h, w] of frame `index` against its silhouette."""
         height, width = label.shape
         values = self.values[index].cpu().numpy().astype(np.float32)
-        how = cv2.INTER_AREA if width < values.shape[1] else cv2.INTER_LINEAR
-        resized = cv2.resize(values, (width, height), interpolation=how)
+        interpolation = cv2.INTER_AREA if width < values.shape[1] else cv2.INTER_LINEAR
+        resized = cv2.resize(values, (width, height), interpolation=interpolation)
         certain = torch.from_numpy((resized - UNKNOWN) / (INSTRUMENT - UNKNOWN)).to(label)
         instrument, tissue = certain.clamp(0, 1), (-certain).clamp(0, 1)
         label = label.clamp(SILHOUETTES.min_share, 1 - SILHOUETTES.min_share)

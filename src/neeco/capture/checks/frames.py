@@ -172,10 +172,10 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
     readings = np.array([[state.joints[joint] for joint in logged] for state in states])  # [S, R]
     readings = readings - readings.mean(0)
     for index, joint in enumerate(logged):
-        reading, others = readings[:, index], np.delete(readings, index, 1)
-        if reading.std() < MIN_DEVIATION or not others.shape[1]:
+        reading, rest = readings[:, index], np.delete(readings, index, 1)
+        if reading.std() < MIN_DEVIATION or not rest.shape[1]:
             continue
-        explained = 1 - (reading - others @ np.linalg.lstsq(others, reading, rcond=1e-6)[0]).var() / reading.var()
+        explained = 1 - (reading - rest @ np.linalg.lstsq(rest, reading, rcond=1e-6)[0]).var() / reading.var()
         if explained > SETTINGS.max_explained:
             message = f"joint {printable(joint)} of {name} follows from the others ({explained:.1%} of its variance)"
             place.warning(message, "also move joints one at a time, to separate their axes")

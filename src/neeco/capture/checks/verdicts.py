@@ -107,8 +107,8 @@ class ImageVerdicts:
             return Verdict("undecided")
         rows, (recorded, root_from_recorded) = self._motion.rows, recorded_poses
         roots = recorded @ root_from_recorded
-        others = [(other[0] @ other[1])[rows] for other in poses.values() if other is not None]
-        motion = self._motion.without(others, roots[rows])
+        other_paths = [(other[0] @ other[1])[rows] for other in poses.values() if other is not None]
+        motion = self._motion.without(other_paths, roots[rows])
         if motion is None:
             return Verdict("undecided")
         name, motion = printable(instrument.name), motion.with_recorded(roots[rows])
@@ -265,9 +265,9 @@ def resampled(
 
 def camera_candidates(poses: np.ndarray) -> Iterator[Candidate]:
     """Mistakes in camera poses [F, 4, 4] (OpenCV axes) and images."""
-    for what, pixels in PIXELS.items():
+    for condition, pixels in PIXELS.items():
         remedy = "turn their pixels, not only an EXIF tag"
-        yield Candidate("image", f"the images are {what}", remedy, SETTINGS.camera, pixels=pixels)
+        yield Candidate("image", f"the images are {condition}", remedy, SETTINGS.camera, pixels=pixels)
     written = swap_camera_axes(poses)  # as transform_matrix has them
     message, inverse = "camera matrices are world-to-camera", np.linalg.inv(written)
     for words, moved in (

@@ -86,7 +86,7 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
 
     Images are in the capture's `images/`; sorted by name, every 8th is a test frame, and time is the order.
     """
-    model, *others = models
+    model, *unused_models = models
     parsed = Parsed(root, timed=False, as_source=as_source)
     suffix = _suffix(model)
     parse_cameras, parse_images, parse_points = _PARSERS[suffix]
@@ -109,7 +109,7 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
-    _note_left_out(model, others, images, root, Node(None, file, "", report))
+    _note_left_out(model, unused_models, images, root, Node(None, file, "", report))
     images.sort(key=lambda item: natural_order(item.name))
     orders = instants([image.name for image in images], [image.camera_id for image in images])
     orders = orders or list(range(len(images)))

@@ -85,17 +85,17 @@ def surface_behind(
     bound = _deepest_instrument(shapes, pinhole)
     if not bound.any():
         flat = (otherwise if deepest is None else SETTINGS.behind_ratio * deepest) * np.ones((height, width))
-        how = (
+        source = (
             f"not known and taken to be {otherwise:.0f} mm, as nothing says where an instrument was"
             if deepest is None
             else f"not known; a plane well behind the deepest recorded pose ({deepest:.0f} mm) stands for it"
         )
-        return TissueSurface(flat, how)
+        return TissueSurface(flat, source)
     inverse = _smoothest_behind(1 / (SETTINGS.behind_ratio * np.where(bound > 0, bound, np.inf)))
     depth = 1 / cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
     low, high = np.quantile(depth, (0.05, 0.95))
-    how = f"not measured: a smooth surface well behind all places of the instruments ({low:.0f} to {high:.0f} mm)"
-    return TissueSurface(depth, how)
+    source = f"not measured: a smooth surface well behind all places of the instruments ({low:.0f} to {high:.0f} mm)"
+    return TissueSurface(depth, source)
 
 
 def _deepest_instrument(shapes: Iterable[tuple[RoughShape, np.ndarray]], pinhole: Lens) -> np.ndarray:
@@ -194,7 +194,7 @@ def epipolar_error(
     the vertical, which only make the depth another one. pinholes, right_from_left as in `surface_from_stereo`.
     """
     sift: Any = cv2.SIFT.create(SETTINGS.max_features)
-    (points, descriptors), (others, of_right) = (
+    (points, descriptors), (right_points, of_right) = (
         sift.detectAndCompute(cv2.cvtColor(np.clip(image, 0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY), None)
         for image in (left, right)
     )
@@ -205,7 +205,7 @@ def epipolar_error(
     if len(good) < SETTINGS.min_matches:
         return None
     # OpenCV counts from the first pixel's centre
-    seen = np.array([[*points[match.queryIdx].pt, *others[match.trainIdx].pt] for match in good]) + 0.5
+    seen = np.array([[*points[match.queryIdx].pt, *right_points[match.trainIdx].pt] for match in good]) + 0.5
     rays = [
         np.column_stack(
             [(seen[:, k] - lens.cx) / lens.fl_x, (seen[:, k + 1] - lens.cy) / lens.fl_y, np.ones(len(seen))]

@@ -147,8 +147,8 @@ def solve_joint(
     covariance += 0.5
     answered = covariance[np.ix_(frames, frames)] + np.eye(len(frames)) * np.radians(SETTINGS.hand_sd_deg) ** 2
     gain = np.linalg.solve(answered, covariance[frames]).T
-    left = covariance - gain @ covariance[frames]
-    return AnglePosterior(_within(center + gain @ (angles - center), limits), SETTINGS.joint_sd_scale**2 * left)
+    posterior = covariance - gain @ covariance[frames]
+    return AnglePosterior(_within(center + gain @ (angles - center), limits), SETTINGS.joint_sd_scale**2 * posterior)
 
 
 def chain_breaks(pairs: RollPairs, rolls: AnglePosterior) -> list[int]:

@@ -168,19 +168,19 @@ class RecordingFormat(ABC):
         fitting = [stream for stream in of_kind if stream.problem is None]
         named = [stream for stream in streams if stream.name == wanted][:1]
         candidates = named if wanted is not None else fitting or of_kind[:1]
-        if len(candidates) == 1 and (found := candidates[0]).problem is not None:
-            raise NeecoError(f"{path}: {found.name}: {found.problem}")
+        if len(candidates) == 1 and (only := candidates[0]).problem is not None:
+            raise NeecoError(f"{path}: {only.name}: {only.problem}")
         if len(candidates) == 1 and candidates[0] in fitting:
             return candidates[0]
         listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
         sought = " or ".join(kinds)
         if wanted is None:
-            what = f"holds {len(fitting)} streams of {sought}; name one as `stream` in the recording: {listed}"
-            raise NeecoError(f"{path}: {what}")
-        what = f"holds no {printable(wanted)}"
+            problem = f"holds {len(fitting)} streams of {sought}; name one as `stream` in the recording: {listed}"
+            raise NeecoError(f"{path}: {problem}")
+        problem = f"holds no {printable(wanted)}"
         if candidates:
-            what = f"{printable(wanted)} is {candidates[0].type}, not {sought}"
-        raise NeecoError(f"{path}: stream: {what}; name one of {listed}")
+            problem = f"{printable(wanted)} is {candidates[0].type}, not {sought}"
+        raise NeecoError(f"{path}: stream: {problem}; name one of {listed}")
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         """Return poses or readings as a table. stream: the name of one, where there are several."""

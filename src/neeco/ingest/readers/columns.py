@@ -206,16 +206,16 @@ def recognise_time(header: Sequence[str]) -> RecognisedColumns:
 def recognise_pose(header: Sequence[str], named: _Given = _NOTHING) -> RecognisedColumns:
     """The columns of time, position and rotation in a log of poses, none of them for two things. named: the columns of
     those that the recording names, by meaning: these are not looked for."""
-    left = _left(header, named)
-    when = RecognisedColumns() if "time" in named else recognise_time(left)
-    left = [name for name in left if name not in (when.time or ())]
+    free = _left(header, named)
+    when = RecognisedColumns() if "time" in named else recognise_time(free)
+    free = [name for name in free if name not in (when.time or ())]
     unclear: dict[str, str] = {}
     matrix, position, rotation, form = None, None, None, None
     if "rotation" not in named:
-        matrix = _matrix(left)
-        rotation, form = _rotation(left, matrix, unclear)
+        matrix = _matrix(free)
+        rotation, form = _rotation(free, matrix, unclear)
     if "position" not in named and not (matrix and len(matrix) > 9):
-        position = _group(left, _POSITIONS, "length", "position", unclear)
+        position = _group(free, _POSITIONS, "length", "position", unclear)
     if shared := [name for name in position or () if name in (rotation or ())]:
         why = f"{', '.join(shared)} may be the position's or the quaternion's; name both under columns"
         unclear |= {"position": why, "rotation": why}
@@ -223,7 +223,7 @@ def recognise_pose(header: Sequence[str], named: _Given = _NOTHING) -> Recognise
     lower = [_plain(name) for name in header]
     ndi = {"state", "q0", "tx", "ty", "tz"} <= set(lower)
     ros = bool(position and _ROS.search(position[0].lower()))
-    states = [name for name in left if (ndi and _plain(name) == "state") or name.endswith("TransformStatus")]  # of PLUS
+    states = [name for name in free if (ndi and _plain(name) == "state") or name.endswith("TransformStatus")]  # of PLUS
     state = next(iter(states), None)
     unit = "mm" if ndi else "m" if ros else None
     return replace(
@@ -266,9 +266,9 @@ def recognise_value(header: Sequence[str], named: _Given = _NOTHING) -> tuple[st
     header = _left(header, named)
     when = RecognisedColumns() if "time" in named else recognise_time(header)
     counters = {"frame", "seq", "index", "header_seq", "field_header_seq", "frame_id", "header_frame_id", "state"}
-    others = [name for name in header if name and name not in (when.time or ()) and _plain(name) not in counters]
-    others = [name for name in others if not _plain(name).startswith(("field_header", "header_"))]
-    return (others[0] if len(others) == 1 else None), when
+    values = [name for name in header if name and name not in (when.time or ()) and _plain(name) not in counters]
+    values = [name for name in values if not _plain(name).startswith(("field_header", "header_"))]
+    return (values[0] if len(values) == 1 else None), when
 
 
 def joint_columns(header: Sequence[str], bodies: Mapping[str, Sequence[str]]) -> list[str]:

@@ -122,8 +122,8 @@ class LeRobot(RecordingFormat):
         ]
         if stream is None and len(data.records) > 1:
             examples = ", ".join(candidate.name for candidate in streams if candidate.kind in kinds)[:300]
-            what = f"missing, and there are {data.range_words}; name one, as in {examples}"
-            raise NeecoError(f"{data.path}: stream: {what}")
+            problem = f"missing, and there are {data.range_words}; name one, as in {examples}"
+            raise NeecoError(f"{data.path}: stream: {problem}")
         key = self.choose(data.path, wanted, *kinds, streams=streams).name.partition("/")[2]
         return data.episode(number), key
 
@@ -154,8 +154,8 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.
     order = np.argsort(table["frame_index"][:, 0], kind="stable")
     frames, stamps = table["frame_index"][order, 0], table["timestamp"][order, 0]
     if len(frames) != episode.length:
-        what = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}"
-        raise NeecoError(f"{episode.data}: {what}; download the data set again")
+        problem = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}"
+        raise NeecoError(f"{episode.data}: {problem}; download the data set again")
     rows = np.arange(len(frames))
     if not np.array_equal(frames, rows):
         raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")

@@ -223,8 +223,8 @@ def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tu
     if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
         rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
     quats, good = to_quaternions(form, turns, source.euler_convention, angle)
-    what = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
-    rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {what}; name the right columns")
+    expected = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
+    rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {expected}; name the right columns")
     distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
     if distance > SETTINGS.max_distance_mm:
         raise NeecoError(
@@ -304,8 +304,8 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     values = numbers(table, (count_name, angle_name))
     if np.isnan(values).any():
         row, slot = np.argwhere(np.isnan(values))[0].tolist()
-        what = f"{(count_name, angle_name)[slot]}: a number is missing"
-        raise NeecoError(f"{path}: line {table.lines[row]}: {what}; repair or remove the line")
+        problem = f"{(count_name, angle_name)[slot]}: a number is missing"
+        raise NeecoError(f"{path}: line {table.lines[row]}: {problem}; repair or remove the line")
     order = np.argsort(values[:, 0], kind="stable")
     counts, angles, lines = values[order, 0], values[order, 1] * named.UNITS["angle"][unit], table.lines[order]
     turning = (np.diff(counts) <= 0) | (np.diff(angles) * np.sign(angles[-1] - angles[0]) <= 0)
@@ -333,8 +333,8 @@ def _calibrated(rows: Rows, name: str, readings: np.ndarray, path: Path, angle_u
     clamped = (excess > 0) & ~outside
     if clamped.any():
         by = f"{low:g} to {high:g}, by at most {excess[clamped].max():g}"
-        what = f"{counted(int(clamped.sum()), 'row')} with {name} just outside the table {path.name} ({by})"
-        rows.repairs.append(f"{what}: read as its end ({rows.table.list_rows(rows.table.lines[clamped])})")
+        clamped_rows = f"{counted(int(clamped.sum()), 'row')} with {name} just outside the table {path.name} ({by})"
+        rows.repairs.append(f"{clamped_rows}: read as its end ({rows.table.list_rows(rows.table.lines[clamped])})")
     reason = f"{name} lies far outside the calibration table {path.name}"
     rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
     return np.asarray(values)

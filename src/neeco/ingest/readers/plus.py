@@ -149,8 +149,8 @@ def read_sequence(path: Path) -> FrameSequence:
     with one_line(path, "cannot read", "correct the path"), open_file(path, "a sequence") as stream:
         plain, frames, start = _read_header(path, stream, is_nrrd)
     if not frames:
-        what = "holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence"
-        raise NeecoError(f"{path}: {what}; give one, or another file")
+        problem = "holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence"
+        raise NeecoError(f"{path}: {problem}; give one, or another file")
     sizes = _integers(path, plain, "sizes" if is_nrrd else "DimSize")
     usual = "" if is_nrrd else " ".join(["domain"] * (len(sizes) - 1) + ["list"])
     size, count, channels = _dimensions(path, sizes, plain.get("kinds", usual).lower().split())
@@ -167,8 +167,8 @@ def read_sequence(path: Path) -> FrameSequence:
     if name.upper() != "LOCAL":
         file, start = path.parent / name, 0
         if Path(name).name != name or not file.is_file():
-            what = f"{printable(name)} is no file next to {path.name}"
-            raise NeecoError(f"{path}: {what}; put there what was written with it")
+            problem = f"{printable(name)} is no file next to {path.name}"
+            raise NeecoError(f"{path}: {problem}; put there what was written with it")
     packed = plain.get("encoding", "raw").lower() != "raw" or plain.get("compresseddata", "").lower() == "true"
     sequence = FrameSequence(
         path=path, size=size, count=count, channels=channels, fields=frames, data=(file, start), packed=packed
@@ -294,8 +294,8 @@ class PlusSequence(RecordingFormat):
     def read(self, path: Path, stream: str | None = None) -> Table:
         sequence = read_sequence(path)
         if not sequence.transforms:
-            what = "holds no transforms (Seq_Frame0000_StylusToTrackerTransform)"
-            raise NeecoError(f"{path}: {what}; name a log of poses")
+            problem = "holds no transforms (Seq_Frame0000_StylusToTrackerTransform)"
+            raise NeecoError(f"{path}: {problem}; name a log of poses")
         wanted = None if stream is None else stream.removesuffix(TRANSFORM)
         name = self.choose(path, wanted, Kind.POSES).name
         statuses, texts = sequence.statuses(name), sequence.fields[name + TRANSFORM]

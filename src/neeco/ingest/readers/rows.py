@@ -93,26 +93,26 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, recognised: Recog
     table, names, rate = rows.table, source.time or recognised.time, source.rate_hz
     if names is None and rate is not None:
         if headers := _headers(table, range(len(table.rows))):
-            what = f"line {headers[0]} repeats the header, and its rows have no times"
-            raise NeecoError(f"{table.where}: {what}; keep those of one run in a file")
+            problem = f"line {headers[0]} repeats the header, and its rows have no times"
+            raise NeecoError(f"{table.where}: {problem}; keep those of one run in a file")
         return np.arange(len(table.rows)) / rate
     if names is None:
-        what = "no column of times found; name it as columns.time (or add t_s), or say rate_hz"
-        raise NeecoError(f"{table.where}: header: {what} where its rows come at a fixed rate")
+        problem = "no column of times found; name it as columns.time (or add t_s), or say rate_hz"
+        raise NeecoError(f"{table.where}: header: {problem} where its rows come at a fixed rate")
     cells, meaning = read_cells(rows, names), named.recognise_time(names)
     if rate is not None and (len(names) == 2 or meaning.time_unit or named.split_unit(names[0], "time")[1]):
-        what = f"{', '.join(names)} holds times and counts no frames"
+        problem = f"{', '.join(names)} holds times and counts no frames"
         raise NeecoError(
-            f"{table.where}: rate_hz: {what}; leave rate_hz out, or name the column that counts as columns.time"
+            f"{table.where}: rate_hz: {problem}; leave rate_hz out, or name the column that counts as columns.time"
         )
     if len(names) == 2:
         return cells[:, 0] + cells[:, 1] * 1e-9
     if rate is not None:
         return cells[:, 0] / rate
     if meaning.counts_frames:
-        what = "counts frames, and nothing says how many a second; say rate_hz in the recording"
+        problem = "counts frames, and nothing says how many a second; say rate_hz in the recording"
         raise NeecoError(
-            f"{table.where}: {names[0]}: {what} (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
+            f"{table.where}: {names[0]}: {problem} (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
         )
     return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, meaning.time_unit, "")
 
@@ -124,18 +124,18 @@ def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
     lacking, unreadable = dict[int, str](), dict[int, str]()  # the first such cell of each row, in words
     for row, slot in np.argwhere(np.isnan(values) & rows.keep[:, None]).tolist():
         cell = str(table.rows[row, column_index(table, names[slot])])
-        for found in (lacking, unreadable) if not _is_readable(cell) else (lacking,):
-            found.setdefault(row, f"{names[slot]} is {printable(cell, 24)}, not a number")
+        for faults in (lacking, unreadable) if not _is_readable(cell) else (lacking,):
+            faults.setdefault(row, f"{names[slot]} is {printable(cell, 24)}, not a number")
     rows.drop(list(lacking), f"values are missing, first: {next(iter(lacking.values()), '')}")
     too_many = len(unreadable) > max(3, SETTINGS.max_unreadable * (len(unreadable) + rows.keep.sum()))
     if too_many or (lacking and not rows.keep.any()):
         row, first = next(iter((unreadable if too_many else lacking).items()))
-        what = f"{table.where}: {table.record} {table.lines[row]}: {first}"
+        problem = f"{table.where}: {table.record} {table.lines[row]}: {first}"
         if too_many:
             similar = f"{len(unreadable)} of {counted(len(table.rows), 'row')} like it"
-            raise NeecoError(f"{what} ({similar}); name other columns or repair the file")
-        what = f"{what}, and no row has values of {', '.join(names)}"
-        raise NeecoError(f"{what}; name other columns or another file in the recording")
+            raise NeecoError(f"{problem} ({similar}); name other columns or repair the file")
+        problem = f"{problem}, and no row has values of {', '.join(names)}"
+        raise NeecoError(f"{problem}; name other columns or another file in the recording")
     return values
 
 

@@ -92,8 +92,8 @@ class SurgPose(RecordingFormat):
 
 def _videos(path: Path) -> list[str]:
     """Videos, the left one in usual light first."""
-    found = [file.relative_to(path).as_posix() for file in visible_entries(path, "**/*_video.mp4")]
-    return sorted(found, key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
+    videos = [file.relative_to(path).as_posix() for file in visible_entries(path, "**/*_video.mp4")]
+    return sorted(videos, key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
 
 
 def _read(path: Path) -> tuple[_ByArm, _ByArm]:

@@ -407,7 +407,7 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     if log.stream is not None and log.stream.columns is not None:  # others are recognised again when read
         stated = (("position", columns.position), (columns.form, columns.rotation))
         lines += ["columns:", *(f"  {key}: [{', '.join(map(_scalar, names))}]" for key, names in stated if names)]
-    lines += [f"# columns: {what} is not clear: {why}" for what, why in columns.unclear.items()]
+    lines += [f"# columns: {meaning} is not clear: {why}" for meaning, why in columns.unclear.items()]
     return lines + _unit_lines(columns, {"length": of_length})
 
 

@@ -257,10 +257,10 @@ class _AxesProblem:
         return self._cost(self.residuals(axes))
 
     def _cost(self, residuals: np.ndarray) -> float:
-        edges, others = np.split(residuals, [self.edges.deviations.size])
+        edges, prior_residuals = np.split(residuals, [self.edges.deviations.size])
         return float(
             0.5 * SETTINGS.edge_loss_sd**2 * np.log1p((edges / SETTINGS.edge_loss_sd) ** 2).sum()
-            + 0.5 * (others**2).sum()
+            + 0.5 * (prior_residuals**2).sum()
         )
 
     def linearise(self, axes: ShaftAxes) -> Linearisation[ShaftAxes]:

@@ -320,10 +320,10 @@ def _narrower_part(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges) -> flo
     places, values = [], []
     for frame in range(len(axes.points)):
         for side in range(2):
-            there = np.isfinite(edges.deviations[frame, side])
-            behind = -axis_coordinates(axes, frame, edges.pixels[frame, side, there], video.intrinsics)
+            observed = np.isfinite(edges.deviations[frame, side])
+            behind = -axis_coordinates(axes, frame, edges.pixels[frame, side, observed], video.intrinsics)
             places.append(behind / (SHAFT.bin_radii * video.radius))
-            values.append(missed[frame, side, there])
+            values.append(missed[frame, side, observed])
     place, value = np.concatenate(places).astype(int), np.concatenate(values)
     numbers = [number for number in range(SHAFT.bins) if (place == number).sum() >= SHAFT.min_filled * len(axes.points)]
     medians = np.array([np.median(value[place == number]) for number in numbers])

@@ -354,6 +354,6 @@ def composite_backward(
             WIDTH=columns, PADDED=triton.next_power_of_2(columns), SLOTS=SLOTS, num_warps=1, enable_fp_fusion=True,
         )  # fmt: skip
     if more:
-        own = sums[:, HEAD.value + count :].reshape(n, more, SHAPE.value)
-        sums[:, : SHAPE.value] += own.sum(1)
+        slotted_sums = sums[:, HEAD.value + count :].reshape(n, more, SHAPE.value)
+        sums[:, : SHAPE.value] += slotted_sums.sum(1)
     return sums[:, : HEAD.value + count]

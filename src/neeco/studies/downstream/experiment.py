@@ -208,8 +208,8 @@ class DownstreamJob(Job):
         if self.fold == self.request.kept_fold:
             write_predictions(self.folder, test, [sample.name for sample in samples], predictions)
         frames = [
-            {"box_iou": box_iou(found, true)} if isinstance(found, Detections) else mask_scores(found, true, names)
-            for found, true in zip(predictions, truth, strict=True)
+            {"box_iou": box_iou(output, true)} if isinstance(output, Detections) else mask_scores(output, true, names)
+            for output, true in zip(predictions, truth, strict=True)
         ]
         boxes = [prediction for prediction in predictions if isinstance(prediction, Detections)]
         rows = [

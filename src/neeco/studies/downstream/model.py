@@ -154,8 +154,8 @@ def model_class(name: str) -> type[TorchModel]:
     """The model of that name. Raises NeecoError when there is none."""
     models = find_models()
     if name not in models:
-        known = ", ".join(models)
-        raise NeecoError(f"--models: {name!r} is unknown; choose of {known}, or install the package that has it")
+        available = ", ".join(models)
+        raise NeecoError(f"--models: {name!r} is unknown; choose of {available}, or install the package that has it")
     return models[name]
 
 

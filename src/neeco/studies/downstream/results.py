@@ -291,17 +291,17 @@ def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
     """The arm that `arm` is compared with on a test: the better of labelled frames alone and strongly augmented, at as
     many labelled frames (sets alone: at the most); strong augmentation with none; permuted labels with the right."""
     words, baselines = words_of(arm.condition), [words_of(name) for name in BASELINES]
-    others = [other for other in scores.jobs if other.model == arm.model and other != arm]
+    other_arms = [other for other in scores.jobs if other.model == arm.model and other != arm]
     wanted, real = baselines, arm.real
     if PERMUTED in words:
         wanted = [words - {PERMUTED}]
     elif words in baselines:
         wanted = baselines[: baselines.index(words)]
     elif REAL not in words:
-        real = max((other.real for other in others if words_of(other.condition) in baselines), default=0)
+        real = max((other.real for other in other_arms if words_of(other.condition) in baselines), default=0)
     rivals = [
         (mean, other)
-        for other in others
+        for other in other_arms
         if words_of(other.condition) in wanted
         and other.real == real
         and (mean := mean_or_none(scores.by_fold(other, test, metric))) is not None
