@@ -1,4 +1,4 @@
-"""Tissue in test frames that no training frame observed: no model can render it right, so it is scored apart."""
+"""Tissue in test frames that no training frame observed: no model can render it, so it is scored apart."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageSettings:
-    """The depth maps that a point is compared with."""
+    """Settings of the depth maps for occlusion tests."""
 
-    max_views: int = 96  # of training, evenly spaced over the recording: neighbours show the same tissue
+    max_views: int = 96  # training views, evenly spaced over the recording; adjacent ones show the same tissue
     scale: float = 0.25  # of the image's resolution
     min_side_px: int = 48  # below which images are not reduced
     tolerance: float = 0.02  # share of the depth
-    tolerance_mm: float = 1.0  # in addition
+    tolerance_mm: float = 1.0  # added to it
     nearest_mm: float = 1e-3  # points behind a camera are not observed
-    chunk_views: int = 16  # tested at once; most points are observed in the first chunk
-    min_alpha: float = 0.5  # of a pixel that has a depth
+    chunk_views: int = 16  # views per test; most points are observed in the first chunk
+    min_alpha: float = 0.5  # minimum alpha of a pixel with a depth
 
 
 SETTINGS = CoverageSettings()
@@ -99,8 +99,8 @@ def observed_depths(scene: DrawableScene, frames: Sequence[Frame]) -> Coverage:
 def unobserved_tissue(coverage: Coverage, scene: DrawableScene, frame: Frame) -> tuple[Tensor, Tensor]:
     """Return tissue in `frame` that no training view observed, and all its tissue: two bool masks [H, W].
 
-    The surface is the scene's own expected depth at the frame's state and camera, where nothing is rendered that of the
-    nearest pixel. Instrument pixels (by the composited label) move with the state and are in neither mask.
+    The surface is the scene's expected depth at the frame's state and camera, extrapolated from the nearest pixel where
+    nothing is rendered. Instrument pixels (by the composited label) move with the state and are in neither mask.
     """
     camera = _small(frame.camera)
     rendering = scene.render(frame.state, camera, labels=True)
