@@ -139,7 +139,7 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
 
 
 def _command(info: Mapping[str, Any]) -> str:
-    """The command that makes the set again."""
+    """Return the command that makes the set again."""
     settings = info["settings"]
     if "annotates" in settings:
         words = ["annotate", info["scene"], "--capture", settings["annotates"], "--min-trust", settings["min_trust"]]
@@ -243,7 +243,7 @@ def _draw_label(axes: Axes, label: dict[str, Any], bones: Pairs, corner: np.ndar
 
 
 def _captions(record: Record) -> tuple[str, str]:
-    """Return those of the plain image, its joint values, and of the labelled one, the instruments' visible shares."""
+    """Return captions for the plain image (joint values) and the labelled one (the instruments' visible shares)."""
     joints = [
         f"{joint.removesuffix('_mm')} {value:.1f} mm"
         if joint.endswith("_mm")
