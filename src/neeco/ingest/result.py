@@ -24,10 +24,10 @@ from neeco.ingest.timing.episodes import Contradiction
 
 @dataclass(frozen=True, kw_only=True)
 class IngestResult:
-    """Everything about one ingest but the capture itself (images, cameras, states, points), which lies at `capture`."""
+    """Everything about one ingest except the capture (images, cameras, states, points) in `capture`."""
 
     capture: Path
-    recording: str  # where it came from, in words
+    recording: str  # description of the source
     video_frames: int
     video_fps: float
     size: tuple[int, int]  # width, height px
@@ -58,13 +58,13 @@ class IngestResult:
     contradictions: tuple[Contradiction, ...] = ()  # between parts of the recording
 
     def frame_words(self, frame: int) -> str:
-        """Return a video frame's number, and of several recordings which is meant."""
+        """Return a video frame's number, with its episode if there are several."""
         name = self._episode_of(frame)
         return f"video frame {frame}" if name is None else f"{name}: video frame {frame - self.episodes[name][0]}"
 
     def log_times(self, frame: int, seconds: float) -> dict[str, float]:
-        """Return the logs' times, s, of a video frame that is taken at `seconds` of the capture's time, by clock: of
-        several recordings, those of the frame's own."""
+        """Return the logs' times, s, by clock, of a video frame at `seconds` of the capture's time; with several
+        recordings, of the frame's own logs."""
         name = self._episode_of(frame)
         if name is None:
             return {clock: float(ahead.at(np.array(seconds))) for clock, ahead in self.clocks.items()}
@@ -138,12 +138,12 @@ class IngestResult:
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictSettings:
-    """Limits beyond which there is a warning: conventions, not measurements."""
+    """Limits above which warnings are issued: conventions, not measurements."""
 
     position_mm: float = 1.0  # RMS position residual of the registration
     rotation_deg: float = 0.5  # RMS rotation residual of the registration
     reprojection_px: float = 1.0
-    scale: float = 0.015  # standard deviation of the scale, share
+    scale: float = 0.015  # standard deviation of the scale, relative
     clock_mm: float = 0.5  # motion of an instrument within the standard deviation of its clock
     base_mm: float = 2.0  # standard deviation of a base
     base_deg: float = 1.5  # standard deviation of a base's rotation
@@ -162,8 +162,8 @@ ADVICE = {"good": "good", "careful": "usable", "bad": "do not train"}
 
 @dataclass(frozen=True)
 class Assessment:
-    """headline: one sentence; warnings: why it is not better, one sentence each, the worst first; facts: the measured
-    values that decide, with what is usual."""
+    """headline: one sentence; warnings: one sentence each, the worst first; facts: the decisive measured values, with
+    usual ones."""
 
     level: Literal["good", "careful", "bad"]
     headline: str
@@ -199,9 +199,9 @@ class Assessment:
 
 @dataclass(frozen=True)
 class _Evidence:
-    """Evidence on a capture: a fact, and a sentence that warns where it is unusual.
+    """Evidence on a capture: a fact, and a warning if it is unusual.
 
-    level: 0 where it is usual, 1 for a warning, 2 where the capture is not to be trained on.
+    level: 0 usual, 1 warning, 2 unsuitable for training.
     """
 
     fact: str
@@ -232,8 +232,8 @@ def rms(values: np.ndarray) -> float:
 
 
 def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Problem] = ()) -> Assessment:
-    """Judge a finished ingest by its own numbers, by contradictions in its recording, and by the problems that `check`
-    found in its capture; nothing here knows the truth."""
+    """Assess a finished ingest by its own numbers, contradictions in its recording, and problems that `check` detected
+    in its capture; no ground truth is used."""
     grave = [problem for problem in problems if problem.severity == "error" or problem.contradicted]
     evidence = [_Evidence.of(_sentence(item.sentence), severe=item.severe) for item in result.contradictions]
     evidence += [_Evidence.of(_sentence(str(problem)), severe=True) for problem in grave]
@@ -265,7 +265,7 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
 
 
 def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -> Assessment:
-    """Return the assessment that all evidence gives, the worst first."""
+    """Return the assessment from all evidence, the worst first."""
     ordered = sorted(evidence, key=lambda item: -item.level)
     facts = tuple(item.fact for item in ordered[: LIMITS.facts])
     warnings = tuple(item.reason for item in ordered if item.level)
@@ -290,7 +290,7 @@ def _lower(sentence: str) -> str:
 
 
 def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
-    """Return what was measured, the most telling first."""
+    """Return the measurements, the most informative first."""
     linked = {item.name for item in capture.instruments if item.kinematics is not None}
     evidence = [item for name, base in result.bases.items() for item in _of_base(name, base, linked=name in linked)]
     registration = result.registration
@@ -327,8 +327,8 @@ def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
 
 
 def _placed(registration: Registration, capture: Capture, found_in_images: Collection[str]) -> list[_Evidence]:
-    """Return how well the cameras' place in the tracker's frame is known where instruments are, but for those whose
-    bases were found in the images. Residuals do not show it: where a scope turns little, they are small far off."""
+    """Return the accuracy of the cameras' positions in the tracker's frame at instruments, except those with estimated
+    bases. Residuals do not show it: if a scope hardly rotates, they are small but extrapolate badly."""
     places = [
         state.pose[:3, 3].numpy()
         for frame in capture.frames
