@@ -261,8 +261,8 @@ def _first_choice(plain: Mapping[str, str], choices: _Choices) -> tuple[list[str
 
 
 def recognise_value(header: Sequence[str], named: _Given = _NOTHING) -> tuple[str | None, RecognisedColumns]:
-    """Return the one column, other than the time, that can be a joint's reading; None when there are none or several.
-    named: as for `recognise_pose`."""
+    """Return the only column, besides time, that can be a joint's reading; None without one, or with several. named: as
+    for `recognise_pose`."""
     header = _left(header, named)
     when = RecognisedColumns() if "time" in named else recognise_time(header)
     counters = {"frame", "seq", "index", "header_seq", "field_header_seq", "frame_id", "header_frame_id", "state"}

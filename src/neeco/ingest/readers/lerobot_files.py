@@ -242,8 +242,8 @@ def parquet_names(path: Path) -> list[str]:
 
 
 def read_columns(path: Path, widths: Mapping[str, int], episode: int | None = None) -> dict[str, np.ndarray]:
-    """Return columns of numbers, or of lists of them, as float64 [R, C], NaN of what is null, only of the rows of an
-    episode where one is given. widths: how many numbers a row of each has. Raises NeecoError."""
+    """Return columns of numbers, or of lists of them, as float64 [R, C], NaN for null; only the rows of an episode, if
+    given. widths: numbers per row of each. Raises NeecoError."""
     import pyarrow.dataset
 
     file = _fragment(path)

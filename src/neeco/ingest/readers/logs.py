@@ -143,8 +143,8 @@ def _frame_names(table: Table) -> list[str]:
 
 
 def _frame_of(table: Table, source: PoseColumns) -> str:
-    """Return the frame of poses that the recording states, else the file. Raises NeecoError where neither does, or they
-    contradict each other."""
+    """Return the frame of poses stated by the recording, else by the file. Raises NeecoError if neither states one, or
+    they contradict each other."""
     if source.frame is None:
         if table.meaning is not None and table.frame is None:
             raise NeecoError(f"{table.where}: frame: {table.meaning.question}")

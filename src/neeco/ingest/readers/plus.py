@@ -142,8 +142,8 @@ class FrameSequence:
 
 @read_once
 def read_sequence(path: Path) -> FrameSequence:
-    """Read the header of a sequence. Raises NeecoError where it is none, is damaged, or says what the file does not
-    hold."""
+    """Read the header of a sequence. Raises NeecoError if it is none, is damaged, or promises more than the file
+    holds."""
     require_content(path)
     is_nrrd = path.suffix.lower() in NRRD
     with one_line(path, "cannot read", "correct the path"), open_file(path, "a sequence") as stream:

@@ -148,8 +148,8 @@ def _is_readable(cell: str) -> bool:
 
 
 def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
-    """Drop the rows of a tracker that repeats its last pose [R, 7] after it lost its tool: exactly the same pose for
-    long, and a jump at an end. What comes to rest slows down before."""
+    """Drop the rows of a tracker that repeats its last pose [R, 7] after losing its tool: identical poses for long, and
+    a jump at an end. A tool that comes to rest decelerates before."""
     used = np.flatnonzero(rows.keep)
     steps = np.linalg.norm(np.diff(poses[used, :3], axis=0), axis=1)
     if not (steps > 0).any():
@@ -165,8 +165,8 @@ def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
 
 
 def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left, and where
-    time begins anew. rate_hz: of a column that counts frames."""
+    """Return increasing times [T] and the rows [T] that they come from. Raises NeecoError if too few remain, or if time
+    restarts. rate_hz: of a column that counts frames."""
     table, usable = rows.table, np.flatnonzero(rows.keep)
     times = _continued(rows, times, usable, rate_hz)
     order = usable[np.argsort(times[usable], kind="stable")]
@@ -192,8 +192,8 @@ def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tup
 
 
 def restarts(times: np.ndarray) -> tuple[float, list[int]]:
-    """Return the usual step of times [T], and after which of them time begins anew: a step back by far more than it,
-    which no single time out of its place explains."""
+    """Return the usual step of times [T], and the rows after which time restarts: a backward step far larger than it
+    that no single misplaced time explains."""
     steps = np.diff(times)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
     far = np.flatnonzero(steps < -SETTINGS.restart_steps * usual).tolist()
@@ -202,8 +202,8 @@ def restarts(times: np.ndarray) -> tuple[float, list[int]]:
 
 
 def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float | None) -> np.ndarray:
-    """Return times [R] that go on where a counter, or the time of day, begins anew. Raises NeecoError where time does
-    for another reason: one step back by far more than a usual step, between rows in order."""
+    """Return times [R] that continue after a counter, or the time of day, wraps around. Raises NeecoError for other
+    restarts: one backward step far larger than the usual step, between rows in order."""
     table, taken = rows.table, times[usable]
     usual, places = restarts(taken)
     units = [1.0, 1e-3, 1e-6, 1e-9, *([] if rate_hz is None else [1 / rate_hz])]

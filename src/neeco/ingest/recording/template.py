@@ -134,8 +134,8 @@ class _FolderFiles:
     episodes: str | None = None
 
     def leave_out(self, what: str, why: NeecoError | str = "", path: Path | None = None, images: bool = False) -> None:
-        """List something as not used. why: what is wrong with it, where anything is, in a message that may begin with
-        the file; images: may they be in it?"""
+        """List something as unused. why: its fault, if any, in a message that may begin with the file; images: whether
+        it may contain images."""
         name = what.rpartition(": ")[2]
         reason = str(why).removeprefix(f"{path}: ").removeprefix(f"{name}: ")
         reason = reason if path is None else reason.replace(str(path), path.name)

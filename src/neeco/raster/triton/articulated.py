@@ -27,7 +27,7 @@ def product(aw, ax, ay, az, bw, bx, by, bz):
         aw * bx + ax * bw + ay * bz - az * by,
         aw * by - ax * bz + ay * bw + az * bx,
         aw * bz + ax * by - ay * bx + az * bw,
-    )  # fmt: skip
+    )
 
 
 @triton.jit
@@ -45,7 +45,7 @@ def turn_point(px, py, pz, nx, ny, nz, sine, cosine, x, y, z):
         px + cosine * ax + sine * (ny * az - nz * ay) + along * nx,
         py + cosine * ay + sine * (nz * ax - nx * az) + along * ny,
         pz + cosine * az + sine * (nx * ay - ny * ax) + along * nz,
-    )  # fmt: skip
+    )
 
 
 @triton.jit
@@ -166,9 +166,8 @@ def articulate(
         moving = moving_of(logits, g, inside, greatest, total, gate, LINKS, LOGITS)
     if SPINS:
         x, y, z, qw, qx, qy, qz = turn(
-            numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin_of(numbers, roll, x, y, z),
-            x, y, z, qw, qx, qy, qz,
-        )  # fmt: skip
+            numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin_of(numbers, roll, x, y, z), x, y, z, qw, qx, qy, qz
+        )
     for joint in tl.static_range(JOINTS):
         own_numbers = numbers + BODY + joint * (VALUES + LINKS - 1)
         amount = amount_of(logits, own_numbers, g, inside, greatest, total, gate, LINKS, LOGITS)
@@ -224,8 +223,9 @@ def put_sum(at, value, inside):
 
 
 @triton.jit
-def turn_backward(pivot, axis, angle, sums_pivot, sums_axis, inside, x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy,
-                  hz):  # fmt: skip
+def turn_backward(
+    pivot, axis, angle, sums_pivot, sums_axis, inside, x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy, hz
+):
     """Points and quaternions back to before the turn, their gradients g and h too, and dL/d angle; sums of dL/d pivot
     and dL/d axis are written."""
     px, py, pz = three(pivot)

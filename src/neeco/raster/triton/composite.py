@@ -306,9 +306,7 @@ def composite_backward_kernel(
 
 
 @triton.jit
-def sum_slots_kernel(
-    slot_sums, order, slot_ends, sums, WIDTH: tl.constexpr, PADDED: tl.constexpr, SLOTS: tl.constexpr
-):  # fmt: skip
+def sum_slots_kernel(slot_sums, order, slot_ends, sums, WIDTH: tl.constexpr, PADDED: tl.constexpr, SLOTS: tl.constexpr):
     """Add the slots of one Gaussian per program, in a fixed order."""
     place = tl.program_id(0)
     g = tl.load(order + place)

@@ -155,9 +155,7 @@ def photometric(
     gradient = None
     with working_on(device):
         across_kernel[(programs,)](image, target, mask, blurred, numbers, width, **launch)
-        compare_kernel[(programs,)](
-            image, target, mask, blurred, slopes, sums, numbers, width, ssim_weight, **launch
-        )  # fmt: skip
+        compare_kernel[(programs,)](image, target, mask, blurred, slopes, sums, numbers, width, ssim_weight, **launch)
         if slopes is not None:
             gradient = torch.empty_like(image)
             slopes_across_kernel[(programs,)](slopes, blurred, numbers, width, **launch)

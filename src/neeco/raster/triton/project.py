@@ -134,8 +134,7 @@ def project_kernel(
 
 
 @triton.jit
-def colors(sh, falloff, left, vignette, frames, pose, g, seen, wx, wy, wz, x, y, z, slope_x, slope_y,
-           SH: tl.constexpr):  # fmt: skip
+def colors(sh, falloff, left, vignette, frames, pose, g, seen, wx, wy, wz, x, y, z, slope_x, slope_y, SH: tl.constexpr):
     """Return red, green and blue as rendered; NaN where any input is not finite."""
     dx, dy, dz, _ = direction(pose, wx, wy, wz)
     if frames is not None:

@@ -71,7 +71,7 @@ class TorchModel(ABC):
 
     @classmethod
     def is_too_small(cls, size: tuple[int, int]) -> bool:
-        """Return whether images of this size (width, height), at its input, are too small for it."""
+        """Return whether images of this size (width, height) are too small as input."""
         return False
 
     @abstractmethod
@@ -128,7 +128,7 @@ class TorchModel(ABC):
                 task.progress(step / task.steps, f"step {step}  loss {value:.3f}")
 
     def _rate(self, step: int, steps: int) -> float:
-        """The learning rate at a step, as a share of the highest."""
+        """Return the learning rate at a step, as a share of the maximum."""
         return min((step + 1) / (1 + self.warmup * steps), (1 + math.cos(math.pi * step / steps)) / 2)
 
     @torch.inference_mode()
