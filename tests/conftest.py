@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -27,6 +29,13 @@ for name in ("NEECO_LPIPS_WEIGHTS", "RAY_ADDRESS", "COLUMNS"):
 os.fsync = lambda descriptor: None  # no test's files need to outlast a power cut, and a sync takes milliseconds
 
 WORLDS = Path(__file__).resolve().parent / "evaluation" / "worlds.py"
+
+
+@pytest.fixture
+def inside(tmp_path: Path) -> Iterator[Path]:
+    """The test's folder, in which it works: relative paths begin there."""
+    with contextlib.chdir(tmp_path):
+        yield tmp_path
 
 
 @pytest.fixture(scope="session")

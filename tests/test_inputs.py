@@ -245,9 +245,8 @@ def test_init_names_a_pipe_and_goes_on(tmp_path: Path, name: str, capsys: pytest
     ],
     ids=lambda words: "-".join(words[:2]),
 )
-def test_no_verb_waits_for_a_pipe(tmp_path, words, monkeypatch, capsys):
-    os.mkfifo(tmp_path / "pipe.mcap")
-    monkeypatch.chdir(tmp_path)
+def test_no_verb_waits_for_a_pipe(inside, words, capsys):
+    os.mkfifo("pipe.mcap")
     with at_most(20):
         try:
             status: object = main(["pipe.mcap" if word == "PIPE" else word for word in words])
@@ -257,4 +256,4 @@ def test_no_verb_waits_for_a_pipe(tmp_path, words, monkeypatch, capsys):
     assert status in (1, 2), told
     assert "pipe" in told
     assert "Traceback" not in told
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["pipe.mcap"]
+    assert sorted(path.name for path in inside.iterdir()) == ["pipe.mcap"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import inspect
 import json
@@ -108,16 +109,16 @@ def examples_of(name: str) -> str:
 
 
 @pytest.mark.parametrize("name", neeco.__all__)
-def test_the_example_of_every_name_runs(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_example_of_every_name_runs(name: str, folder: Path) -> None:
     code = examples_of(name)
     assert code.strip(), f"{name} has no example"
-    monkeypatch.chdir(folder)
     if name == "train":
         code = code.replace("minutes=2", 'iterations=5, method="3dgs"').replace("runs/sample", "runs/again")
     code = code.replace("num_workers=2", "num_workers=0").replace("recording.yaml", "samples/liver-mini")
     code = code.replace('4, states="extrapolate"', '4, states="extrapolate", force=True')  # of a short run
     code = code.replace('start="first"', 'start="first", min_trust=0.0')
-    exec(compile(code, f"<example of {name}>", "exec"), {"neeco": neeco, "np": np, "torch": torch})
+    with contextlib.chdir(folder):
+        exec(compile(code, f"<example of {name}>", "exec"), {"neeco": neeco, "np": np, "torch": torch})
 
 
 @pytest.mark.parametrize("name", [name for name in neeco.__all__ if name not in ("Run", "NeecoError")])
@@ -142,16 +143,16 @@ def test_python_of_the_first_pages_runs_as_written(page: str, folder: Path, monk
     for written, run in smaller.items():
         assert written in code or page == "README.md"
         code = code.replace(written, run)
-    monkeypatch.chdir(folder)
     if page == "README.md":  # the call is the other page's
         monkeypatch.setattr(neeco, "train", lambda capture, output, **options: neeco.load("runs/sample"))
     else:
         search_less(monkeypatch)
     names: dict[str, object] = {}
-    exec(compile(code, page, "exec"), names)
-    images = names["images"]
-    assert isinstance(images, neeco.LabelledImages)
-    assert images[1]["image"].shape[0] == 3
+    with contextlib.chdir(folder):
+        exec(compile(code, page, "exec"), names)
+        images = names["images"]
+        assert isinstance(images, neeco.LabelledImages)
+        assert images[1]["image"].shape[0] == 3
 
 
 def test_what_a_notebook_shows_of_an_object_is_one_short_line(folder: Path) -> None:
@@ -203,14 +204,13 @@ def test_errors_name_arguments_in_python_and_options_on_the_command_line(folder,
     assert "neeco: error: --min-trust: 2.0 is not a share" in capsys.readouterr().err
 
 
-def test_the_recipe_for_the_next_operation_runs_as_the_page_says(folder, tmp_path, monkeypatch):
+def test_the_recipe_for_the_next_operation_runs_as_the_page_says(folder, inside):
     """The commands and the Python of docs/does-it-help.md, tiny: 14 frames of liver-mini are both recordings."""
     pytest.importorskip("transformers")
     page = (ROOT / "docs" / "does-it-help.md").read_text(encoding="utf-8").partition("## What to do")[2]
     train, synthesize_set, downstream = (
         line.split() for line in re.findall(r"^    (neeco .*)$", page, re.MULTILINE)[:3]
     )
-    monkeypatch.chdir(tmp_path)
     capture = neeco.read_capture(SAMPLE)
     frames = [*capture.split("train")[::6], *capture.split("test")[:2]]
     write_capture(replace(capture, frames=frames), Path("FIRST"))

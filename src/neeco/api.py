@@ -239,8 +239,8 @@ def train(
         run = neeco.train("samples/liver-mini", "runs/sample", minutes=2)
     """
     overrides = {"iterations": iterations, "minutes": minutes, "seed": seed}
-    others = {name.replace("__", "."): value for name, value in settings.items()}
-    config = training_config(method, overrides, others, runs.begun_config(Path(output)) if resume else None)
+    dotted = {name.replace("__", "."): value for name, value in settings.items()}
+    config = training_config(method, overrides, dotted, runs.begun_config(Path(output)) if resume else None)
     path = train_run(Path(capture), Path(output), config, device=device_of(device), resume=resume, progress=progress)
     return load(path, device)
 
@@ -303,8 +303,8 @@ def synthesize(
     """
     chosen = Settings.from_values("synthesize", count=count, **settings)
     report = progress or _silent
-    first, *others = (_opened(one, device, force).gaussians("synthesize") for one in (run, *instruments))
-    for labelled in others or (first,):
+    first, *instrument_scenes = (_opened(one, device, force).gaussians("synthesize") for one in (run, *instruments))
+    for labelled in instrument_scenes or (first,):
         labelled.require_trusted("synthesize")
     with first.scene.torch_threads():
         return synthesize_run(
@@ -315,7 +315,7 @@ def synthesize(
             resume,
             on_progress=lambda done: report("synthesize", done, count),
             workers=workers,
-            instrument_runs=others,
+            instrument_runs=instrument_scenes,
         )
 
 

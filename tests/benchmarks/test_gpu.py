@@ -38,8 +38,8 @@ def script() -> Iterator[ModuleType]:
         sys.modules.pop("gpu", None)
 
 
-def test_without_a_gpu_it_ends_in_one_line(script: ModuleType, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is there")
+def test_without_a_gpu_it_ends_in_one_line(script: ModuleType, capsys) -> None:
     assert script.main([]) == 1
     told = capsys.readouterr()
     assert told.out == ""
@@ -105,10 +105,14 @@ class Event:
 def test_a_gpu_is_timed_by_events_in_its_own_stream_and_named(script: ModuleType, monkeypatch) -> None:
     card = SimpleNamespace(total_memory=8 * 2**30, major=8, minor=9)
     monkeypatch.setattr(Event, "recorded", [])
-    monkeypatch.setattr(torch.cuda, "Event", Event)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: f"stream of {device}")
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "Some Card")
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: card)
+    stand_ins = {
+        "Event": Event,
+        "current_stream": lambda device: f"stream of {device}",
+        "get_device_name": lambda device: "Some Card",
+        "get_device_properties": lambda device: card,
+    }
+    for name, stands_in in stand_ins.items():
+        monkeypatch.setattr(torch.cuda, name, stands_in)
     device = torch.device("cuda:1")
     marks = sys.modules["stages"].Marks(device)
     first, _, third = (marks.mark() for _ in range(3))

@@ -34,10 +34,10 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[World, Path, Pat
     world = draw_world(SEED, touched=True)
     assert world.touch is not None
     touch = replace(world.touch, kind="pull", radius=5.0, return_s=0.2, depth=3.0)
-    small = replace(world, size=(64, 48), frames=15, coverage=1.0, automatic=False, touch=touch)
+    small = replace(world, size=(64, 48), frames=12, coverage=1.0, automatic=False, touch=touch)
     folder = tmp_path_factory.mktemp("worlds")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(draws, "RESOLUTION", 300)
+        patch.setattr(draws, "RESOLUTION", 150)
         patch.setattr(world_capture, "TEST", 4)
         patch.setattr(world_capture, "BEYOND", 4)
         write_world(small, folder / "touched")

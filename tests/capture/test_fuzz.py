@@ -28,9 +28,7 @@ def places(value: Any, path: tuple = ()) -> list[tuple]:
     return found
 
 
-@settings(
-    max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_no_document_makes_check_raise(pristine, data):
     folder, original = pristine

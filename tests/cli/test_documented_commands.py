@@ -268,7 +268,7 @@ def serves(words: list[str], folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", COMMANDS)
-def test_a_command_of_the_pages_runs_to_its_end(line, documented, tmp_path, monkeypatch):
+def test_a_command_of_the_pages_runs_to_its_end(line, documented, inside):
     if line.startswith("downstream"):
         pytest.importorskip("transformers")
     if "--help" in line.split():
@@ -276,14 +276,13 @@ def test_a_command_of_the_pages_runs_to_its_end(line, documented, tmp_path, monk
     for piece, elsewhere in NOT_HERE.items():
         if piece in line:
             pytest.skip(elsewhere)
-    monkeypatch.chdir(tmp_path)
     words = shlex.split(smaller(line))
-    prepare(documented, words, tmp_path)
+    prepare(documented, words, inside)
     if words[0] == "view" and "--export" not in words:
         if "--annotate" in words:
             pytest.skip("posing")
         pytest.importorskip("websockets")
-        return serves(words, tmp_path)
+        return serves(words, inside)
     assert main(words) == 0
     outputs = [words[index + 1] for index, word in enumerate(words) if word in ("--output", "--export", "--video")]
     assert all(os.path.exists(path) for path in outputs)
@@ -291,11 +290,10 @@ def test_a_command_of_the_pages_runs_to_its_end(line, documented, tmp_path, monk
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["index", "recipes"])
-def test_the_python_of_a_page_runs(page, documented, tmp_path, monkeypatch):
+def test_the_python_of_a_page_runs(page, documented, inside):
     """README's and getting-started's are run by tests/test_library.py, adding-a-method's by tests/training; blocks that
     begin with packages of others need these."""
-    monkeypatch.chdir(tmp_path)
-    prepare(documented, ["python", "RUN", "dataset"], tmp_path)
+    prepare(documented, ["python", "RUN", "dataset"], inside)
     blocks = re.findall(
         r"^```python\n(.*?)^```", (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8"), re.M | re.S
     )

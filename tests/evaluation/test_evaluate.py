@@ -1,7 +1,7 @@
 """A whole evaluation of a world whose recorded images the scene itself drew."""
 
-import importlib
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -9,9 +9,12 @@ import torch
 
 from neeco.base.errors import NeecoError
 from neeco.capture.images import write_labels
+from neeco.capture.writer import write_capture
 from neeco.cli import main
 from neeco.evaluation import evaluate, image_metrics
 from neeco.evaluation.evaluate import evaluate_run
+from neeco.training.config import training_config
+from neeco.training.train import train
 
 
 def make_run(world, folder, splits=("train", "train", "test", "unseen"), **options):
@@ -139,13 +142,16 @@ def test_an_unknown_split_is_refused_naming_those_there_are(world, tmp_path):
         evaluated(only_training)
 
 
-def open_as(run, monkeypatch):
-    """Let the verb open this run."""
-    importlib.import_module("neeco.viewer.export")  # which keeps the `load_run` of its first import
-    monkeypatch.setattr("neeco.training.run.load_run", lambda path, device, **_: run)
+@pytest.fixture(scope="module")
+def trained(world, tmp_path_factory):
+    """A run of five steps on disk."""
+    folder = tmp_path_factory.mktemp("trained")
+    capture = world.make_capture(folder / "capture", world.TinyScene(), ("train",) * 4 + ("test",))
+    write_capture(capture, folder / "capture")
+    return train(folder / "capture", folder / "run", training_config("3dgs", {"iterations": 5}))
 
 
-def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_path, monkeypatch):
+def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(trained, monkeypatch):
     seen = {}
 
     def noting(where, function):
@@ -162,9 +168,7 @@ def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_p
         monkeypatch.setattr(image_metrics, "find_lpips", lambda folder: {"alexnet": network})
         monkeypatch.setattr(evaluate, "draw", noting("draw", evaluate.draw))
         monkeypatch.setattr(image_metrics, "relu", noting("lpips", image_metrics.relu))
-        run = make_run(world, tmp_path)
-        open_as(run, monkeypatch)
-        assert main(["evaluate", str(run.path), "--splits", "test"]) == 0
+        assert main(["evaluate", str(trained), "--splits", "test"]) == 0
         assert (seen, torch.get_num_threads()) == ({"draw": 1, "lpips": 3}, 3)
     finally:
         torch.set_num_threads(before)
@@ -179,24 +183,21 @@ def one_by_one_filter():
 
 
 @pytest.mark.parametrize("place", ["taken/scores.json", "folder"])
-def test_numbers_that_could_not_be_written_are_told_before_scoring(world, tmp_path, monkeypatch, capsys, place):
-    run = make_run(world, tmp_path / "run")
+def test_numbers_that_could_not_be_written_are_told_before_scoring(trained, tmp_path, capsys, place):
+    run = shutil.copytree(trained, tmp_path / "run", ignore=shutil.ignore_patterns("evaluation.json"))
     (tmp_path / "taken").write_text("a file, not a folder")
     (tmp_path / "folder").mkdir()
-    open_as(run, monkeypatch)
-    monkeypatch.setattr("neeco.evaluation.evaluate.evaluate_run", lambda *_, **__: pytest.fail("scored"))
-    assert main(["evaluate", str(run.path), "--json", str(tmp_path / place)]) == 1
+    assert main(["evaluate", str(run), "--json", str(tmp_path / place)]) == 1
+    assert not (run / "evaluation.json").exists()
     told = capsys.readouterr()
     assert len(told.err.strip().splitlines()) == 1
     assert str(tmp_path / place).split("/scores")[0] in told.err
 
 
-def test_numbers_are_also_written_where_asked(world, tmp_path, monkeypatch):
-    run = make_run(world, tmp_path / "run")
-    open_as(run, monkeypatch)
-    assert main(["evaluate", str(run.path), "--json", str(tmp_path / "new" / "scores.json")]) == 0
-    assert (tmp_path / "new" / "scores.json").read_text() == (run.path / "evaluation.json").read_text()
-    assert "images it never saw. " in (run.path / "report.html").read_text()
+def test_numbers_are_also_written_where_asked(trained, tmp_path):
+    assert main(["evaluate", str(trained), "--json", str(tmp_path / "new" / "scores.json")]) == 0
+    assert (tmp_path / "new" / "scores.json").read_text() == (trained / "evaluation.json").read_text()
+    assert "images it never saw. " in (trained / "report.html").read_text()
 
 
 def test_the_device_is_waited_for_before_a_clock_is_read(world, tmp_path, monkeypatch):

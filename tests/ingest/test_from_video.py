@@ -157,7 +157,7 @@ def found(world):
 
 @pytest.fixture(scope="module")
 def still_world():
-    return ShaftWorld(still=True, frames=30)
+    return ShaftWorld(still=True, frames=24)
 
 
 @pytest.fixture

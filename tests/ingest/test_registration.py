@@ -81,6 +81,7 @@ def test_exact_cameras_are_placed_exactly_and_the_clock_is_found() -> None:
 
 def test_a_noisy_drifting_tracker_bends_the_scale_by_less_than_its_stated_uncertainty() -> None:
     times, log = recorded(offset=-1.81, drift=0.3)
+    times = times[::2]
     truth = scope_path(times)
     found = register_with_laparoscope(in_sfm(truth), times, log, None)
     assert abs(found.scale / 17.0 - 1) < max(3 * found.scale_sd, 0.005)
@@ -91,19 +92,21 @@ def test_a_noisy_drifting_tracker_bends_the_scale_by_less_than_its_stated_uncert
 
 def test_a_clock_that_counts_from_1970_is_found_too() -> None:
     times, log = recorded(offset=1.7e9)
+    times = times[::4]
     found = register_with_laparoscope(in_sfm(scope_path(times)), times, log, None)
     assert found.clock.seconds == pytest.approx(1.7e9, abs=0.005)
 
 
 def test_a_given_offset_is_kept() -> None:
     times, log = recorded(offset=0.05)
+    times = times[::4]
     found = register_with_laparoscope(in_sfm(scope_path(times)), times, log, ClockOffset(0.048, 0.0, GIVEN))
     assert found.clock.seconds == 0.048
     assert found.clock.source == "given"
 
 
-@pytest.mark.parametrize("fps", [24.0, 24.75])
-def test_a_video_at_another_frame_rate_is_a_clock_with_a_rate(fps: float) -> None:
+def test_a_video_at_another_frame_rate_is_a_clock_with_a_rate() -> None:
+    fps = 24.75
     right, log = recorded(offset=0.037, noise=0.5)
     right = right[::3]
     found = register_with_laparoscope(in_sfm(scope_path(right)), right * 25 / fps, log, None)

@@ -32,7 +32,7 @@ FOCAL = (60.0, 60.0, 32.0, 24.0)
 LEFT, RIGHT = "/stereo/left/image_raw", "/stereo/right/image_raw"
 OLD = ("position_cartesian_current", "state_joint_current", "state_jaw_current")
 NEW = ("measured_cp", "measured_js", "jaw/measured_js")
-CASES = 40
+CASES = 25
 
 
 def shaft(time: float) -> np.ndarray:

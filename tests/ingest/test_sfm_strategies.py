@@ -60,7 +60,7 @@ def test_the_best_places_most_frames_then_fits_best_then_has_most_parallax():
 def search(tmp_path, monkeypatch):
     """Structure from motion of 100 frames by a worker that answers with the attempts given; (it, tasks done)."""
 
-    def made(*answers: dict, pinhole: Lens | None = None, minutes: float = 20.0):
+    def made(*answers: dict, pinhole: Lens | None = None, minutes: float = 20.0, matches: np.ndarray | None = None):
         tasks, waiting = [], list(answers)
         none = {"models": [], "focal": 0.0, "distortion": 0.0, "points": 0, "error": 0.0, "parallax": 0.0}
 
@@ -74,7 +74,7 @@ def search(tmp_path, monkeypatch):
                 Path(job["model"]).mkdir()
                 (Path(job["model"]) / "attempt.json").write_text(json.dumps(none | answer))
             if job["task"] == "matches":
-                np.savez(job_file.with_name("matches.npz"), matches=np.zeros((0, 5)))
+                np.savez(job_file.with_name("matches.npz"), matches=np.zeros((0, 5)) if matches is None else matches)
             return 30.0
 
         monkeypatch.setattr(sfm, "run_worker", run)
@@ -152,9 +152,8 @@ def test_a_still_and_a_turning_scope_are_told_apart_from_a_moving_one():
     assert motion_fault(turned[:20], 1280) == ""  # nothing is concluded from little
 
 
-def test_a_scope_that_stands_still_is_refused_in_one_line_that_says_so(search, monkeypatch):
-    motion, _ = search()
-    monkeypatch.setattr(sfm, "motion_fault", lambda matches, width: "the scope seems to stand still")
+def test_a_scope_that_stands_still_is_refused_in_one_line_that_says_so(search):
+    motion, _ = search(matches=matched(np.full(200, 100.0), [(np.zeros(3), np.zeros(3))] * 8))
     with pytest.raises(
         NeecoError, match=r"stand still, and cameras come from parallax; record with a scope that moves"
     ):

@@ -16,19 +16,29 @@ FULL = (
 
 
 class Cards:
-    """Stands in for PyTorch's view of the machine: two cards, and what the build has kernels for."""
+    """Stands in for PyTorch's view of the machine: two cards, or none and `told` of it, and what the build has kernels
+    for."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.capability, self.built = (8, 9), ["sm_75", "sm_80", "sm_90a", "compute_120"]
-        self.triton_lacks: str | None = None
+        self.told, self.triton_lacks = "", ""
         self.started: list[str] = []  # devices on which Triton was started
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-        monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-        monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "Some Card")
-        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: self.capability)
-        monkeypatch.setattr(torch.cuda, "get_arch_list", lambda: self.built)
-        monkeypatch.setattr(devices, "missing", lambda device: self.triton_lacks)
+        of_pytorch = {
+            "is_available": lambda: not self.told,
+            "init": self.init,
+            "device_count": lambda: 2,
+            "get_device_name": lambda device: "Some Card",
+            "get_device_capability": lambda device: self.capability,
+            "get_arch_list": lambda: self.built,
+        }
+        for name, stands_in in of_pytorch.items():
+            monkeypatch.setattr(torch.cuda, name, stands_in)
+        monkeypatch.setattr(torch.version, "cuda", "13.0")
+        monkeypatch.setattr(devices, "missing", lambda device: self.triton_lacks or None)
         monkeypatch.setattr(devices, "require_triton", lambda device: self.started.append(str(device)))
+
+    def init(self) -> None:
+        raise RuntimeError(self.told)
 
 
 @pytest.fixture
@@ -50,9 +60,8 @@ def test_words_mean_the_devices_that_are_there(cards: Cards) -> None:
         assert "is unknown; choose auto, cpu, cuda or cuda:N" in refused(word)
 
 
-def test_a_pytorch_without_cuda_is_named_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.version, "cuda", None)
+@pytest.mark.skipif(torch.version.cuda is not None, reason="a build with CUDA")
+def test_a_pytorch_without_cuda_is_named_with_the_remedy() -> None:
     told = refused("cuda")
     assert "PyTorch finds no CUDA device" in told
     assert "is a build without CUDA" in told
@@ -61,13 +70,8 @@ def test_a_pytorch_without_cuda_is_named_with_the_remedy(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("said", ["Found no NVIDIA driver on your system. Please check.", "No CUDA GPUs are available"])
-def test_a_machine_without_a_driver_or_a_card_says_what_pytorch_says(said: str, monkeypatch) -> None:
-    def init() -> None:
-        raise RuntimeError(said + "\nand more")
-
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setattr(torch.cuda, "init", init)
+def test_a_machine_without_a_driver_or_a_card_says_what_pytorch_says(said: str, cards: Cards) -> None:
+    cards.told = said + "\nand more"
     assert f"{said.rstrip('.')}; check `nvidia-smi`" in refused("cuda:0")
 
 
@@ -101,7 +105,7 @@ def test_triton_must_start_there_before_any_work(cards: Cards) -> None:
     assert "package triton is missing" in refused("cuda")
     assert device_of("cuda", drawing=False).type == "cuda"
     assert cards.started == []
-    cards.triton_lacks = None
+    cards.triton_lacks = ""
     assert device_of("cuda:1") == torch.device("cuda:1")
     assert cards.started == ["cuda:1"]
 

@@ -101,7 +101,7 @@ def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[s
 @pytest.mark.parametrize(
     ("capability", "scene", "deterministic"),
     [
-        (80, {"sh_count": 4, "channels": 5}, True),
+        (80, {"sh_count": 4, "channels": 2}, True),
         (90, {"sh_count": 1, "channels": 0, "frames": False, "light": False, "width": 1, "height": 1}, False),
         pytest.param(90, {"sh_count": 9, "channels": 1, "frames": False}, False, marks=pytest.mark.slow),
         pytest.param(90, {"sh_count": 16, "channels": 32}, True, marks=pytest.mark.slow),
@@ -139,7 +139,7 @@ def test_every_kernel_compiles_without_a_gpu(capability, scene, deterministic, c
 
 @here
 @pytest.mark.skipif(ready.interpreted(), reason="the interpreter compiles nothing")
-@pytest.mark.parametrize(("capability", "masked"), [(80, True), (90, False)])
+@pytest.mark.parametrize(("capability", "masked"), [(80, True), pytest.param(90, False, marks=pytest.mark.slow)])
 def test_the_kernels_of_a_training_step_compile_without_a_gpu(capability, masked, compiled):
     import triton
 
@@ -156,7 +156,9 @@ def test_the_kernels_of_a_training_step_compile_without_a_gpu(capability, masked
 
 @here
 @pytest.mark.skipif(ready.interpreted(), reason="the interpreter compiles nothing")
-@pytest.mark.parametrize(("capability", "joints", "slides", "roll"), [(80, 2, 2, 1.0), (90, 1, 0, 0.0)])
+@pytest.mark.parametrize(
+    ("capability", "joints", "slides", "roll"), [(80, 2, 2, 1.0), pytest.param(90, 1, 0, 0.0, marks=pytest.mark.slow)]
+)
 def test_the_kernels_of_posing_compile_without_a_gpu(capability, joints, slides, roll, compiled):
     import triton
 

@@ -30,7 +30,7 @@ def by_triton(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     ("joints", "roll"),
-    [((None,), 2.1), ((0,), 2.1), ((1,), 0.0), ((2,), 2.1), ((None, 1), 2.1), ((None, 3, 0), 0.0)],
+    [((None,), 2.1), ((1,), 0.0), ((None, 3, 0), 2.1)],
 )
 def test_the_kernels_are_their_definition(joints: tuple[int | None, ...], roll: float) -> None:
     counts = tuple(9 + 5 * k for k in range(len(joints)))
@@ -43,7 +43,7 @@ def test_poses_of_every_kind(seed: int) -> None:
     assert_same_as_definition(make_world((6, 0, 5), (hinges(1), hinges(2), hinges(0)), seed=seed, roll=-1.0), 5e-5)
 
 
-@settings(max_examples=6, deadline=None, derandomize=True)
+@settings(max_examples=4, deadline=None, derandomize=True)
 @given(tree=trees())
 def test_any_tree(tree: Tree) -> None:
     assert_same_as_definition(make_world((7, 6), (None, tree), seed=1, roll=0.4), 5e-5)

@@ -42,7 +42,7 @@ def deterministic() -> Iterator[None]:
     torch.use_deterministic_algorithms(False)
 
 
-@pytest.mark.parametrize(("sh_count", "channels"), [(1, 0), (4, 5), (9, 4), (16, 1)])
+@pytest.mark.parametrize(("sh_count", "channels"), [(1, 0), (9, 5)])
 def test_image_and_every_gradient_match_the_reference(sh_count: int, channels: int) -> None:
     same(scene_of(24, sh_count, channels, seed=sh_count + channels))
 
@@ -51,7 +51,7 @@ def test_as_many_channels_as_there_may_be() -> None:
     same(scene_of(12, 16, 32, seed=1))
 
 
-@pytest.mark.parametrize(("sh_count", "channels"), [(1, 0), (4, 6), (16, 3)])
+@pytest.mark.parametrize(("sh_count", "channels"), [(4, 6)])
 def test_deterministic_gradients_match_the_reference(deterministic: None, sh_count: int, channels: int) -> None:
     same(scene_of(24, sh_count, channels, seed=sh_count + channels))
 
@@ -62,7 +62,7 @@ def test_deterministic_gradients_of_a_gaussian_across_many_tiles(deterministic: 
     same(scene)
 
 
-@settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=4, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     count=st.sampled_from([0, 1, 2, 7, 40]),
     sh_count=st.sampled_from([1, 4, 9, 16]),
@@ -83,7 +83,7 @@ def test_tiles_of_another_size_draw_the_same(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_more_gaussians_than_a_program_takes() -> None:
-    same(scene_of(300, 1, 0, seed=9, size=1.0))
+    same(scene_of(150, 1, 0, seed=9, size=1.0))
 
 
 def test_gaussians_that_cross_many_columns_of_tiles() -> None:

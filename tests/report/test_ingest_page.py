@@ -232,7 +232,7 @@ def test_small_residuals_of_a_scope_that_turned_little_do_not_make_a_good_verdic
     assert "the place of instruments in the images is known to ±1.1°" in " ".join(verdict.facts)
 
 
-@pytest.mark.parametrize(("overlap", "advice"), [(0.68, "do not train"), (0.80, "usable"), (0.93, "good")])
+@pytest.mark.parametrize(("overlap", "advice"), [(0.68, "do not train"), (0.93, "good")])
 def test_a_reason_is_stated_once_with_what_is_usual(tmp_path, overlap, advice):
     note = "the outline of psm1 and what moves overlap by"
     result = made(SAMPLE, bases={"psm1": based(overlap)}, notes=(f"{note} {overlap:.2f} only; check its clock.",))

@@ -110,14 +110,14 @@ def test_ticks_are_round_and_inside_the_range():
     assert ticks_of(23.1, 29.7) == [24, 26, 28, 30]  # the chart ends at 30.03
 
 
-def test_a_chart_has_no_fixed_colours_and_needs_nothing_from_elsewhere(monkeypatch):
+def test_a_chart_has_no_fixed_colours_and_needs_nothing_from_elsewhere():
     rows = [{"iteration": i, "loss": 1.0 - i / 20, "phase": 1 if i < 5 else 2} for i in range(10)]
     svg = curve(rows, "loss", "loss $\\frac$ \u65e5 \x01")
     assert svg.startswith('<svg viewBox="0 0 420 190" role="img" aria-label="loss $')
     assert not re.search(r"http|url\(|: #[0-9a-f]{3}|<style", svg)
     assert "$\\frac$ \u65e5 \ufffd" in svg
-    monkeypatch.setitem(matplotlib.rcParams, "font.size", 40.0)  # the user's own settings change nothing
-    assert curve(rows, "loss", "loss $\\frac$ \u65e5 \x01") == svg
+    with matplotlib.rc_context({"font.size": 40.0}):  # the user's own settings change nothing
+        assert curve(rows, "loss", "loss $\\frac$ \u65e5 \x01") == svg
 
 
 def test_charts_of_one_page_have_ids_of_their_own_and_find_what_they_refer_to():

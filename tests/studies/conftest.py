@@ -31,7 +31,8 @@ def short_job(capture: Path, runs: Path, name: str = "3dgs", seed: int = 0, **ch
     """A short job of static 3DGS; keywords change it, values and settings those of its config."""
     folder = changes.pop("folder", runs / f"{name}-seed{seed}")
     values = {"iterations": 12, "seed": seed} | changes.pop("values", {})
-    config = training_config(changes.pop("method", name), values, changes.pop("settings", ()))
+    settings = ["log_interval=1", *changes.pop("settings", ())]  # progress tells of every step
+    config = training_config(changes.pop("method", name), values, settings)
     return TrainingJob(name=name, capture=capture, folder=folder, config=config, device="cpu", **changes)
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 import torch
+from ctrl_c import ctrl_c_at
 from worker_tasks import seen_gpu
 
 from neeco.base import workers
@@ -27,13 +28,13 @@ from neeco.base.settings import with_fields
 from neeco.capture import read_capture
 from neeco.scene.training_session import UNLIMITED
 from neeco.studies import study
-from neeco.studies.study import check_workers, run_jobs, threads_per_worker
+from neeco.studies.study import JobEvent, check_workers, run_jobs, threads_per_worker
 from neeco.studies.training_job import Curve, phase_1_psnr, psnr_at
 from neeco.training import train as train_module
 from neeco.training.run import checkpoint_path, write_config
-from neeco.training.session import GaussianSession
 
 TIMES = ("seconds", "fps")
+DIVERGING = "optimizer.color_rate=1e30"
 
 
 def without_times(value):
@@ -119,20 +120,10 @@ def test_other_splits_are_scored_without_training_again(finished_job, make_job):
 
 
 @pytest.mark.parametrize("stop", [1, 7, 12])
-def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(stop, trained_job, make_job, tmp_path, monkeypatch):
+def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(stop, trained_job, make_job, tmp_path):
     whole, cut = trained_job, make_job(folder=tmp_path / "cut")
-    step = GaussianSession.step
-
-    def interrupted(session: GaussianSession):
-        result = step(session)
-        if session.iteration == stop:
-            os.kill(os.getpid(), signal.SIGINT)
-        return result
-
-    with monkeypatch.context() as patched:
-        patched.setattr(GaussianSession, "step", interrupted)
-        with pytest.raises(KeyboardInterrupt, match=rf"job 1 of 1 \(3dgs, seed 0\), at iteration {stop}; run the same"):
-            run_jobs([cut])
+    with pytest.raises(KeyboardInterrupt, match=rf"job 1 of 1 \(3dgs, seed 0\), at iteration {stop}; run the same"):
+        run_jobs([cut], progress=ctrl_c_at(0, stop))
     assert not (cut.folder / "job.json").exists()
     result = run_jobs([cut])[0]
     assert without_times(result) == without_times(result_of(whole))
@@ -163,22 +154,15 @@ def test_damaged_files_of_a_job_are_reported_by_file_and_field(name, change, rep
         finished_job.run()
 
 
-def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = ["checkpoint_interval=5"]
-    whole, cut = (make_job(folder=tmp_path / name, settings=settings) for name in ("whole", "cut"))
-    expected = whole.run()
-    step = GaussianSession.step
-
-    def killed(session: GaussianSession):
-        if session.iteration == 8:
+def test_a_killed_job_counts_the_lost_steps_once(trained_job, make_job, tmp_path) -> None:
+    def killed(event: JobEvent) -> None:
+        if event.text.startswith("iteration 8 "):
             raise MemoryError("killed")
-        return step(session)
 
-    with monkeypatch.context() as patched:
-        patched.setattr(GaussianSession, "step", killed)
-        assert "memory: too little" in run_jobs([cut])[0]["error"]
-    assert without_times(cut.run()) == without_times(expected)
-    assert [row["iteration"] for row in curve_of(cut)] == [row["iteration"] for row in curve_of(whole)]
+    cut = make_job(folder=tmp_path / "cut", settings=["checkpoint_interval=5"])
+    assert "memory: too little" in run_jobs([cut], progress=killed)[0]["error"]
+    assert without_times(cut.run()) == without_times(result_of(trained_job))
+    assert [row["iteration"] for row in curve_of(cut)] == [row["iteration"] for row in curve_of(trained_job)]
 
 
 def test_drawing_the_curve_changes_no_bit_of_the_scene(trained_job, tmp_path) -> None:
@@ -205,29 +189,20 @@ def test_time_of_drawing_the_curve_is_not_counted(make_job, monkeypatch: pytest.
     assert result["seconds"] < 1.0  # ten moments of two splits took 2 s
 
 
-def test_one_failing_job_leaves_the_others_alone(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
-    step = GaussianSession.step
-
-    def diverging(session: GaussianSession):
-        if session.config.seed == 1:
-            raise NeecoError("training: the loss became nan at iteration 1, frame 000; train anew")
-        return step(session)
-
-    monkeypatch.setattr(GaussianSession, "step", diverging)
+def test_one_failing_job_leaves_the_others_alone(make_job) -> None:
     reported: list[str] = []
-    results = run_jobs([make_job(seed=seed) for seed in (0, 1, 2)], progress=lambda event: reported.append(event.stage))
+    jobs = [make_job(seed=0), make_job(seed=1, settings=[DIVERGING]), make_job(seed=2)]
+    results = run_jobs(jobs, progress=lambda event: reported.append(event.stage))
     assert [("error" in result) for result in results] == [False, True, False]
     assert "loss became nan" in results[1]["error"]
     assert results[1]["splits"] == {}
-    assert not (make_job(seed=1).folder / "job.json").exists()
+    assert not (jobs[1].folder / "job.json").exists()
     assert [stage for stage in reported if stage in ("done", "failed")] == ["done", "failed", "done"]
 
 
-def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unforeseen_failure_leaves_its_traceback(make_job) -> None:
     job = make_job()
-    with monkeypatch.context() as patched:
-        patched.setattr(GaussianSession, "step", lambda session: 1 // 0)
-        error = run_jobs([job])[0]["error"]
+    error = run_jobs([job], progress=lambda event: event.text.startswith("iteration 3 ") and 1 // 0)[0]["error"]
     record = job.folder.with_name("3dgs-seed0.error.txt")
     assert error.startswith("ZeroDivisionError")
     assert str(record) in error
@@ -263,20 +238,18 @@ def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, monkeypatc
         run_jobs([make_job()], workers=2)
 
 
-@pytest.mark.parametrize(
-    ("workers", "device", "reported"),
-    [
-        (3, "cuda", r"--workers: 3 for 2 GPU\(s\); give at most 2"),
-        (2, "cuda:1", "each uses its own GPU"),
-        (2, "cuda", ""),
-    ],
-)
-def test_workers_have_a_gpu_each(workers: int, device: str, reported: str, monkeypatch) -> None:
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    check_workers(workers, torch.device("cpu"))
-    check_workers(1, torch.device(device))
-    with pytest.raises(NeecoError, match=reported) if reported else contextlib.nullcontext():
-        check_workers(workers, torch.device(device))
+def test_workers_have_a_gpu_each() -> None:
+    workers.check_gpus(2, 2)
+    with pytest.raises(NeecoError, match=r"--workers: 3 for 2 GPU\(s\); give at most 2"):
+        workers.check_gpus(3, 2)
+    count = torch.cuda.device_count() + 1
+    check_workers(count + 1, torch.device("cpu"))
+    check_workers(1, torch.device("cuda:1"))
+    check_workers(count + 1, torch.device("cuda"), share_gpus=True)
+    with pytest.raises(NeecoError, match=f"--workers: {count + 1} for {count - 1} GPU"):
+        check_workers(count + 1, torch.device("cuda"))
+    with pytest.raises(NeecoError, match="each uses its own GPU"):
+        check_workers(2, torch.device("cuda:1"))
 
 
 class FakeRay:
@@ -298,9 +271,7 @@ def test_a_task_on_a_node_sees_the_gpu_it_was_given(monkeypatch) -> None:
 @pytest.mark.parametrize(("shared", "visible", "seen"), [(None, "4,5", {"4", "5"}), (2, "", {"0", "1"})])
 def test_tasks_here_see_a_gpu_each_or_share_them_where_they_are_small(shared, visible, seen, monkeypatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     count = 3 if shared else 2
-    check_workers(count, torch.device("cuda"), share_gpus=bool(shared))
     how = workers.Workers(count=count, threads=1, fresh=True, gpu=True, shared_gpus=shared)
     found = [event.value for event in workers.run_tasks(seen_gpu, None, range(4), how) if event.stage == "done"]
     assert len(found) == 4
@@ -332,10 +303,9 @@ def test_gpus_are_asked_for_where_jobs_compute_on_them(device, address, asked, m
     assert given == asked
 
 
-def test_workers_give_the_same_numbers(make_job, tmp_path) -> None:
-    here = [make_job(seed=seed, folder=tmp_path / "here" / str(seed)) for seed in (0, 1)]
-    there = [make_job(seed=seed, folder=tmp_path / "there" / str(seed)) for seed in (0, 1)]
-    assert without_times(run_jobs(there, workers=2)) == without_times(run_jobs(here))
+def test_a_worker_gives_the_same_numbers(trained_job, make_job) -> None:
+    (there,) = run_jobs([make_job()], workers=2)
+    assert without_times(there) == without_times(result_of(trained_job))
 
 
 @pytest.mark.slow
@@ -436,9 +406,11 @@ def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
     assert result["splits"]["test"]["psnr"] > 5
 
 
-def test_workers_share_the_cores(monkeypatch) -> None:
-    monkeypatch.setattr(study, "usable_cores", lambda: 8)
-    assert [threads_per_worker(workers) for workers in (1, 2, 3, 16)] == [8, 4, 2, 1]
+def test_workers_share_the_cores() -> None:
+    cores = study.usable_cores()
+    for count in (1, 2, 3, 2 * cores):
+        threads = threads_per_worker(count)
+        assert threads == 1 or count * threads <= cores < count * (threads + 1)
 
 
 def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:

@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import json
-import os
 import re
 import shutil
-import signal
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 import yaml
+from ctrl_c import ctrl_c_at
 
-from neeco.base import workers
 from neeco.base.errors import NeecoError
 from neeco.base.settings import plain
 from neeco.cli import main
 from neeco.raster.devices import fast_bfloat16
 from neeco.scene.method_registry import method_settings
-from neeco.studies import training_job as jobs_module
 from neeco.studies.configurations import Configuration, Study, SweepRequest, Table, TableRow, ablations, read_study
 from neeco.studies.sweep import direction, plan_sweep, run_sweep, tables_of
 from neeco.studies.tables import ResultTable
-from neeco.training.session import GaussianSession
 
 TWO = """\
 title: Two ways
@@ -55,17 +52,9 @@ def rows_of(output: Path) -> list[dict[str, str]]:
         return [{key: value for key, value in row.items() if key not in TIMES} for row in csv.DictReader(stream)]
 
 
-def trained(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The run folders that are trained from now on."""
-    names: list[str] = []
-    train = jobs_module.train
-
-    def counted(path, output, *rest, **options):
-        names.append(output.name)
-        return train(path, output, *rest, **options)
-
-    monkeypatch.setattr(jobs_module, "train", counted)
-    return names
+def trained(output: Path) -> dict[str, int]:
+    """The finished runs of a sweep, and when each was written."""
+    return {file.parent.name: file.stat().st_mtime_ns for file in output.glob("runs/*/scene.safetensors")}
 
 
 def test_every_configuration_seed_and_split_has_a_row_with_its_scores(capture: Path, study: Path, tmp_path) -> None:
@@ -92,57 +81,35 @@ def test_every_configuration_seed_and_split_has_a_row_with_its_scores(capture: P
     )
 
 
-def test_interrupted_it_goes_on_and_trains_only_what_is_missing(capture, study, tmp_path, monkeypatch, capsys):
+def test_interrupted_it_goes_on_and_trains_only_what_is_missing_and_more_is_added(capture, study, tmp_path):
     whole, output = tmp_path / "whole", tmp_path / "out"
-    assert sweep(capture, study, whole, "--seeds", "1") == 0
-    step, steps = GaussianSession.step, [0]
-
-    def interrupted(session: GaussianSession):
-        result = step(session)
-        steps[0] += 1
-        if steps[0] == 15:  # in the second of two jobs
-            os.kill(os.getpid(), signal.SIGINT)
-        return result
-
-    with monkeypatch.context() as patched:
-        patched.setattr(GaussianSession, "step", interrupted)
-        assert sweep(capture, study, output, "--seeds", "1") == 130
-    assert "job 2 of 2 (few, seed 0), at iteration 5; run the same" in capsys.readouterr().err
+    assert sweep(capture, study, whole, "--seeds", "1", "--set", "log_interval=1") == 0
+    request = SweepRequest(capture=capture, output=output, seeds=1, set=("log_interval=1",), device="cpu")
+    with pytest.raises(KeyboardInterrupt, match=r"job 2 of 2 \(few, seed 0\), at iteration 5; run the same"):
+        run_sweep(plan_sweep(request, read_study(study)), ctrl_c_at(1, 5))
     assert [row["configuration"] for row in rows_of(output)] == ["plain", "plain"]
     assert not json.loads((output / "sweep.json").read_text())["complete"]
-    names = trained(monkeypatch)
-    assert sweep(capture, study, output, "--seeds", "1") == 0
-    assert names == ["few-seed0"]
+    begun = trained(output)
+    assert sweep(capture, study, output, "--seeds", "1", "--set", "log_interval=1") == 0
+    done = trained(output)
+    assert done.items() - begun.items() == {("few-seed0", done["few-seed0"])}
     assert rows_of(output) == rows_of(whole)
-
-
-def test_more_configurations_and_seeds_are_added(capture: Path, study: Path, tmp_path, monkeypatch) -> None:
-    output = tmp_path / "out"
-    assert sweep(capture, study, output, "--seeds", "1") == 0
     study.write_text(TWO + "  more: {method: 3dgs+dta}\n")
-    names = trained(monkeypatch)
-    assert sweep(capture, study, output) == 0
-    assert names == ["more-seed0", "plain-seed1", "few-seed1", "more-seed1"]
+    assert sweep(capture, study, output, "--set", "log_interval=1") == 0
+    more = trained(output)
+    assert {name for name, _ in more.items() - done.items()} == {"more-seed0", "plain-seed1", "few-seed1", "more-seed1"}
     assert len(rows_of(output)) == 12
 
 
-def test_a_failed_run_has_its_reason_in_its_place_and_the_status_is_1(capture, tmp_path, monkeypatch, capsys):
-    step = GaussianSession.step
-
-    def diverging(session: GaussianSession):
-        if session.config.schedule.sh_order == "on":
-            raise NeecoError("training: the loss became nan at iteration 1, frame 000; train anew")
-        return step(session)
-
-    monkeypatch.setattr(GaussianSession, "step", diverging)
+def test_a_failed_run_has_its_reason_in_its_place_and_the_status_is_1(capture, study, tmp_path, capsys):
     output = tmp_path / "out"
-    words = ["compare", str(capture), "--methods", "3dgs", "3dgs+dta", "--iterations", "10", "--device", "cpu"]
-    assert main([*words, "--output", str(output)]) == 1
+    study.write_text(TWO + "  wild: {like: plain, settings: [optimizer.color_rate=1e30]}\n")
+    assert sweep(capture, study, output, "--seeds", "1") == 1
     printed = capsys.readouterr()
     last = printed.err.strip().splitlines()[-1]
-    assert last.startswith("neeco: error: 1 of 2 runs failed: 3dgs+dta, seed 0: training: the loss became nan")
+    assert last.startswith("neeco: error: 1 of 3 runs failed: wild, seed 0: training: the loss became nan")
     assert "failed" in printed.out
-    lost = [row for row in rows_of(output) if row["configuration"] == "3dgs+dta"]
+    lost = [row for row in rows_of(output) if row["configuration"] == "wild"]
     assert [(row["psnr"], "loss became nan" in row["error"]) for row in lost] == [("", True)] * 2
     page = (output / "report.html").read_text()
     assert "What failed" in page
@@ -371,9 +338,9 @@ def test_settings_reach_the_methods_that_have_them(capture: Path, tmp_path: Path
     assert configs["3dgs"]["deformation"] == {}
 
 
+@pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="Ray is installed")
 def test_a_cluster_without_ray_is_refused_before_anything_is_written(capture, study, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")
-    monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
     assert sweep(capture, study, tmp_path / "out", "--workers", "2") == 1
     assert "[cluster]" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -153,8 +153,7 @@ def test_what_cannot_be_mixed_is_told(near: GaussianScene, scene: GaussianScene)
         (["--tissue", "b", "--instruments", "c", "--count", "2"], "b: no such run folder"),
     ],
 )
-def test_the_command_line_asks_for_one_or_the_other(words, told, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_command_line_asks_for_one_or_the_other(words, told, tmp_path, capsys):
     assert main(["synthesize", *words, "--output", str(tmp_path / "out")]) == 1
     error = capsys.readouterr().err.strip()
     assert told in error

@@ -78,15 +78,6 @@ def test_images_drawn_before_a_refusal_are_kept_indexed_and_gone_on_from(run, wh
     assert contents(cut / "images") == contents(whole / "images")
 
 
-def test_ctrl_c_before_anything_was_begun_tells_of_nothing_kept(run, tmp_path, monkeypatch, capsys):
-    def stopped(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("neeco.api.synthesize", stopped)
-    assert main(["synthesize", str(run.path), "--output", str(tmp_path / "dataset"), "--count", "4"]) == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "neeco: interrupted: run the same command again"
-
-
 def test_ctrl_c_is_told_with_the_way_to_go_on(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("neeco.training.run.load_run", lambda path, device, **_: run)
     real, left = SampleGenerator.draw, iter(range(2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import re
 import sys
@@ -15,23 +16,17 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tools"))
 
 
-@pytest.fixture
-def lock(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    import lock
-
-    monkeypatch.setitem(sys.modules, "lock", lock)
-    return lock
+@pytest.fixture(scope="module")
+def lock() -> ModuleType:
+    return importlib.import_module("lock")
 
 
-@pytest.fixture
-def notice(lock: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    import notice
-
-    monkeypatch.setitem(sys.modules, "notice", notice)
-    return notice
+@pytest.fixture(scope="module")
+def notice() -> ModuleType:
+    return importlib.import_module("notice")
 
 
 def closure(lock: ModuleType, group: str) -> dict[str, object]:

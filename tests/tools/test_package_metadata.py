@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import re
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tools"))
 
 
 @pytest.fixture
-def package_metadata(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    monkeypatch.chdir(ROOT)
-    import package_metadata
-
-    return package_metadata
+def package_metadata() -> Iterator[ModuleType]:
+    with contextlib.chdir(ROOT):
+        yield importlib.import_module("package_metadata")
 
 
 def test_links_of_the_page_on_an_index_lead_to_the_files_of_the_version(package_metadata, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -9,6 +10,7 @@ from types import ModuleType
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tools"))
 UPPER = """
 from package.lower import Thing, leaf
 
@@ -36,13 +38,9 @@ class Thing:
 """
 
 
-@pytest.fixture
-def walks(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    import walks
-
-    monkeypatch.setitem(sys.modules, "walks", walks)
-    return walks
+@pytest.fixture(scope="module")
+def walks() -> ModuleType:
+    return importlib.import_module("walks")
 
 
 def test_a_walk_visits_each_function_once_and_counts_returns(walks: ModuleType, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The one exception that users see, and what is said of one that any library may raise: too little memory."""
+"""NeecoError, the only exception for users, and the message for insufficient memory in any library."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class NeecoError(Exception):
 
 
 def visible(text: str) -> str:
-    """Return text in one line without control characters, which could move a terminal's cursor: files may hold any."""
+    """Return text in one line without control characters (from files), which could move a terminal's cursor."""
     line = re.sub(r"\s*[^\S ]\s*", " ", text)  # line breaks and tabs, with the spaces around
     return line if line.isprintable() else "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line)
 
@@ -79,8 +79,8 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
 
 
 def memory_failure(error: BaseException) -> str | None:
-    """Say in one line that the computer's memory was too small, by how much, and what to do; None where neither `error`
-    nor any error that it was raised for is of that kind."""
+    """Return a one-line message on insufficient memory, with its size and a remedy; None if neither `error` nor any of
+    its causes is of that kind."""
     if isinstance(error, NeecoError) and str(error).startswith(TOO_LITTLE):
         return str(error)
     cause: BaseException | None = error
@@ -105,7 +105,7 @@ def _is_memory_failure(error: BaseException) -> bool:
 
 
 def _memory_limit() -> int | None:
-    """Bytes that this process may use: the limit that was set for it, else the machine's memory; None: not known."""
+    """Return the bytes that this process may use: the limit set for it, else the machine's memory; None: unknown."""
     try:
         import resource
     except ImportError:  # Windows
@@ -116,7 +116,7 @@ def _memory_limit() -> int | None:
 
 
 def _size(number: str, unit: str) -> str:
-    """A size in memory; bytes in the largest binary unit of which there is one."""
+    """Format a size in memory in the largest suitable binary unit."""
     if unit != "bytes":
         return f"{number} {unit}"
     value, units = float(number), ["bytes", "KiB", "MiB", "GiB", "TiB"]

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic files, locked folders, and checked reading of inputs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from neeco.base.errors import NeecoError
 from neeco.base.locks import LOCK, LOCKING, TEMPORARY, begin_file, locked, remove_abandoned
 from neeco.base.placeholders import placeholder
 
-LOCK_WAIT_S = 20.0  # limit on the wait in s, for a person who clicks, while another process writes
+LOCK_WAIT_S = 20.0  # maximum wait for another process that writes, in s, for interactive use
 FOLLOW_LINKS = "NEECO_FOLLOW_LINKS"  # environment variable
-MAX_VALUES = 1_000_000  # limit on the values of a YAML file, aliases written out
-MAX_BYTES = 2**30  # limit on the bytes of a file that is read whole
-HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
+MAX_VALUES = 1_000_000  # maximum number of values of a YAML file with expanded aliases
+MAX_BYTES = 2**30  # maximum size of a file that is read at once
+HALVES = re.compile("[\ud800-\udfff]")  # surrogate halves: JSON may contain them, a text file cannot
 _REMEDIES = {
     errno.ENOSPC: "free space there, or write to another disk",
     errno.EDQUOT: "free space of your quota, or write to another disk",
@@ -48,7 +48,7 @@ def cannot_write(path: Path, error: OSError) -> NeecoError:
 
 def require_replaceable(path: Path) -> None:
     """Raise NeecoError where a file written to `path` would replace a link, a device, a pipe or a socket."""
-    with contextlib.suppress(OSError):  # nothing is there, or writing says why not
+    with contextlib.suppress(OSError):  # absent, or writing will state the reason
         mode = path.lstat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
             kind = "a symbolic link" if stat.S_ISLNK(mode) else "a device, pipe or socket"
@@ -88,10 +88,10 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def write_unsynced(path: Path, content: bytes) -> None:
-    """Write `content` to `path` as `write_atomically` does, but leave it to the system when it reaches the disk.
+    """Write `content` to `path` like `write_atomically`, but without waiting for the disk.
 
-    For the many files of a folder that counts as complete only after `sync_disk`: a killed process leaves each whole or
-    absent, a power cut may leave some empty. Raises NeecoError naming `path` when the disk refuses.
+    For the many files of a folder that counts as complete only after `sync_disk`: a killed process leaves each complete
+    or absent, a power failure may leave some empty. Raises NeecoError naming `path` when the disk refuses.
     """
     require_replaceable(path)
     try:
@@ -117,13 +117,13 @@ def write_unsynced(path: Path, content: bytes) -> None:
 
 
 def sync_disk() -> None:
-    """Wait until everything written so far is on disk, where the system can say so (not on Windows)."""
+    """Wait until all written data are on disk, if the system supports it (not on Windows)."""
     if hasattr(os, "sync"):
         os.sync()
 
 
 def _make_folders(path: Path) -> None:
-    """Make folder `path` and those above it, as far as they are missing, so that they outlast a power cut."""
+    """Create folder `path` and its missing parents, so that they survive a power failure."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(parents=True, exist_ok=True)
     for folder in missing:
@@ -146,10 +146,10 @@ def _sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[None]:
-    """Make folder `path` and those above it, as far as they are missing, and check that files can be written there.
+    """Create folder `path` and its missing parents, and check that files can be written there.
 
-    When the block fails, folders made here that are still empty go again. Raises NeecoError when the disk refuses, and
-    for a path that is not in UTF-8.
+    If the block fails, new folders that are still empty are removed. Raises NeecoError when the disk refuses, and for a
+    path that is not in UTF-8.
     """
     path = Path(path)
     require_utf8(path)
@@ -170,12 +170,12 @@ def new_folder(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def own_folder(path: Path, named: Path | None = None, wait_s: float = 0.0) -> Iterator[None]:
-    """`new_folder` for this process alone, rid of what killed processes left half-written there.
+    """Lock a folder (`new_folder`) for this process, and remove unfinished files of killed processes.
 
-    Others that ask for the same folder meanwhile are refused (NeecoError naming `named`, by default the folder) after
-    `wait_s` seconds, and so is a folder that holds a link out of it. The lock goes with the process that holds it,
-    however that ends; a file system without locks refuses nobody. On Windows there is none: nobody is refused, and
-    nothing is swept, which another may be writing.
+    Other processes that request it are refused (NeecoError naming `named`, by default the folder) after `wait_s`
+    seconds, and so is a folder that contains a link out of it. The lock is released when its process ends in any way;
+    file systems without locks refuse nobody. On Windows there is no lock: nobody is refused, and nothing is removed, as
+    another process may be writing it.
     """
     path = Path(path)
     with new_folder(path), contextlib.ExitStack() as stack:
@@ -192,9 +192,9 @@ def own_folder(path: Path, named: Path | None = None, wait_s: float = 0.0) -> It
 
 
 def sweep_unfinished(folder: Path) -> None:
-    """Remove what killed processes left half-written in a folder that this process owns; folders have owners of their
-    own, and a file that is still being written is locked. Raises NeecoError where the folder holds a link out of it, a
-    device or a pipe. On Windows nothing is removed (see `own_folder`)."""
+    """Remove unfinished files of killed processes from a folder that this process owns; subfolders may have other
+    owners, and a file that is still being written is locked. Raises NeecoError if the folder contains a link out of it,
+    a device or a pipe. On Windows nothing is removed (see `own_folder`)."""
     halves = []
     for entry in folder.rglob("*"):  # which follows no link
         if entry.is_symlink():
@@ -217,7 +217,7 @@ def is_vacant(path: Path) -> bool:
 
 
 def _remove_empty(folders: list[Path]) -> None:
-    with contextlib.suppress(OSError):  # the first that is not empty ends it
+    with contextlib.suppress(OSError):  # stops at the first that is not empty
         for folder in folders:
             folder.rmdir()
 
@@ -234,7 +234,7 @@ def write_json(path: Path, value: Any, indent: int | None = 1) -> None:
 
 
 def finite(value: Any) -> Any:
-    """The same structure with NaN and infinity as None: JSON has no such numbers."""
+    """Return the same structure with NaN and infinity replaced by None: JSON has no such numbers."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -285,7 +285,7 @@ def require_file(path: Path, expected: str) -> None:
 
 
 def require_content(path: Path) -> None:
-    """Raise NeecoError for a `placeholder`."""
+    """Raise NeecoError for a `placeholder` instead of content."""
     if problem := placeholder(path):
         raise NeecoError(f"{path}: {problem}")
 
@@ -341,8 +341,8 @@ def read_json(path: Path) -> Any:
 
 
 def _refuse_halves(path: Path, text: str, value: Any) -> None:
-    """Raise NeecoError for a document with halves of characters, as of names that are not in UTF-8: no other file could
-    hold them."""
+    """Raise NeecoError for a document with unpaired surrogates, from names that are not in UTF-8: no other file could
+    contain them."""
     if "\\ud" in text.lower() and (half := HALVES.search(json.dumps(value, ensure_ascii=False, default=str))):
         raise NeecoError(f"{path}: holds {half[0]!r}, an incomplete character; write its names and the files' in UTF-8")
 
@@ -362,8 +362,8 @@ def distinct_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class YamlLoader(yaml.SafeLoader):
-    """YAML in which -.5, 1e-3 and 1.5e3 are numbers, as in YAML 1.2 (PyYAML, which reads 1.1, takes them for text), and
-    a key given twice is an error: the first would be lost without a word."""
+    """YAML loader that reads -.5, 1e-3 and 1.5e3 as numbers, as in YAML 1.2 (in 1.1, which PyYAML reads, they are
+    text), and rejects duplicate keys, the first of which would be lost silently."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -376,11 +376,11 @@ class YamlLoader(yaml.SafeLoader):
 
 
 class FastYamlLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """The same, 20 times as fast where PyYAML was built with libyaml, for files that nobody writes by hand."""
+    """The same loader, 20 times as fast if PyYAML was built with libyaml, for files that are not written by hand."""
 
 
 class YamlDumper(yaml.SafeDumper):
-    """Writes what these read: text that looks like such a number in quotes."""
+    """Dumper for these loaders: quotes text that looks like such a number."""
 
 
 _NUMBER = re.compile(r"^[-+]?(?:(?:\.[0-9]+|[0-9]+\.[0-9]*)(?:[eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+)$")
@@ -389,8 +389,8 @@ for _kind in (YamlLoader, FastYamlLoader, YamlDumper):
 
 
 def parse_yaml(path: Path, text: str, remedy: str, loader: type[yaml.SafeLoader] = YamlLoader) -> Any:
-    """The document in the text of YAML file `path`. Raises NeecoError, with the line where it is no YAML, and for
-    aliases that make more of it than any file says."""
+    """Return the document in the text of YAML file `path`. Raises NeecoError, with the line of a syntax error, and for
+    aliases that expand beyond MAX_VALUES."""
     try:
         value = yaml.load(text, Loader=loader)
     except RecursionError:
@@ -408,11 +408,11 @@ def parse_yaml(path: Path, text: str, remedy: str, loader: type[yaml.SafeLoader]
 
 
 def _unfolded(value: Any, counts: dict[int, int]) -> int:
-    """Number of values when every alias is written out; `counts`: of those met already."""
+    """Return the number of values with all aliases expanded; `counts`: those of values visited so far."""
     if not isinstance(value, dict | list):
         return 1
     if id(value) not in counts:
-        counts[id(value)] = MAX_VALUES + 1  # until it is known: it would contain itself
+        counts[id(value)] = MAX_VALUES + 1  # until it is computed: detects recursion
         inner = value.values() if isinstance(value, dict) else value
         counts[id(value)] = 1 + sum(_unfolded(item, counts) for item in inner)
     return counts[id(value)]
@@ -421,10 +421,10 @@ def _unfolded(value: Any, counts: dict[int, int]) -> int:
 def read_begun(
     output: Path, name: str, resume: bool | None, work: str, read: Callable[[Path], Any] | None = None
 ) -> dict[str, Any] | None:
-    """Return what file `name` in folder `output` says of the `work` (a noun) begun there; None for a vacant folder.
+    """Return the record in file `name` of folder `output` on the `work` (a noun) begun there; None for a vacant folder.
 
-    resume: continue it; None: where it was begun. read: reads it from the folder; None: the file is JSON. Raises
-    NeecoError where `output` is no folder, vacant (with `resume`) or not empty (without), or holds something else.
+    resume: continue it; None: if it was begun. read: reads it from the folder; None: the file is JSON. Raises
+    NeecoError if `output` is no folder, vacant (with `resume`) or not empty (without), or contains something else.
     """
     file = output / name
     if output.exists() and not output.is_dir():
@@ -445,8 +445,8 @@ def read_begun(
 
 
 def require_same(place: str, pairs: Iterable[tuple[str, Any, Any]], remedy: str = "use a new folder") -> None:
-    """Raise NeecoError for the first field (name, value begun with, value now) that differs, of work to be continued
-    that `place` describes."""
+    """Raise NeecoError for the first field (name, value begun with, present value) that differs, of work to be
+    continued as described in `place`."""
     for name, begun, now in pairs:
         if begun != now:
             raise NeecoError(f"{place}: {name}: begun with {begun!r}, now {now!r}; {remedy}")

@@ -1,4 +1,4 @@
-"""Locks of files, which go with the process that holds them, however it ends. Windows has none; nor have some disks."""
+"""File locks, which are released when their process ends in any way. Windows and some disks have none."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ try:
 except ImportError:  # Windows has no such locks
     fcntl = None  # type: ignore[assignment]
 
-TEMPORARY = ".unfinished-"  # begins the names of files and folders that are still being written
+TEMPORARY = ".unfinished-"  # prefix of files and folders that are still being written
 LOCK = ".neeco.lock"
 RETRY_S = 0.02
 LOCKING = fcntl is not None
 
 
 def begin_file(path: Path) -> tuple[Path, int]:
-    """Create the temporary file of `path`; returns it and its handle, whose lock says that its writer is alive."""
+    """Create the temporary file of `path`; return it and its handle, whose lock shows that its writer is alive."""
     flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
     while True:
         # keep the suffix: some writers choose the format by it

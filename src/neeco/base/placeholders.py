@@ -1,19 +1,19 @@
-"""Recognition of what is in a file's place: pipes, devices and Git LFS pointers."""
+"""Detection of what is in place of a file: pipes, devices and Git LFS pointers."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # how it begins
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # its first bytes
 _KINDS = {
     "recording.yaml": ("a recording, ", "`neeco ingest` makes a capture of it, for `neeco train`"),
     "config.yaml": ("a run, ", "its config.yaml names its capture"),
     "transforms.json": ("a capture, ", "`neeco train` makes a run of it"),
-}  # of folders, by a file that they hold
+}  # kinds of folders, by a file that they contain
 
 
 def read_head(path: Path, count: int) -> bytes:
-    """Up to `count` bytes from the beginning of a regular file; none where there is no such file, or none to read."""
+    """Return up to `count` bytes from the beginning of a regular file; empty if it is absent or unreadable."""
     try:
         if path.is_file():
             with path.open("rb") as stream:
@@ -24,8 +24,8 @@ def read_head(path: Path, count: int) -> bytes:
 
 
 def placeholder(path: Path) -> str | None:
-    """Name what is in a file's place, and the remedy: a pipe, a socket or a device, whose reading may not end, or a Git
-    LFS pointer; None for a file, a folder, or nothing."""
+    """Name what is in place of a file, and the remedy: a pipe, a socket or a device, whose reading may not end, or a
+    Git LFS pointer; None for a file, a folder, or nothing."""
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             return "is not a file but a pipe, socket or device; write what it holds into a file, and give that"
@@ -37,7 +37,7 @@ def placeholder(path: Path) -> str | None:
 
 
 def misplaced(path: Path, wanted: str, content: str = "") -> tuple[str, str]:
-    """Return what is wrong with `path`, which is not what was `wanted`, a folder that holds `content`, and a remedy."""
+    """Return the fault of `path`, which is not the `wanted` kind of folder with `content`, and a remedy."""
     if not path.is_dir():
         kind = "is a file" if path.is_file() else "is a device, pipe or socket" if path.exists() else "no such folder"
         return kind, f"give {wanted}"

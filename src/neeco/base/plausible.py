@@ -1,6 +1,6 @@
-"""Limits of plausible cameras, joints, times, masks and frame counts, for all readers of files and the Python API.
+"""Limits of plausible cameras, joints, times, masks and frame counts, for all file readers and the Python API.
 
-Each function returns what is wrong and what to do, or None. Poses: `neeco.geometry.rotations.rigid_fault`.
+Each function returns a fault and its remedy, or None. Poses: `neeco.geometry.rotations.rigid_fault`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ class PlausibleLimits:
     max_anamorphic: float = 2.5  # ratio of the two focal lengths: single fields of interlaced video have 2
     # of the sides, distance of a principal point from the middle by a lens's own tolerances
     max_off_middle: float = 0.08
-    max_middle_error: float = 0.03  # of the sides, the same once intrinsics of another image size are scaled
-    full_turn: float = 2 * math.pi  # rad; a joint without stated limits turns no farther
-    max_slide_mm: float = 1000.0  # mm; nor slides farther
+    max_middle_error: float = 0.03  # of the sides, the same after scaling intrinsics of another image size
+    full_turn: float = 2 * math.pi  # rad; maximum of a joint without stated limits
+    max_slide_mm: float = 1000.0  # mm; maximum of a sliding joint without stated limits
     limit_tolerance: float = 1e-3  # rad (mm of sliding joints) by which rounding and noise may exceed a limit
-    max_time_s: float = 1e10  # s, beyond the seconds since 1970 that clocks give
-    few_train_frames: int = 20  # fewer: expect little
+    max_time_s: float = 1e10  # s, beyond any Unix time of a clock
+    few_train_frames: int = 20  # number below which results are poor
     max_hidden: float = 0.5  # share of the lit pixels of most images that a loss mask may hide
     max_points_hidden: float = 0.8  # share of the projected sparse points that loss masks may hide
 

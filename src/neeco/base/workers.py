@@ -163,13 +163,13 @@ class Processes:
     def start_worker(self) -> _Worker:
         """Return another worker, started."""
         context = multiprocessing.get_context("spawn")  # a forked one would share threads' locks
-        here, there = context.Pipe()
+        parent_end, child_end = context.Pipe()
         slot = self._slots.pop(0)
         gpu = _visible_gpu(slot % (self._workers.shared_gpus or self.capacity)) if self._workers.gpu else None
-        process = context.Process(target=_serve, args=(*self._arguments, there, gpu), daemon=True)
+        process = context.Process(target=_serve, args=(*self._arguments, child_end, gpu), daemon=True)
         process.start()
-        there.close()
-        return _Worker(process, here, slot)
+        child_end.close()
+        return _Worker(process, parent_end, slot)
 
     def submit(self, index: int, task: Any) -> None:
         """Give the task to an idle worker or a new one."""
@@ -198,14 +198,14 @@ class Processes:
 
     def stop(self) -> None:
         """Interrupt all workers; those that do not end in time are killed, at a second Ctrl-C at once."""
-        left = [*self._idle, *(worker for worker, _ in self.running.values())]
-        for worker in left:
+        workers = [*self._idle, *(worker for worker, _ in self.running.values())]
+        for worker in workers:
             worker.process.terminate()
         deadline = time.monotonic() + self._workers.stop_s
         with contextlib.suppress(KeyboardInterrupt):
-            for worker in left:
+            for worker in workers:
                 worker.process.join(max(0.0, deadline - time.monotonic()))
-        for worker in left:
+        for worker in workers:
             worker.process.kill()
             worker.process.join()
             worker.connection.close()
@@ -355,8 +355,8 @@ def require_shared(ray: Any, file: Path, inputs: Collection[Path]) -> None:
         probes = {}
         for node in ray.nodes():
             if node["Alive"] and node["Resources"].get("CPU", 0) >= 1:
-                there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-                probe = ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=there)(node_problem)
+                on_node = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+                probe = ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=on_node)(node_problem)
                 name = f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
                 probes[probe.remote(file, token, tuple(inputs))] = name
         answered, silent = ray.wait(list(probes), num_returns=len(probes), timeout=LIMITS.probe_s)

@@ -1,4 +1,4 @@
-"""Captures: what was recorded, how it is read, written and checked."""
+"""Captures: data model, readers, writer and checks."""
 
 from neeco.capture.checks import check_capture
 from neeco.capture.documents import Problem, errors_only

@@ -1,4 +1,4 @@
-"""Values of JSON and YAML files that know their place, and reports of the problems found in them."""
+"""Values of JSON and YAML files with their place, and reports of the problems found in them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from neeco.geometry.rotations import rigid_fault
 
 T = TypeVar("T")
 U = TypeVar("U")
-MIN_CONDENSED = 3  # problems similar to another one, from which they are counted instead of listed
+MIN_CONDENSED = 3  # number of similar problems above which they are counted instead of listed
 VARYING = re.compile(
     r"'(?:[^'\\]|\\.)*'|\S+\.(?:png|jpe?g)\b|[-+]?\d[\d.]*(?:e[-+]?\d+)?|\b(?:nan|inf)\b", re.IGNORECASE
 )
@@ -53,10 +53,10 @@ def condensed(problems: Sequence[Problem]) -> list[Problem]:
         key = (VARYING.sub("#", part) for part in (problem.file, problem.field, problem.message, problem.remedy))
         groups.setdefault((problem.severity, *key), []).append(problem)
     merged = []
-    for first, *others in groups.values():
-        many = len(others) >= MIN_CONDENSED
-        merged.append(replace(first, message=f"{first.message} (and {len(others)} more like it)") if many else first)
-        merged += [] if many else others
+    for first, *similar in groups.values():
+        many = len(similar) >= MIN_CONDENSED
+        merged.append(replace(first, message=f"{first.message} (and {len(similar)} more like it)") if many else first)
+        merged += [] if many else similar
     return merged
 
 
@@ -94,7 +94,7 @@ def as_float(value: Any) -> float | None:
 
 @dataclass(frozen=True)
 class Node(Place):
-    """A value of a JSON or YAML file and its place. A reading that fails raises Fault, or, by `tried`, is reported."""
+    """A value of a JSON or YAML file and its place. A failing reading raises Fault; within `tried` it is reported."""
 
     report: ProblemReport = field(default_factory=ProblemReport)
 
@@ -104,14 +104,14 @@ class Node(Place):
 
     @contextmanager
     def blamed(self) -> Iterator[None]:
-        """Raise the block's NeecoError, which does not say where, as Fault of this place."""
+        """Convert the block's NeecoError, which names no place, to a Fault of this place."""
         try:
             yield
         except NeecoError as error:
             raise Fault(self.field, str(error)) from None
 
     def tried(self, read: Callable[..., T], *arguments: Any) -> T | None:
-        """Return `read(self, *arguments)`; where that fails, report the first fault and return None."""
+        """Return `read(self, *arguments)`; on failure, report the first fault and return None."""
         try:
             with self.blamed():
                 return read(self, *arguments)
@@ -154,7 +154,7 @@ class Node(Place):
         return {name: self.child(name) for name in self.value}
 
     def given(self, key: str, read: Callable[[Node], T], default: U) -> T | U:
-        """Return `read` of the value under `key`; `default` where there is none, or null."""
+        """Return `read` of the value under `key`; `default` if it is absent or null."""
         return read(self.child(key)) if self.has(key) else default
 
     def flag(self) -> bool:
@@ -192,7 +192,7 @@ class Node(Place):
         return int(value)
 
     def numbers(self, count: int, what: str, least: float | None = None) -> tuple[float, ...]:
-        """A list of so many finite numbers, none below `least`."""
+        """Return a list of `count` finite numbers, none below `least`."""
         if not isinstance(self.value, list) or len(self.value) != count:
             self.fail(f"expected {count} numbers ({what}), found {printable(self.value)}", "correct it")
         return tuple(item.number(least=least) for item in self.items())

@@ -1,4 +1,4 @@
-"""Images and masks, read as tensors and written whole, and what loss masks hide."""
+"""Images and masks: reading as tensors, writing, and the content hidden by loss masks."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ warnings.simplefilter("error", Image.DecompressionBombWarning)
 
 @dataclass(frozen=True, kw_only=True)
 class PixelSettings:
-    """Thresholds of what an image's pixels show."""
+    """Thresholds on image content."""
 
     # Levels of 255, mean and largest, by which a picture differs that is coded again: 0.07 and 19 by H.264 at its
     # coarsest; 0.4 and 40 or more where a camera or an instrument moves
     repeated_mean: float = 0.2
     repeated_max: int = 24
-    visible_mm: float = 1.0  # change that a picture shows of a position
+    visible_mm: float = 1.0  # minimum visible change of a position
     visible_rad: float = 0.03  # the same of an angle, or a rotation's entries
-    lit: float = 0.12  # brightness in [0, 1] of a pixel's brightest channel: a dark border around the field has less
-    min_lit: float = 0.02  # share of an image: with fewer lit pixels it is not counted
+    lit: float = 0.12  # minimum brightness in [0, 1] of a lit pixel's brightest channel: a dark border has less
+    min_lit: float = 0.02  # minimum share of lit pixels for an image to count
 
 
 PIXELS = PixelSettings()
 PNG_NONE, PNG_SUB, PNG_AVERAGE = 8, 16, 64  # filters of a PNG's rows: the best of labels, of depths, and of images
-FORMATS = ("PNG", "JPEG")  # that are opened, whatever a file's name says: Pillow's other decoders stay unused
+FORMATS = ("PNG", "JPEG")  # accepted formats, whatever the extension: Pillow's other decoders are not used
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
@@ -92,7 +92,7 @@ def open_image(path: Path, size: tuple[int, int] | None = None, formats: tuple[s
     `formats` than Pillow's of these names."""
     path = Path(path)
     with _opened(path, formats) as image:
-        if size is not None and image.size != tuple(size):  # before its pixels, of which there may be billions
+        if size is not None and image.size != tuple(size):  # before decoding, as there may be billions of pixels
             actual, expected = "x".join(map(str, image.size)), "x".join(map(str, size))
             raise NeecoError(f"{path}: image is {actual}, its camera says {expected}; resize it or correct w and h")
         image.load()
@@ -139,9 +139,9 @@ def encoded_rgb(pixels: np.ndarray) -> bytes:
 
 
 def encoded_png(pixels: np.ndarray) -> bytes:
-    """The content of a PNG of uint8 [H, W, 3] (BGR), or uint8 or uint16 [H, W].
+    """Return the content of a PNG of uint8 [H, W, 3] (BGR), or uint8 or uint16 [H, W].
 
-    By OpenCV, quickly: in a sixteenth of Pillow's usual time, images a tenth larger.
+    Encoded by OpenCV: 16 times as fast as Pillow, and a tenth larger.
     """
     image, depth = pixels.ndim == 3, pixels.dtype != np.uint8
     # labels have long runs; of images and depths, a search for any takes longer than what it saves
@@ -170,7 +170,7 @@ def area_averaged(image: Tensor, width: int, height: int) -> Tensor:
 
 
 def is_repeated(before: np.ndarray, picture: np.ndarray) -> bool:
-    """Return True if a grey image, uint8 [h, w], is the one before, coded again."""
+    """Return True if a grey image, uint8 [h, w], is the previous one encoded again."""
     if before.shape != picture.shape:
         return False
     change = cv2.absdiff(before, picture)
@@ -232,8 +232,8 @@ class Hidden:
 
 
 def measure_hidden(pixels: np.ndarray, mask: np.ndarray, camera: Camera | None, points: np.ndarray) -> Hidden:
-    """Count what a loss mask bool [H, W], False where ignored, hides of an image [H, W, 3], uint8 or in [0, 1], and of
-    points [P, 3] mm in its camera (None: not known)."""
+    """Measure what a loss mask bool [H, W], False where ignored, hides of an image [H, W, 3], uint8 or in [0, 1], and
+    of points [P, 3] mm in its camera (None: unknown)."""
     lit, ignored = pixels.max(-1) > PIXELS.lit * (255 if pixels.dtype == np.uint8 else 1), ~mask
     share = float(ignored[lit].mean()) if lit.mean() > PIXELS.min_lit else None
     if camera is None or not len(points):
@@ -246,7 +246,7 @@ def measure_hidden(pixels: np.ndarray, mask: np.ndarray, camera: Camera | None, 
 
 
 def masks_fault(hidden: Sequence[Hidden]) -> Fault | None:
-    """Return the fault of loss masks that hide so much, and its remedy."""
+    """Return the fault of loss masks that hide too much, and its remedy."""
     shares = [one.pixels for one in hidden if one.pixels is not None]
     if not shares:
         return None

@@ -1,4 +1,4 @@
-"""Kinematic trees: the links of an instrument, what joins them, and where they stand at a state's readings."""
+"""Kinematic trees: the links of an instrument, their joints, and their poses at a state's readings."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A rigid piece, and the joint that joins it to its parent.
+    """A rigid link, and the joint that connects it to its parent.
 
-    `origin` [4, 4] is parent_from_link, mm, where the joint's value is 0; `axis` [3] unit, in the parent's frame. The
-    joint turns the link about the axis through the origin (revolute, rad) or slides it along (prismatic, mm), by its
-    value: the sum of readings, each times its gain, plus `offset`. `body`: there is something of the instrument to see
-    that moves with the link; otherwise it is a frame only, such as the point that a robot reports.
+    `origin` [4, 4] is parent_from_link, mm, at a joint value of 0; `axis` [3] unit, in the parent's frame. The joint
+    rotates the link about the axis through the origin (revolute, rad) or slides it along (prismatic, mm) by its value:
+    the sum of readings, each times its gain, plus `offset`. `body`: a visible part of the instrument moves with the
+    link; otherwise it is a frame only, such as the point that a robot reports.
     """
 
     name: str
@@ -83,17 +83,17 @@ class KinematicTree:
 
     @property
     def readings(self) -> tuple[str, ...]:
-        """Names of all readings that drive a joint, in the order of the links, of one joint in that of the alphabet."""
+        """Names of all readings that drive a joint, in the order of the links, alphabetically within a joint."""
         return tuple(dict.fromkeys(name for link in self.links for name in sorted(link.value)))
 
     @property
     def bodies(self) -> tuple[Link, ...]:
-        """Links with something to see, parents first."""
+        """Links with a visible body, parents first."""
         return tuple(link for link in self.links if link.body)
 
     @property
     def joints(self) -> tuple[Link, ...]:
-        """Links whose joint moves, the outermost first: the order in which joints move what is at rest."""
+        """Links with a moving joint, outermost first: the order in which joints move the links at rest."""
         return tuple(link for link in reversed(self.links) if link.type != FIXED)
 
     def poses(self, readings: Mapping[str, float]) -> dict[str, Array]:
@@ -101,8 +101,8 @@ class KinematicTree:
         missing."""
         poses: dict[str, Array] = {}
         for link in self.links:
-            here = link.parent_from_link(readings)
-            poses[link.name] = here if link.parent is None else poses[link.parent] @ here
+            parent_from_link = link.parent_from_link(readings)
+            poses[link.name] = parent_from_link if link.parent is None else poses[link.parent] @ parent_from_link
         return poses
 
     def readings_of(self, name: str) -> set[str]:
@@ -143,8 +143,8 @@ class KinematicTree:
         return np.array(points).reshape(-1, 3), np.array(directions).reshape(-1, 3)
 
     def values(self, readings: Mapping[str, float]) -> Array:
-        """[J, B] by which each of `joints` turns or slides each of `bodies`: its value for links that lie beyond it, 0
-        for others. With `axes_at_rest` all that posing takes. Raises KeyError for a reading that is missing."""
+        """Return [J, B]: the value by which each of `joints` moves each of `bodies`, for links beyond it, else 0.
+        Together with `axes_at_rest` sufficient for posing. Raises KeyError for a missing reading."""
         rows = [[link.joint_value(readings) * self.carries(link, body) for body in self.bodies] for link in self.joints]
         return np.array(rows, np.float64).reshape(len(self.joints), len(self.bodies))
 

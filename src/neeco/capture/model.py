@@ -1,7 +1,7 @@
-"""The data model: what a recording consists of, in the units and axes that the whole program uses.
+"""Data model of recordings, in the units and axes used throughout.
 
-Lengths are mm, angles rad, times s. The world is right-handed and fixed to the tissue. Cameras have OpenCV axes
-(x right, y down, z forward). Poses are rigid transforms [4, 4], named by both ends: `world_from_camera`.
+Lengths are mm, angles rad, times s. The world is right-handed and fixed to the tissue. Cameras have OpenCV axes (x
+right, y down, z forward). Poses are rigid transforms [4, 4], named by both ends: `world_from_camera`.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from neeco.geometry.rotations import as_pose, number_text, position_text, rigid_
 SCHEMA = "neeco-capture/1"  # of the folder that holds a capture
 SEPARATE_TISSUES = "make one capture for each tissue, train each, and mix with `neeco synthesize --tissue RUN`"
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
-UNKNOWN_DEG = 180.0  # the standard deviation of an angle of which nothing is known
-REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
-HOW_TO_REGISTER = (  # poses that are not in the cameras' world
+UNKNOWN_DEG = 180.0  # standard deviation of an unknown angle
+REFERENCE_PIXELS = 320 * 256  # image size that pixel sizes and numbers of Gaussians refer to
+HOW_TO_REGISTER = (  # if poses are not in the cameras' world
     "in recording.yaml state camera_from_base (a robot's base to a still camera; or unknown, which searches it), "
     "poses: {…, frame: camera}, or laparoscope (the tracker of a scope that moves), and ingest again"
 )
-MIN_DEVIATION = 1e-9  # coordinates that vary less in the recording do not count as changing
+MIN_DEVIATION = 1e-9  # standard deviation below which a coordinate counts as constant
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class BaseUncertainty:
-    """Covariance of an error that all recorded poses of an instrument share, as that of a robot's base: a turn (rad)
-    about `center` (mm) and a shift (mm), both in the world's axes."""
+    """Covariance of an error common to all recorded poses of an instrument, such as that of a robot's base: a rotation
+    (rad) about `center` (mm) and a translation (mm), both in the world's axes."""
 
     center: tuple[float, ...]  # [3]
     covariance: tuple[tuple[float, ...], ...]  # [6][6]
@@ -60,8 +60,8 @@ class BaseUncertainty:
 class InstrumentState:
     """Pose and joint values of one instrument.
 
-    The pose may be given as a tensor, an array or nested lists; what is no tensor becomes float64. Raises NeecoError
-    when it is not 4x4, or given so and no rotation and translation, and for joints that are not finite numbers.
+    The pose may be a tensor, an array or nested lists; other than tensors become float64. Raises NeecoError if it is
+    not 4x4, or (unless a tensor) no rotation and translation, and for joints that are not finite numbers.
     """
 
     pose: Tensor  # [4, 4] float64, world_from_instrument, mm
@@ -119,11 +119,11 @@ class State:
         return f"State({instruments}time={number_text(self.time)} s)"
 
     def check(self, instruments: Sequence[Instrument], *, fitted: bool = False) -> None:
-        """Raise NeecoError for what none of a scene's instruments can be: poses that are not rigid, instruments and
-        joints that it does not have, joints beyond their limits.
+        """Raise NeecoError for states that are invalid for a scene's instruments: poses that are not rigid, instruments
+        and joints that it does not have, joints beyond their limits.
 
-        fitted: it may come from a fit, so joints may leave their limits by the range between these and be others than
-        the scene's, and tensors on a GPU or with gradients are not read.
+        fitted: it may come from a fit, so joints may exceed their limits by their range and differ from the scene's;
+        tensors on a GPU or with gradients are not read.
         """
         by_name = {item.name: item for item in instruments}
         for name, state in self.instruments.items():
@@ -162,11 +162,11 @@ class FromVideo:
 
 @dataclass(frozen=True)
 class Instrument:
-    """One tracked rigid body and what is joined to it. `joints`: name of every reading -> (lower, upper) limit in rad,
-    or None when not stated. `kinematics`: the links and which reading drives which joint, where that is known.
-    `unrecorded`: joints of those that move the links and that no sensor logged, each with limits; in a capture's states
-    they stand half way between these until they are found. `from_video`: its poses were found in the images.
-    `left_out`: recorded joints that a learned scene does not use. `base_uncertainty`: of what all poses share."""
+    """One tracked rigid body and its links. `joints`: name of every reading -> (lower, upper) limit in rad, or None
+    when not stated. `kinematics`: the links and the readings that drive their joints, if known. `unrecorded`: joints of
+    these links that no sensor logged, each with limits; in a capture's states they are half way between these until
+    they are estimated. `from_video`: its poses were estimated from the images. `left_out`: recorded joints that a
+    learned scene does not use. `base_uncertainty`: of the error common to all poses."""
 
     name: str
     joints: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
@@ -181,7 +181,7 @@ class Instrument:
         return f"Instrument({self.name!r}, joints: {', '.join(self.joints) or 'none'})"
 
     def joint_fault(self, joint: str, value: float, slack: float = 0.0) -> Fault | None:
-        """Return what is wrong with a value, rad or mm, of a joint, and what to do; None: it may be right. slack: see
+        """Return the fault of a joint value, rad or mm, and its remedy; None if plausible. slack: see
         `neeco.base.plausible.joint_fault`."""
         if joint in self.joints:
             return joint_fault(value, self.joints[joint], self.slides(joint), slack)
@@ -319,11 +319,11 @@ def share_lamps(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
 
 
 class RecordedStates:
-    """Distances of states from the recorded ones, in standard deviations of those.
+    """Distances of states from the recorded ones, in standard deviations of the latter.
 
     A state's coordinates are the instruments' positions (mm), the entries of their rotation matrices and their joints
-    (rad), or the time (s) where no instrument is asked for. Each is divided by its standard deviation over the recorded
-    states; coordinates that stand still there are left out. joints: whether they are to count.
+    (rad), or the time (s) without instruments. Each is divided by its standard deviation over the recorded states;
+    constant coordinates are ignored. joints: whether they count.
     """
 
     def __init__(self, states: Sequence[State], instruments: Sequence[str], joints: bool = True) -> None:
@@ -336,7 +336,7 @@ class RecordedStates:
 
     @property
     def still(self) -> bool:
-        """True if nothing moved, so that no state is nearer than another."""
+        """True if nothing moved, so that all states are equally near."""
         return not self._moving.any()
 
     def distances(self, state: State) -> np.ndarray:
@@ -356,9 +356,9 @@ class RecordedStates:
 
 
 def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
-    """Indices of at most `most` of `count` items, evenly spaced from the first to the last, in order, none twice.
+    """Return indices of at most `most` of `count` items, evenly spaced, in order, without duplicates.
 
-    Places between two items are rounded to the nearest (half to even), or with `floor` down.
+    Half positions are rounded to even, or down with `floor`.
     """
     places = np.linspace(0, count - 1, min(count, most))
     return np.unique((np.floor if floor else np.rint)(places).astype(int)).tolist()

@@ -12,7 +12,7 @@ from neeco.base.files import read_bytes, write_atomically
 from neeco.geometry.lines import across_projectors, nearest_point
 
 MAX_SAMPLED_POINTS = 500
-UNKNOWN_DISTANCE_MM = 100.0  # how far a single, still camera is taken to look
+UNKNOWN_DISTANCE_MM = 100.0  # assumed distance of the scene for a single, still camera
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -101,10 +101,10 @@ def random_points(center: np.ndarray, half_size: float, count: int = 20_000, see
 
 
 def points_in_view(poses: np.ndarray) -> PointCloud:
-    """Random points where the cameras look, world_from_camera [F, 4, 4], for captures that bring none.
+    """Return random points in the cameras' common view, world_from_camera [F, 4, 4], for captures without points.
 
-    A cube about the point nearest to all optical axes, as wide as the cameras are far from it. Axes that meet nowhere,
-    or behind the cameras (a scope turns about its trocar), leave the distance unknown.
+    A cube around the point nearest to all optical axes, as wide as its distance from the cameras. If the axes do not
+    intersect in front of the cameras (a scope rotating about its trocar), the distance is unknown.
     """
     centers, axes = poses[:, :3, 3], poses[:, :3, 2]
     meeting = centers.mean(axis=0) + UNKNOWN_DISTANCE_MM * axes.mean(axis=0)

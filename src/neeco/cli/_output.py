@@ -27,9 +27,9 @@ from neeco.base.settings import described, field_texts, value_words
 if TYPE_CHECKING:
     from neeco.studies.tables import ResultTable
 
-STANDARD_OUTPUT = Path("-")  # as the value of --json
-FILE_WIDTH = 1000  # limit on the characters of a line in files and pipes
-BORDER = 3  # characters of a column in addition to its text
+STANDARD_OUTPUT = Path("-")  # value of --json
+FILE_WIDTH = 1000  # maximum width of lines in files and pipes
+BORDER = 3  # additional characters per column
 
 
 JsonTarget = Annotated[
@@ -43,7 +43,7 @@ JsonTarget = Annotated[
 
 
 def whole_lines(*, stderr: bool = False) -> Console:
-    """Return a console that cuts and wraps nothing where no terminal's width asks for it: in files and pipes."""
+    """Return a console that neither cuts nor wraps lines in files and pipes, which have no terminal width."""
     console = Console(stderr=stderr)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = FILE_WIDTH
@@ -51,8 +51,8 @@ def whole_lines(*, stderr: bool = False) -> Console:
 
 
 def fitted(table: ResultTable, width: int) -> list[Table]:
-    """Split a table into as many pieces as a terminal of `width` characters needs; each has the key columns, and of a
-    failed row its first cell. The best of a column and reference rows are bold."""
+    """Split a table into pieces that fit a terminal of `width` characters; each has the key columns, and the first cell
+    of a failed row. The best of a column and reference rows are bold."""
     headings, keys = [*table.keys, *(column.title for column in table.columns)], len(table.keys)
     rows = []
     for row in table.rows:
@@ -93,8 +93,8 @@ def print_outcome(
     failed: Sequence[str],
     runs: str,
 ) -> int:
-    """Print tables, sentences, notes and where the files lie, by what they are; returns 1 when any of `runs` (`3 runs`)
-    failed, and prints the first failure."""
+    """Print tables, sentences, notes and file paths by title; return 1 if any of `runs` (`3 runs`) failed, after
+    printing the first failure."""
     console = whole_lines()
     for table in tables:
         for piece in fitted(table, console.width):
@@ -103,8 +103,8 @@ def print_outcome(
         console.print(sentence, markup=False, highlight=False)
     for note in notes:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
-    for what, place in files.items():
-        console.print(f"{what}: {place}", markup=False, highlight=False, soft_wrap=True)
+    for title, place in files.items():
+        console.print(f"{title}: {place}", markup=False, highlight=False, soft_wrap=True)
     if not failed:
         return 0
     more = f" (and {len(failed) - 1} more, listed above)" if len(failed) > 1 else ""
@@ -114,14 +114,14 @@ def print_outcome(
 
 
 def require_ending(option: str, path: Path, *endings: str) -> None:
-    """Raise NeecoError where the name of an output file ends as another format's than the one that is written, whose
-    names end in one of `endings`; one without an ending is nobody's."""
+    """Raise NeecoError if the extension of an output file belongs to another format than the one written, whose
+    extensions are `endings`; files without an extension are accepted."""
     if path.suffix and path.suffix.lower() not in endings:
         raise NeecoError(f"{option}: {path}: wrong file name extension; use {' or '.join(endings)}")
 
 
 def write_numbers(path: Path | None, numbers: Any) -> bool:
-    """Write what `--json` asks for; True where that is all that standard output is to have."""
+    """Write the numbers requested by `--json`; return True if they are the whole standard output."""
     if path == STANDARD_OUTPUT:
         print(json.dumps(finite(numbers), indent=2, allow_nan=False))
     elif path is not None:
@@ -131,7 +131,7 @@ def write_numbers(path: Path | None, numbers: Any) -> bool:
 
 @contextmanager
 def ready_for_json(path: Path | None) -> Iterator[None]:
-    """Check before the work whose numbers go to `--json` that the file can be written.
+    """Check, before a long computation, that the file of `--json` can be written.
 
     Raises NeecoError for a folder, a name of another format, or a file whose folder cannot be written to.
     """
@@ -145,7 +145,7 @@ def ready_for_json(path: Path | None) -> Iterator[None]:
         yield
 
 
-DEFAULT = " Default: "  # begins the last sentence of an option's text, where its default is no value
+DEFAULT = " Default: "  # prefix of the last sentence of an option's text, for defaults without a value
 
 
 def _options(kind: Any) -> Iterator[tuple[Any, dataclasses.Field[Any], Any, tuple[Any, ...]]]:
@@ -162,8 +162,8 @@ def _options(kind: Any) -> Iterator[tuple[Any, dataclasses.Field[Any], Any, tupl
 
 @cache
 def state_defaults(kind: Any) -> None:
-    """Make the help of a dataclass of arguments state what holds where an option without a value of its own is left
-    out: the text behind DEFAULT, in place of None."""
+    """Make the help of a dataclass of arguments state the behaviour of omitted options without a default value: the
+    text behind DEFAULT, in place of None."""
     for owner, field, bare, markers in list(_options(kind)):
         added = []
         repeated, texts = typing.get_origin(bare) is tuple, field_texts(owner)
@@ -193,8 +193,8 @@ def option_names(kind: Any) -> list[str]:
 
 
 def usage_error(box: str, words: Sequence[str], kind: Any) -> str:
-    """Return in one line what is wrong with a command line that tyro refused in a framed `box`: the options that its
-    verb does not have and that are nearly one, else tyro's words without its frame and its list of similar options."""
+    """Return a one-line message for a command line that tyro refused in a framed `box`: similar options for unknown
+    ones, else tyro's words without its frame and its list of similar options."""
     options, slips = [*option_names(kind), "--help"], []
     for option in (word.partition("=")[0] for word in words):
         if option.startswith("--") and option not in options and (meant := nearest(option, options)) is not None:
@@ -202,8 +202,8 @@ def usage_error(box: str, words: Sequence[str], kind: Any) -> str:
     if slips:
         return " ".join(slips)
     rows = [row[2:].rstrip("│ ") for row in re.sub("\x1b\\[[0-9;]*m", "", box).splitlines()[1:-1]]
-    rows = rows[bool(rows) and not rows[0].strip("-") :]  # the title's rule, where the frame is ASCII
-    first = list(itertools.takewhile(lambda row: row.strip("─-"), rows))  # up to the next rule
+    rows = rows[bool(rows) and not rows[0].strip("-") :]  # title line of an ASCII frame
+    first = list(itertools.takewhile(lambda row: row.strip("─-"), rows))  # up to the next line of the frame
     line = " ".join(f"{row}:" if re.match(" {4}[^ ]", row) else row for row in first)  # names of what is missing
     line = re.sub(r"[. ]*\(required\)", ";", " ".join(line.split())).rstrip(".;").removeprefix("Error parsing ")
     line = re.sub("^Missing from [^:]+:", f"{words[0]}: missing", line)

@@ -1,4 +1,4 @@
-"""Progress on the error stream, as bars or lines, and messages for interrupted work."""
+"""Progress on the error stream, as bars or lines, and messages on interruption."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ if TYPE_CHECKING:
 class ProgressSettings:
     """Times and sizes of bars and lines."""
 
-    line_interval_s: float = 30.0  # s between two lines about the same work, where no terminal shows bars
-    wide: int = 100  # least width in characters of a terminal on which bars are long
-    min_shown_s: float = 1.0  # least s of work that has a last line
+    line_interval_s: float = 30.0  # s between two lines about the same task without a terminal
+    wide: int = 100  # minimum width in characters of a terminal for long bars
+    min_shown_s: float = 1.0  # minimum duration of a task with a final line
     evaluation_share: float = 0.1  # share of a job's bar for evaluation; the rest is training
-    speed_s: float = 3600.0  # s over which the speed is taken that the time left follows from
+    speed_s: float = 3600.0  # s, window of the speed for estimating the remaining time
 
 
 PROGRESS = ProgressSettings()
 
 
 class Bars:
-    """A bar for each count and each running job on a terminal; elsewhere a line for each every `line_interval_s`. None
-    before there is progress, so that bad input prints its one line alone."""
+    """A bar for each count and each running job on a terminal; elsewhere a line for each every `line_interval_s`.
+    Nothing before there is progress, so that invalid input prints its one line only."""
 
-    def __init__(self) -> None:
-        console = whole_lines(stderr=True)
+    def __init__(self, settings: ProgressSettings = PROGRESS) -> None:
+        self.settings, console = settings, whole_lines(stderr=True)
         columns = (
             TextColumn("{task.description}"),
             BarColumn(bar_width=20 if console.width >= PROGRESS.wide else 5),
@@ -72,15 +72,15 @@ class Bars:
             self.left.set()
             self.lines.join()
             if kind is None:
-                tasks = [task for task in self.bar.tasks if task.visible]  # none where all were jobs that ended
-                for task in [task for task in tasks[:-1] if (task.elapsed or 0) >= PROGRESS.min_shown_s] + tasks[-1:]:
+                tasks = [task for task in self.bar.tasks if task.visible]  # none if all were completed jobs
+                others, least = tasks[:-1], self.settings.min_shown_s
+                for task in [task for task in others if (task.elapsed or 0) >= least] + tasks[-1:]:
                     self._print(_line(task))
-        passed = time.monotonic() - self.began
-        if kind is None and self.tasks and passed >= PROGRESS.min_shown_s:
+        if kind is None and self.tasks and (passed := time.monotonic() - self.began) >= self.settings.min_shown_s:
             self._print(f"total: {_duration(passed)}")
 
     def stage(self, what: str, done: int, total: int | None) -> None:
-        """Show that `done` of `total` are done; those of the stages before are, then."""
+        """Show that `done` of `total` are completed, and so are earlier stages."""
         begins = what not in self.tasks
         task = self._task(what, total or None)
         if begins:
@@ -90,7 +90,7 @@ class Bars:
         self.bar.update(task, completed=done, total=total or None, text=f"{done}/{total}" if total else "")
 
     def training(self, row: ProgressRow) -> None:
-        """Progress of `train`."""
+        """Show the progress of `train`."""
         task = self._task("training")
         if row.note:
             self._print(row.note, style="dim")
@@ -100,12 +100,12 @@ class Bars:
         self.bar.update(task, completed=row.progress, text=text)
 
     def end(self, title: str) -> None:
-        """Complete the bar of `title`, if there is one."""
+        """Complete the bar of `title`, if any."""
         if title in self.tasks:
             self._complete(self.tasks[title])
 
     def job(self, news: JobEvent) -> None:
-        """Progress of `run_jobs`."""
+        """Show the progress of `run_jobs`."""
         title = f"{news.index + 1}/{news.total} {news.job.title}"
         task = self._task(title)
         if news.result is not None:
@@ -134,7 +134,7 @@ class Bars:
         self.bar.update(task, completed=total, total=total)
 
     def _print_lines(self) -> None:
-        while not self.left.wait(PROGRESS.line_interval_s):
+        while not self.left.wait(self.settings.line_interval_s):
             for task in [task for task in self.bar.tasks if task.visible and not task.finished]:
                 self._print(_line(task))
 
@@ -143,7 +143,7 @@ class Bars:
 
 
 def _line(task: Task) -> str:
-    """State what is done, how far it is, and how long it still takes at the speed so far."""
+    """Return a line with the task, its progress, and the remaining time at the recent speed."""
     passed = task.finished_time or task.elapsed or 0.0
     words = [f"{task.percentage:.0f} %"] if task.total else []
     words += [task.fields["text"]] if task.fields["text"] else []
@@ -159,15 +159,15 @@ def _duration(seconds: float) -> str:
 
 @contextmanager
 def counting(title: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """A bar from 0 to `total`; yields the function to call with how many are done, and of how many where that was not
-    known before."""
+    """Show a bar from 0 to `total`; yield the function to call with the completed number, and with the total if it was
+    unknown."""
     with Bars() as bars:
         yield lambda done, of=total: bars.stage(title, done, of)
 
 
 @contextmanager
 def resumable(begun: Path, how: str = "it is kept; run the same command again with --resume") -> Iterator[None]:
-    """Report `how` to resume where Ctrl-C, whose own message goes first, a failing GPU or too little memory ends the
+    """Report `how` to resume when Ctrl-C (whose own message is first), a failing GPU or insufficient memory ends the
     block, once folder `begun` has files. Raises KeyboardInterrupt and NeecoError."""
     try:
         yield
@@ -188,20 +188,20 @@ def train_with_progress(
     from neeco.training.run import resume_command
     from neeco.training.train import train
 
-    run, how = shlex.quote(str(output)), f"go on with: {resume_command(capture, output)}"
+    run, hint = shlex.quote(str(output)), f"go on with: {resume_command(capture, output)}"
     started: list[int] = []  # the iteration of the first row
 
     def show(row: ProgressRow) -> None:
         if not row.note and not started:
             started.append(row.iteration)
             slow = "; a CUDA device would be used if there were one" if device.type == "cpu" else ""
-            left = row.seconds_left
-            whole = "begins" if left is None else f"takes about {_duration(row.seconds + left)} in all"
+            remaining = row.seconds_left
+            whole = "begins" if remaining is None else f"takes about {_duration(row.seconds + remaining)} in all"
             forecast = f"{whole}, estimated anew as it goes on"
             bars.training(replace(row, note=f"training on {device.type} {forecast}{slow}; watch it: neeco view {run}"))
         bars.training(row)
 
-    with Bars() as bars, resumable(output, how):
+    with Bars() as bars, resumable(output, hint):
         path = train(capture, output, config, device=device, resume=resume, progress=show)
         bars.end("training")
     return path

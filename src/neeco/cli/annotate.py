@@ -64,8 +64,8 @@ def run(arguments: Arguments) -> int:
                 on_progress=advance,
             )
         page = write_annotated_page(annotated.output, annotated.records, annotated.capture, arguments.min_trust)
-    count, left = len(annotated.records), len(annotated.records) - annotated.written
-    out = f"; {left} trusted less than {arguments.min_trust:g}: left out" if left else ""
+    count, omitted = len(annotated.records), len(annotated.records) - annotated.written
+    out = f"; {omitted} trusted less than {arguments.min_trust:g}: left out" if omitted else ""
     print(f"{annotated.written} of {count} frames in {annotated.output}{out}")
     print(f"numbered anew; field frame of states.jsonl has the capture's name; worst first: {page}")
     return 0

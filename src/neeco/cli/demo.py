@@ -54,14 +54,14 @@ def run(args: Arguments) -> int:
         before = f"remove {args.output} and " if args.output.exists() else ""
         raise KeyboardInterrupt(f"{before}run the same command again") from None
     print(f"\nDone in {time.monotonic() - start:.0f} s.")
-    for what, path in (
+    for title, path in (
         ("capture", capture),
         ("learned scene", trained),
         ("labelled data set", dataset),
         ("its preview", dataset / "preview.png"),
         ("report, open it in a browser", trained / "report.html"),
     ):
-        print(f"  {what}: {path.resolve()}")
+        print(f"  {title}: {path.resolve()}")
     return 0
 
 

@@ -51,9 +51,9 @@ def run(args: Ingest) -> int:
     if not args.source and args.video is None:
         raise NeecoError("ingest: no source; give recording.yaml (`neeco ingest --init` drafts it) or --video FILE")
     folder, recordings = sources_of(args, args.output)
-    output = Path(os.path.normpath(args.output or ""))  # a/../b is b, whatever a is
+    output = Path(os.path.normpath(args.output or ""))  # a/../b is b, even if a is a link
     if folder is not None:
-        if args.strict or args.json is not None:  # they are of a verdict, and what is converted has none
+        if args.strict or args.json is not None:  # both concern the verdict, which a converted folder does not have
             option = "--strict" if args.strict else "--json"
             raise NeecoError(f"{folder}: {option} has no effect with it; leave it out")
         for sentence in convert_folder(folder, output):
@@ -68,6 +68,6 @@ def run(args: Ingest) -> int:
                 raise KeyboardInterrupt("nothing was written") from None
         if not write_numbers(args.json, done.as_json()):
             print(*map(visible, done.lines()), sep="\n")
-            if done.verdict != "doubtful":  # whose last line says not to train
+            if done.verdict != "doubtful":  # its last line advises against training
                 print(f"next: neeco train {shlex.quote(str(output))} --output RUN")
     return 1 if args.strict and done.verdict == "doubtful" else 0

@@ -72,9 +72,9 @@ def explain(words: Sequence[str]) -> None:
 
     named = [word for before, word in pairwise(["", *words]) if before == "--method" or word.startswith("--method=")]
     method = method_class((named or [DEFAULT])[-1].removeprefix("--method=").partition("+")[0])
-    others = ", ".join(name for name in methods() if name != method.method)
+    other_methods = ", ".join(name for name in methods() if name != method.method)
     print_settings(
         f"settings of method {method.method}: --set deformation.NAME=VALUE",
         method.Settings,
-        f"of other methods: neeco train --method NAME --help ({others})",
+        f"of other methods: neeco train --method NAME --help ({other_methods})",
     )

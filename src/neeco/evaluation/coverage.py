@@ -1,4 +1,4 @@
-"""Tissue in test frames that no training frame observed: no model can render it right, so it is scored apart."""
+"""Tissue in test frames that no training frame observed: no model can render it, so it is scored apart."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageSettings:
-    """The depth maps that a point is compared with."""
+    """Settings of the depth maps for occlusion tests."""
 
-    max_views: int = 96  # of training, evenly spaced over the recording: neighbours show the same tissue
+    max_views: int = 96  # training views, evenly spaced over the recording; adjacent ones show the same tissue
     scale: float = 0.25  # of the image's resolution
     min_side_px: int = 48  # below which images are not reduced
     tolerance: float = 0.02  # share of the depth
-    tolerance_mm: float = 1.0  # in addition
+    tolerance_mm: float = 1.0  # added to it
     nearest_mm: float = 1e-3  # points behind a camera are not observed
-    chunk_views: int = 16  # tested at once; most points are observed in the first chunk
-    min_alpha: float = 0.5  # of a pixel that has a depth
+    chunk_views: int = 16  # views per test; most points are observed in the first chunk
+    min_alpha: float = 0.5  # minimum alpha of a pixel with a depth
 
 
 SETTINGS = CoverageSettings()
@@ -48,17 +48,17 @@ class Coverage:
     sizes: Tensor  # [V, 2] width, height of each view's map (maps are padded to a common size)
 
     def observed(self, points: Tensor) -> Tensor:
-        """Return bool [M]: which world points [M, 3] (mm) at least one training view observed unoccluded.
-
-        A view observed a point that projects into it no deeper than the surface rendered there, within 2% + 1 mm.
+        """Return bool [M]: world points [M, 3] (mm) that at least one training view observes unoccluded: they project
+        into it no deeper than the surface rendered there, within 2 % + 1 mm.
         """
         observed = torch.zeros(len(points), dtype=torch.bool)
         chunks = -(-len(self.depths) // SETTINGS.chunk_views)
         for start in range(chunks):  # views far apart in time first: each chunk takes every chunks-th view
-            left = torch.nonzero(~observed)[:, 0]
-            if len(left) == 0:
+            unseen = torch.nonzero(~observed)[:, 0]
+            if len(unseen) == 0:
                 break
-            observed[left] = self._observed_by(points[left], torch.arange(len(self.depths))[start::chunks]).any(dim=0)
+            views = torch.arange(len(self.depths))[start::chunks]
+            observed[unseen] = self._observed_by(points[unseen], views).any(dim=0)
         return observed
 
     def _observed_by(self, points: Tensor, views: Tensor) -> Tensor:
@@ -99,8 +99,8 @@ def observed_depths(scene: DrawableScene, frames: Sequence[Frame]) -> Coverage:
 def unobserved_tissue(coverage: Coverage, scene: DrawableScene, frame: Frame) -> tuple[Tensor, Tensor]:
     """Return tissue in `frame` that no training view observed, and all its tissue: two bool masks [H, W].
 
-    The surface is the scene's own expected depth at the frame's state and camera, where nothing is rendered that of the
-    nearest pixel. Instrument pixels (by the composited label) move with the state and are in neither mask.
+    The surface is the scene's expected depth at the frame's state and camera, extrapolated from the nearest pixel where
+    nothing is rendered. Instrument pixels (by the composited label) move with the state and are in neither mask.
     """
     camera = _small(frame.camera)
     rendering = scene.render(frame.state, camera, labels=True)

@@ -1,4 +1,4 @@
-"""Scores of a run, per split, at the given poses and at aligned ones."""
+"""Scores of a run, per split, at the recorded poses and at aligned ones."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ if TYPE_CHECKING:
 class EvaluationSettings:
     """Thresholds of shadows, and the timing of renderings."""
 
-    missing_light: float = 0.15  # share of the tissue's light that is lost, from which a pixel is in shadow
+    missing_light: float = 0.15  # share of the tissue's light removed, above which a pixel is in shadow
     min_shadow: float = 1e-3  # minimum area of a shadow that is scored, as a share of the image
     timed: int = 7  # number of timed renderings, after two to warm up
-    max_timed_s: float = 10.0  # time after which a slow scene is not rendered again
+    max_timed_s: float = 10.0  # time limit for repeated renderings of a slow scene
 
 
 SETTINGS = EvaluationSettings()
@@ -68,8 +68,8 @@ Progress = Callable[[str, int, int], None]  # what, how many done, of how many
 
 
 def load_shadow(capture: Capture, frame: Frame) -> Tensor | None:
-    """Return the true shadow of a frame, bool [H, W], of `truth/shadow/<stem>.png` (0/255: tissue that loses more than
-    `missing_light`); None without one. Raises NeecoError where it is damaged or of another size than the frame."""
+    """Return the true shadow of a frame, bool [H, W], from `truth/shadow/<stem>.png` (0/255: tissue that loses more
+    than `missing_light`); None without one. Raises NeecoError if it is damaged or differs in size from the frame."""
     file = capture.root / SHADOW_FOLDER / f"{frame.name}.png"
     if not file.is_file():
         return None
@@ -78,8 +78,8 @@ def load_shadow(capture: Capture, frame: Frame) -> Tensor | None:
 
 @torch.no_grad()
 def rendered_shadow(scene: GaussianScene, state: State, camera: Camera) -> Tensor | None:
-    """Return the scene's own shadow of the instruments in `state`, bool [H, W]: tissue, rendered alone, that loses
-    more than `missing_light`. None where the scene models none."""
+    """Return the scene's own shadow of the instruments in `state`, bool [H, W]: tissue, rendered alone, that loses more
+    than `missing_light`. None if the scene models no shadow."""
     if not scene.casts_shadow:
         return None
     camera = scene.recorded.as_learned(camera)
@@ -99,9 +99,9 @@ def rendered_shadow(scene: GaussianScene, state: State, camera: Camera) -> Tenso
 
 
 def labelled_shadow(mask: Tensor, truth: Tensor, shadow: Tensor, counted: Tensor) -> float:
-    """Return the share of the area of a shadow that the label calls instrument; NaN where the shadow is small.
+    """Return the share of a shadow's area that is labelled instrument; NaN if the shadow is small.
 
-    All bool [H, W]: label, true mask, shadow (counted outside the true mask), pixels that count.
+    All bool [H, W]: label, true mask, shadow (counted outside the true mask), valid pixels.
     """
     area = shadow & ~truth & counted
     if int(area.sum()) < SETTINGS.min_shadow * area.numel():
@@ -124,11 +124,11 @@ class _Context:
     """Inputs that all frames share."""
 
     scene: DrawableScene
-    posed: GaussianScene | None  # `scene`, where its poses are fitted to the frames
+    posed: GaussianScene | None  # `scene`, if its poses are fitted to the frames
     capture: Capture
     networks: Mapping[str, Lpips]
     coverage: Coverage
-    foreground: Foreground | None  # tells instruments from tissue in images without masks
+    foreground: Foreground | None  # pixel classifier for images without masks
 
 
 def evaluate_run(
@@ -216,8 +216,8 @@ def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tu
 
 
 def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) -> None:
-    """Render one frame at its given poses and, where asked, at fitted ones; add the scores to the tallies. A score is
-    None where there is nothing to compare with."""
+    """Render one frame at its recorded poses and, if requested, at fitted ones; add the scores to the tallies. A score
+    without a reference is None."""
     scene = context.scene
     unobserved, tissue = unobserved_tissue(context.coverage, scene, frame)
     reference = load_reference(context.capture, frame)
@@ -279,7 +279,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
 
 
 def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return means over the frames that have the number, and the assignment of the scene's pairs of parts."""
+    """Return means over the frames with a value, and the assignment of the scene's pairs of parts."""
     numbers: dict[str, Any] = {key: mean_of([row[key] for row in tally.scores]) for key in tally.scores[0]}
     quality = quality_of(tally.counts)
     numbers |= {"estimated_iou": quality and quality.iou, "estimated_recall": quality and quality.recall}
@@ -297,8 +297,7 @@ def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[
 
 @torch.no_grad()
 def _speed(scene: DrawableScene, frames: Sequence[Frame]) -> tuple[float, int | None]:
-    """Return renderings per second (median, after two to warm up; of fewer where those take long) and the number of
-    Gaussians."""
+    """Return renderings per second (median, after two for warm-up; fewer if slow) and the number of Gaussians."""
     seconds: list[float] = []
     for index in range(SETTINGS.timed + 2):
         frame = frames[index % len(frames)]

@@ -185,6 +185,6 @@ def open_truth(
         raise NeecoError(f"{path}: its frames have no truth/masks and no {REFERENCE_FOLDER}; give a folder of masks")
     parts = all(file.parent.name != REFERENCE_FOLDER for file in files.values())
     if classes is not None and not parts:
-        what = f"{path / REFERENCE_FOLDER} tell the instrument, no parts"
-        raise NeecoError(f"--truth-classes: {what}; leave --truth-classes out")
+        problem = f"{path / REFERENCE_FOLDER} tell the instrument, no parts"
+        raise NeecoError(f"--truth-classes: {problem}; leave --truth-classes out")
     return Masks(path, files, (classes or truth_names(path)) if parts else None, capture=truth, frames=masked)

@@ -46,8 +46,8 @@ def _overlap(mask: Pixels, truth: Pixels, counted: Pixels | None) -> tuple[int, 
 
 
 def truth_table(names: Mapping[int, str], truth: Mapping[int, str]) -> np.ndarray:
-    """Return uint8 [256]: the truth's id, of several of a part the first, of the part that each id names; 0 where it
-    has none. names, truth: part by id."""
+    """Return uint8 [256]: for each id, the truth's id of the part with this name (the first of several); 0 without one.
+    names, truth: part by id."""
     numbers = {part: number for number, part in reversed([*truth.items()])}
     table = np.zeros(256, np.uint8)
     for number, part in names.items():
@@ -101,7 +101,7 @@ class PartTally:
         )
 
     def swapped(self) -> tuple[dict[str, str], dict[str, str]]:
-        """Return the parts to exchange, and how each pair is assigned: "swapped" where that fits better, else "as
+        """Return the parts to exchange, and the assignment of each pair: "swapped" if that fits better, else "as
         named"."""
         swap: dict[str, str] = {}
         assignment = {}

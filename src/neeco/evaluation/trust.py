@@ -1,7 +1,7 @@
-"""Trust in a rendered label: the overlap (IoU) with the instrument that the recorded image supports.
+"""Trust in a rendered label: its overlap (IoU) with the instrument supported by the recorded image.
 
-Every pixel votes. A pixel inside the label votes against it where the tissue alone explains the image better, or
-neither does (something else is in front). A pixel next to the label is missed where the image looks as no tissue did in
+Every pixel votes. A pixel inside the label votes against it if the tissue alone explains the image better, or neither
+does (an occluding object). A pixel next to the label is missed if the image differs from the tissue more than in
 training frames.
 """
 
@@ -23,9 +23,9 @@ from neeco.labels.drawing import distances_to
 class TrustSettings:
     """Thresholds of the votes of pixels on a label."""
 
-    neighbourhood: float = 0.03  # share of the image's diagonal: how far from the label pixels may be missed
-    typical_quantile: float = 0.99  # of the errors in training frames
-    max_share: float = 0.5  # of the tissue's error: an instrument with a smaller one is there, if blurred
+    neighbourhood: float = 0.03  # share of the image's diagonal: maximum distance of missed pixels from the label
+    typical_quantile: float = 0.99  # quantile of the errors in training frames
+    max_share: float = 0.5  # ratio to the tissue's error, below which the instrument is present even if blurred
     window_px: int = 3  # side of the square over which a pixel's error is averaged
 
 
@@ -56,7 +56,7 @@ class TypicalErrors:
 class Trust:
     """The support of a label by the recorded image."""
 
-    value: float  # in [0, 1]: the overlap that the votes leave
+    value: float  # in [0, 1]: the overlap according to the votes
     against: float  # share of the label's pixels that vote against it
     missed: float  # missed pixels next to the label, as a share of the label's
 
@@ -94,7 +94,7 @@ def estimate_trust(
     typical: TypicalErrors,
     neighbourhood: float = SETTINGS.neighbourhood,
 ) -> Trust:
-    """Return the trust in the label of `drawing` as that of `image` [H, W, 3]; 0 where there is no label.
+    """Return the trust in the label of `drawing` for the `image` [H, W, 3]; 0 without a label.
 
     Pixels outside the frame's loss mask do not vote; next to the label, those up to `neighbourhood` of the image's
     diagonal away do.

@@ -1,1 +1,1 @@
-"""Foreground of images: what shows an instrument, by what the learned tissue does not explain."""
+"""Foreground of images: which pixels show an instrument, from residuals of the learned tissue."""

@@ -1,10 +1,10 @@
 """Space carving: rough instrument shapes (visual hulls) from the residuals of a tissue-only scene, without masks or
 CAD.
 
-A short static fit explains the tissue; each image's residual is the silhouette evidence. Points of a rigid instrument
-project onto evidence in all frames, whatever its pose; points of tissue do not. Background that no fit explains does so
-too, but under any frame's pose: points that score as well with exchanged poses are left out. The carved volume gives
-the shaft's axis (which need not be the sensor's z), the tip, and seeds for the Gaussians.
+A short static fit explains the tissue; the residual of each image is the silhouette evidence. Points of a rigid
+instrument project onto evidence in all frames, whatever its pose; points of tissue do not. Background that no fit
+explains does so too, but under any frame's pose: points with similar scores under exchanged poses are excluded. The
+carved volume yields the shaft's axis (not necessarily the sensor's z), the tip, and seeds for the Gaussians.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from neeco.scene.training_views import TrainingViews
 class CarvingLimits:
     """Thresholds of carving."""
 
-    # mean evidence of a solid point: the strictest level that enough points reach
+    # mean evidence of a solid point: the highest level reached by enough points
     solid_levels: tuple[float, float, float] = (0.85, 0.75, 0.65)
-    min_solid_points: int = 8  # with fewer, nothing is carved
-    min_coarse_points: int = 24  # solid points on the coarse grid; with fewer, the finer one is tried
-    seed_spread: float = 0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame
-    darkest_shadow: float = 0.66  # of the tissue's sRGB values: 40 % of its light
-    min_level: float = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
-    behind: float = 1.02  # of the tissue's depth, from which on a point is behind the tissue
-    brightness: float = 0.25  # mean of images, below which the evidence's floor falls as they are darker
-    color_frames: int = 20  # the most frames whose images give seeds their colours
-    color_slice: float = 0.25  # of the shaft's radius: along it, seeds within have the same colour
-    unseen_share: float = 1e-6  # of all evidence, which counts in every slice: some show none
+    min_solid_points: int = 8  # minimum number of solid points for carving
+    min_coarse_points: int = 24  # minimum number of solid points on the coarse grid, else the finer one is used
+    seed_spread: float = 0.05  # standard deviation of seeds about the tracked frame / distance to tissue
+    darkest_shadow: float = 0.66  # minimum factor on the tissue's sRGB values: 40 % of its light
+    min_level: float = 0.6  # mean evidence of a point that may be inside the shaft or a moving jaw
+    behind: float = 1.02  # ratio to the tissue's depth beyond which a point is behind the tissue
+    brightness: float = 0.25  # mean of images below which the evidence's floor is lowered for dark images
+    color_frames: int = 20  # maximum number of images for the colours of seeds
+    color_slice: float = 0.25  # shaft radii: length of a slice along the shaft whose seeds share one colour
+    unseen_share: float = 1e-6  # share of all evidence added to every slice, as some have none
 
 
 CARVING = CarvingLimits()
@@ -52,16 +52,16 @@ CARVING = CarvingLimits()
 class CarvingSettings:
     """Settings of the search for instruments."""
 
-    tissue_steps: int = 500  # of the tissue-only fit whose residual is the evidence
-    long_tissue_steps: int = 1500  # of the one with density control, where the first leaves more than `max_evidence`
-    max_evidence: float = 0.25  # on average
-    evidence_frames: int = 120  # the most training frames used
-    evidence_floor: float = 0.04  # residual at which evidence begins (images in [0, 1])
-    evidence_range: float = 0.06  # residual above that at which it saturates
+    tissue_steps: int = 500  # steps of the tissue-only fit whose residual is the evidence
+    long_tissue_steps: int = 1500  # steps of the fit with density control, if the first exceeds `max_evidence`
+    max_evidence: float = 0.25  # maximum mean evidence
+    evidence_frames: int = 120  # maximum number of training frames
+    evidence_floor: float = 0.04  # residual at which evidence starts (images in [0, 1])
+    evidence_range: float = 0.06  # residual above the floor at which it saturates
     grid: int = 48  # voxels per side
-    fine_grid: int = 72  # voxels per side where `grid` finds too few of a thin instrument
-    pose_shifts: int = 4  # exchanges of poses among frames that evidence is compared with
-    motion_ratio: float = 1.5  # evidence under an instrument's own poses to that under exchanged ones, at least
+    fine_grid: int = 72  # voxels per side if `grid` is too coarse for a thin instrument
+    pose_shifts: int = 4  # number of pose exchanges among frames that evidence is compared with
+    motion_ratio: float = 1.5  # minimum ratio of evidence under recorded poses to that under exchanged ones
     seeds: int = 3000  # points per instrument
 
     def __post_init__(self) -> None:
@@ -72,9 +72,9 @@ class CarvingSettings:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Silhouette evidence: residuals of F frames as soft masks, and the cameras that observed them, on one device.
+    """Silhouette evidence: residuals of F frames as soft masks, with the cameras, on one device.
 
-    H and W are the largest of the frames' heights and widths; outside its own image a frame has no evidence.
+    H and W are the maxima over the frames; outside its own image a frame has no evidence.
     """
 
     hits: Tensor  # [F, H, W] in [0, 1]
@@ -82,16 +82,16 @@ class Evidence:
     camera_from_world: Tensor  # [F, 4, 4]
     intrinsics: Tensor  # [F, 4] fx, fy, cx, cy
     frames: tuple[Frame, ...]
-    unshaded: Tensor | None = None  # [F, H, W] as `hits`, without what a shadow on the tissue explains
+    unshaded: Tensor | None = None  # [F, H, W] as `hits`, excluding residuals that a shadow on the tissue explains
 
     @cached_property
     def distance(self) -> float:
-        """Median distance from camera to tissue, mm: the scale of the scene."""
+        """Return the median distance from camera to tissue, mm: the scale of the scene."""
         return float(self.depths[self.depths.isfinite() & (self.depths > 0)].median())
 
     @cached_property
     def sizes(self) -> Tensor:
-        """[F, 2] width and height px of each frame's image."""
+        """Return [F, 2] width and height px of each frame's image."""
         sizes = [[frame.camera.width, frame.camera.height] for frame in self.frames]
         return torch.tensor(sizes, device=self.device)
 
@@ -126,14 +126,14 @@ class Evidence:
 def gather_evidence(
     scene: GaussianScene, views: TrainingViews, settings: CarvingSettings, *, unshaded: bool = False
 ) -> Evidence:
-    """Residuals of a tissue-only `scene` against every n-th training image, at most `settings.evidence_frames`, on its
-    device, and with `unshaded` those that no shadow explains. Pixels outside a mask have no evidence."""
+    """Return residuals of a tissue-only `scene` for evenly spaced training images, at most `settings.evidence_frames`,
+    on its device; with `unshaded` also those that no shadow explains. Masked pixels have none."""
     frames = views.frames
     picked = list(range(0, len(frames), max(1, -(-len(frames) // settings.evidence_frames))))
     hits: list[Tensor] = []
     without_shadows: list[Tensor] = []
     depths: list[Tensor] = []
-    means = []  # brightness of images, without what masks leave out
+    means = []  # brightness of images without masked pixels
     for index in picked:
         image, mask = views.target(index), views.mask(index)
         counted = image if mask is None else image[mask]
@@ -147,12 +147,12 @@ def gather_evidence(
         if unshaded:
             dimmed = (image * tissue).sum(-1, keepdim=True) / tissue.square().sum(-1, keepdim=True).clamp_min(1e-6)
             explanations.append((without_shadows, tissue * dimmed.clamp(CARVING.darkest_shadow, 1.0)))
-        for found, expected in explanations:
+        for maps, expected in explanations:
             residual = (expected - image).abs().mean(-1)
             if mask is not None:
                 residual = residual * mask
             smooth = avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
-            found.append(((smooth / exposure - settings.evidence_floor) / settings.evidence_range).clamp(0, 1))
+            maps.append(((smooth / exposure - settings.evidence_floor) / settings.evidence_range).clamp(0, 1))
         depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
     cameras, device = [frames[i].camera for i in picked], views.device
     return Evidence(
@@ -177,25 +177,25 @@ class CarvedShape:
     """Rough geometry of one instrument, instrument frame, mm."""
 
     instrument_from_shaft: Tensor  # [4, 4], z along the shaft towards the tip, origin at the evidence's centroid
-    near: float  # mm along the shaft: first position observed often enough
+    near: float  # mm along the shaft: first position that enough frames observe
     tip: float  # mm along the shaft: last position with evidence
     radius: float  # mm, of the solid part
-    center_line: Tensor  # [Z, 3] mm: position along the shaft, and the solid's centre across it (x, y), shaft frame
-    seeds: Tensor  # [M, 3] mm, points possibly inside, instrument frame
-    level: float  # mean evidence from which a point counts as solid
+    center_line: Tensor  # [Z, 3] mm: position along the shaft, and the solid's centre (x, y), shaft frame
+    seeds: Tensor  # [M, 3] mm, candidate points inside, instrument frame
+    level: float  # mean evidence above which a point counts as solid
 
 
 def camera_from_instrument(evidence: Evidence, name: str) -> Tensor:
-    """Recorded camera_from_instrument transforms [F, 4, 4], float32, of instrument `name`."""
+    """Return the recorded camera_from_instrument transforms [F, 4, 4], float32, of instrument `name`."""
     poses = torch.stack([frame.state.instruments[name].pose.double() for frame in evidence.frames]).to(evidence.device)
     return (evidence.camera_from_world.double() @ poses).float()
 
 
 def score_points(evidence: Evidence, transforms: Tensor, points: Tensor, chunk: int = 8192) -> tuple[Tensor, Tensor]:
-    """Return the mean evidence [Q] at points [Q, 3] over the frames that observe them, and the share [Q] of such
+    """Return the mean evidence [Q] at points [Q, 3] over the frames that observe them, and the share [Q] of these
     frames.
 
-    `transforms` [F, 4, 4] take the points' frame to each camera's.
+    `transforms` [F, 4, 4] map the points' frame to each camera's.
     """
     scores, visible = [], []
     rotation, translation = transforms[:, :3, :3].transpose(1, 2), transforms[:, None, :3, 3]
@@ -214,14 +214,14 @@ class PosedViews:
     evidence: Evidence
     own: Tensor  # [F, 4, 4]
     exchanged: Tensor  # [settings.pose_shifts, F, 4, 4]
-    motion_ratio: float  # as `CarvingSettings` has it
+    motion_ratio: float  # see `CarvingSettings`
 
     def in_frame(self, base: Tensor) -> PosedViews:
         """Return the views of another coordinate frame, given as `base` [4, 4] in the present one."""
         return PosedViews(self.evidence, self.own @ base, self.exchanged @ base, self.motion_ratio)
 
     def scores(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `score_points` with 0 where the evidence is nearly as strong under exchanged poses."""
+        """Return `score_points`, set to 0 where the evidence under exchanged poses is nearly as strong."""
         score, visible = score_points(self.evidence, self.own, points)
         likely = torch.nonzero(score > 0.5 * CARVING.min_level)[:, 0]  # the others are far below all thresholds
         static = score[likely] <= self.motion_ratio * self.exchanged_scores(points[likely])
@@ -229,7 +229,7 @@ class PosedViews:
         return score, visible
 
     def exchanged_scores(self, points: Tensor) -> Tensor:
-        """Mean evidence [Q] at points [Q, 3] over all exchanges of the poses."""
+        """Return the mean evidence [Q] at points [Q, 3] over all exchanges of the poses."""
         return torch.stack([score_points(self.evidence, other, points)[0] for other in self.exchanged]).mean(0)
 
 
@@ -237,15 +237,15 @@ def posed_views(evidence: Evidence, name: str, settings: CarvingSettings, moved:
     """Return the views of instrument `name`, or of a link of it that each frame's readings move by `moved` [F, 4, 4].
 
     An exchange keeps the cameras and shifts poses and readings among the frames."""
-    own = camera_from_instrument(evidence, name)
-    own = own if moved is None else own @ moved
+    recorded_poses = camera_from_instrument(evidence, name)
+    recorded_poses = recorded_poses if moved is None else recorded_poses @ moved
     cameras = evidence.camera_from_world.double()
-    poses = torch.linalg.inv(cameras) @ own.double()
-    # uneven shifts, so that periodic motion does not come out the same
+    poses = torch.linalg.inv(cameras) @ recorded_poses.double()
+    # uneven shifts, so that periodic motion is not reproduced
     count = settings.pose_shifts
     shifts = [round(len(poses) * (k + 0.1 * (k % 2)) / (count + 1)) for k in range(1, count + 1)]
     exchanged = torch.stack([(cameras @ poses.roll(shift, 0)).float() for shift in shifts])
-    return PosedViews(evidence, own, exchanged, settings.motion_ratio)
+    return PosedViews(evidence, recorded_poses, exchanged, settings.motion_ratio)
 
 
 @torch.no_grad()
@@ -289,7 +289,7 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
 def carve_along(
     evidence: Evidence, name: str, base: Tensor, level: float, generator: torch.Generator, settings: CarvingSettings
 ) -> CarvedShape | None:
-    """Return the shape about a known line, the z axis of `base` [4, 4], instrument_from_shaft; None without evidence
+    """Return the shape around a given line, the z axis of `base` [4, 4], instrument_from_shaft; None without evidence
     along it."""
     reach = 0.6 * evidence.distance
     views = posed_views(evidence, name, settings).in_frame(base)
@@ -341,7 +341,7 @@ def frame_along(origin: Tensor, direction: Tensor) -> Tensor:
 
 
 def center_line(evidence: Evidence, name: str, shape: CarvedShape, settings: CarvingSettings) -> Tensor:
-    """Return the centre line [Z, 3] (see `CarvedShape`) by other frames."""
+    """Return the centre line [Z, 3] (see `CarvedShape`) in another frame."""
     views = posed_views(evidence, name, settings).in_frame(shape.instrument_from_shaft)
     return _slice_centers(views, (shape.tip - shape.near) / 30, 4 * shape.radius, shape.level)[:, :3]
 
@@ -372,7 +372,7 @@ def _slice_centers(views: PosedViews, spacing: float, half: float, level: float)
 def _sample_seeds(
     views: PosedViews, near: float, tip: float, width: float, count: int, generator: torch.Generator
 ) -> Tensor:
-    """Sample points [count, 3], shaft frame, where the evidence allows an instrument."""
+    """Sample points [count, 3], shaft frame, where the evidence is compatible with an instrument."""
     length = tip - near
     device, target = generator.device, views.evidence.device
     random = torch.rand(20 * count, 3, generator=generator, device=device).to(target)

@@ -1,4 +1,4 @@
-"""Quality of labels where no mask is known: what images show of an instrument against what is labelled."""
+"""Label quality without ground-truth masks: the instrument's pixels by image evidence compared with its label."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from neeco.capture.model import Frame, evenly_spaced
 from neeco.evidence.foreground import SETTINGS, Comparison, Foreground
 from neeco.scene.gaussian_scene import GaussianScene
 
-LABEL_QUALITY = "label_quality"  # of a scene's diagnostics
+LABEL_QUALITY = "label_quality"  # key in a scene's diagnostics
 
 
 @dataclass(frozen=True, kw_only=True)
 class QualitySettings:
     """Settings of the estimate."""
 
-    n_views: int = 12  # training frames from which instruments and tissue are told apart
-    labelled: float = 0.5  # rendered share of a pixel from which it is labelled
-    certain: float = 0.25  # certainty from which a pixel counts
-    nearby: float = 0.02  # of the images' width: how far certain pixels tell what uncertain ones show
-    least_body: float = 0.25  # of an image's largest body in area: an unlabelled smaller one is a highlight or a shadow
-    least_iou: float = 0.8  # estimated, below which labels are doubtful
+    n_views: int = 12  # training frames from which the classifier is learned
+    labelled: float = 0.5  # rendered share above which a pixel is labelled
+    certain: float = 0.25  # minimum certainty of a pixel that counts
+    nearby: float = 0.02  # share of the image width: neighbourhood of certain pixels that classify uncertain ones
+    least_body: float = 0.25  # area relative to the largest body: smaller unlabelled ones are highlights or shadows
+    least_iou: float = 0.8  # estimated IoU below which labels are doubtful
     least_recall: float = 0.9  # the same of the recall
-    least_shown: int = 600  # px of an instrument in one image; of a smaller one, edges are too large a part
+    least_shown: int = 600  # minimum instrument pixels per image; smaller ones consist mostly of edges
 
 
 QUALITY = QualitySettings()
@@ -35,8 +35,8 @@ QUALITY = QualitySettings()
 
 @dataclass(frozen=True)
 class LabelQuality:
-    """Estimated quality of labels over some images, all in [0, 1]: the share of what images show of the instrument
-    that is labelled, the share of the label that shows it, and the IoU that follows."""
+    """Estimated quality of labels over some images, all in [0, 1]: recall and precision of the instrument's label with
+    respect to the images' evidence, and the resulting IoU."""
 
     recall: float
     precision: float
@@ -50,7 +50,7 @@ class LabelQuality:
 
     @property
     def doubt(self) -> str | None:
-        """Reason to doubt these labels, if there is one."""
+        """Return the reason to doubt these labels, if any."""
         if self.iou >= QUALITY.least_iou and self.recall >= QUALITY.least_recall:
             return None
         return (
@@ -59,12 +59,12 @@ class LabelQuality:
         )
 
     def as_json(self) -> dict[str, float]:
-        """Return the numbers for files."""
+        """Return the numbers as JSON values."""
         return {"iou": self.iou, "recall": self.recall, "precision": self.precision}
 
 
 def learned_foreground(scene: GaussianScene, frames: Sequence[Frame]) -> Foreground | None:
-    """Learn from training frames what is instrument; None where the scene does not tell instruments from tissue."""
+    """Learn the pixel classifier from training frames; None if instruments are not separate."""
     if not scene.label_names:
         return None
     views = []
@@ -75,11 +75,11 @@ def learned_foreground(scene: GaussianScene, frames: Sequence[Frame]) -> Foregro
 
 
 def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
-    """Count pixels of a view [4]: certain instrument that is labelled, that is not, and of the other labelled pixels
-    tissue, and instrument. Of those that are neither for certain, each counts as both: at outlines, as an instrument by
-    how near it is to being covered by half, elsewhere by the share of instrument among certain pixels nearby. Certain
-    instrument is no isolated patch: see `least_body`. Unlabelled pixels beside an instrument that are not certainly
-    tissue, and that nothing in the scene explains, are instrument as well: a wrist that was never learned, say."""
+    """Count pixels of a view [4]: certain instrument that is labelled, that is not labelled, and of the other labelled
+    pixels tissue, and instrument. Uncertain pixels are split between both: at outlines by the distance from half
+    coverage, elsewhere by the share of instrument among certain pixels nearby. Isolated patches are ignored (see
+    `least_body`). Unlabelled pixels next to an instrument that are not certainly tissue and that nothing in the scene
+    explains count as instrument: a wrist that was never learned, for example."""
     certainty, label = (
         foreground.certainty(view, foreground.settings.apart),
         view.usable & (view.label > QUALITY.labelled),
@@ -88,9 +88,9 @@ def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
     across = np.ones((2 * foreground.settings.outline_px + 1,) * 2, np.uint8)  # outlines do not divide a body
     bodies = cv2.connectedComponents(cv2.dilate(instrument.astype(np.uint8), across))[1]
     areas = np.bincount(bodies[instrument], minlength=1)
-    shown = areas >= QUALITY.least_body * areas.max()
-    shown[bodies[instrument & label]] = True
-    missed = ~label & np.where(instrument, shown[bodies], ~tissue & _unexplained(view, foreground))
+    visible_bodies = areas >= QUALITY.least_body * areas.max()
+    visible_bodies[bodies[instrument & label]] = True
+    missed = ~label & np.where(instrument, visible_bodies[bodies], ~tissue & _unexplained(view, foreground))
     share = view.covered / foreground.settings.covered
     window = (2 * math.ceil(QUALITY.nearby * label.shape[1]) + 1,) * 2
     near_instrument, near_tissue = (1e-6 + cv2.blur(kind.astype(float), window) for kind in (instrument, tissue))
@@ -100,7 +100,7 @@ def label_counts(view: Comparison, foreground: Foreground) -> np.ndarray:
 
 
 def _unexplained(view: Comparison, foreground: Foreground) -> np.ndarray:
-    """Return which pixels [H, W] beside a rendered instrument nothing that the scene renders explains."""
+    """Return which pixels [H, W] next to a rendered instrument the scene does not explain."""
     settings = foreground.settings
     outline = view.near(px=settings.outline_px + settings.window_px // 2)
     beside = view.usable & view.near(settings.apart) & ~outline
@@ -109,8 +109,8 @@ def _unexplained(view: Comparison, foreground: Foreground) -> np.ndarray:
 
 
 def quality_of(images: Sequence[np.ndarray], least: int = SETTINGS.least_pixels) -> LabelQuality | None:
-    """Return the quality of labels with such counts [4] of each image: the mean over images that show at least their
-    share of `least` pixels of an instrument for certain; None where all together show fewer."""
+    """Return the label quality from counts [4] of each image: the mean over images with at least their share of `least`
+    certain instrument pixels; None if all together have fewer."""
     counts = np.reshape(images, (-1, 4))
     certain = counts[:, :2].sum(1)
     if certain.sum() < least:

@@ -1,16 +1,16 @@
 """Search for an instrument's shaft: the half-infinite cylinder whose silhouettes explain the evidence of all frames.
 
-Points that lie on evidence in every frame fill the visual hull, which is far from the instrument where it hardly turns:
-they lie along lines of sight as well. A cylinder is told from these by its silhouettes. The line through a pair of such
-points is a candidate; it gains the evidence that its silhouettes cover and loses what they cover without evidence, and
-ends where it gains most. What it gains with poses exchanged among the frames is evidence that does not move with the
-instrument, and counts against it. The best candidates are improved by random steps.
+Points on evidence in every frame fill the visual hull, which extends far from an instrument that hardly rotates, along
+the lines of sight. Silhouettes of cylinders resolve this. The line through a pair of such points is a candidate: it
+gains the evidence that its silhouettes cover, loses what they cover without evidence, and ends where the gain is
+largest. Gains with poses exchanged among the frames do not move with the instrument, and are subtracted. The best
+candidates are refined by random steps.
 
-A shaft turns about its trocar, so that it moves less there than where it is seen. A line that does gains more, and the
-trocar is behind the tip. Where nothing holds the shaft, its two directions differ as it leaves the image at its rear.
+A shaft pivots at its trocar, so it moves less there than where it is visible. Such a line gains more, and its trocar is
+behind the tip. Without a pivot, its direction follows from the rear end leaving the image.
 
-Where no cylinder explains much of the evidence, which other instruments leave, too, or where a wrist bends the shaft in
-the tracked frame of its tip, the line is the principal axis of these points.
+If no cylinder explains much of the evidence (other instruments contribute to it), or if a wrist bends the shaft in the
+tracked frame of its tip, the line is the principal axis of these points.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from torch.nn.functional import avg_pool2d, normalize
 class ShaftSettings:
     """Settings of the search. Lengths are shares of the median distance to the tissue."""
 
-    n_points: int = 600  # with most evidence, through which lines are tried
-    least_evidence: float = 0.4  # mean of each of these points
-    n_frames: int = 16  # evenly spaced, that are compared
-    widths_px: tuple[int, int] = (32, 64)  # of their evidence: for all candidates, and for the best
-    n_pairs: int = 2400  # of points: candidates
-    least_apart: float = 0.12  # of the two points of a pair
+    n_points: int = 600  # points with most evidence, which define candidate lines
+    least_evidence: float = 0.4  # minimum mean evidence of these points
+    n_frames: int = 16  # compared frames, evenly spaced
+    widths_px: tuple[int, int] = (32, 64)  # width of the evidence images: for all candidates, and for the best
+    n_pairs: int = 2400  # number of point pairs (candidates)
+    least_apart: float = 0.12  # minimum distance of the points of a pair
     threshold: float = 0.45  # evidence from which a covered pixel is a gain
-    always: float = 0.95  # share of the frames with evidence from which a pixel shows background that nothing explains
-    radii: tuple[float, float, int] = (0.012, 0.055, 7)  # least, most, and how many between, geometrically
-    half_length: float = 1.5  # of the line on either side of its origin
-    n_bins: int = 96  # along it
-    n_likely: int = 96  # candidates that are also tried with exchanged poses
-    n_best: int = 12  # of them that are improved
-    least_share: float = 0.14  # of the evidence, that a cylinder must gain; shafts gained 0.16 and more, bent ones 0.12
-    solid: float = 0.9  # of the largest mean evidence of a point, from which it counts for the principal axis
-    n_rounds: int = 4  # of random steps, each half as large as the one before
-    n_steps: int = 24  # tried in a round for each candidate
+    always: float = 0.95  # share of frames with evidence above which a pixel is unexplained background
+    radii: tuple[float, float, int] = (0.012, 0.055, 7)  # minimum, maximum, number (geometric)
+    half_length: float = 1.5  # length of the line on either side of its origin
+    n_bins: int = 96  # number of positions along it
+    n_likely: int = 96  # candidates also scored with exchanged poses
+    n_best: int = 12  # candidates that are refined
+    least_share: float = 0.14  # minimum share of the evidence gained; shafts gained at least 0.16, bent ones 0.12
+    solid: float = 0.9  # share of the maximum evidence, above which a point counts in the principal axis
+    n_rounds: int = 4  # rounds of random steps, halving their size
+    n_steps: int = 24  # steps per round and candidate
     shift: float = 0.02  # standard deviation of the first steps
-    turn: float = 0.08  # rad, the same of directions
-    trocar_weight: float = 0.4  # what a line that rests at a trocar gains more, as a share
-    least_rest: float = 0.2  # share by which a line moves less at a trocar, which then tells where its rear is
-    trocar: tuple[float, float, int] = (0.4, 2.6, 12)  # from the evidence's middle: least, most, how many between
+    turn: float = 0.08  # rad, the same for directions
+    trocar_weight: float = 0.4  # relative bonus for a line that rests at a trocar
+    least_rest: float = 0.2  # minimum reduction of motion at a trocar, for it to determine the rear end
+    trocar: tuple[float, float, int] = (0.4, 2.6, 12)  # distance from the evidence's centre: minimum, maximum, number
 
 
 SETTINGS = ShaftSettings()
@@ -56,9 +56,9 @@ SETTINGS = ShaftSettings()
 
 @dataclass(frozen=True, eq=False)
 class Shaft:
-    """A line in an instrument's frame: a point [3] mm, a unit direction [3], and the radius, mm; None: not known.
-    `lead`: by how much more of the evidence is explained with the tip in that direction than in the other, as a share.
-    `rest`: by how much less than where it is seen it moves at a trocar behind, as a share; negative: ahead."""
+    """A line in an instrument's frame: a point [3] mm, a unit direction [3], and the radius, mm (None: unknown).
+    `lead`: relative advantage of the tip in that direction over the opposite one. `rest`: relative reduction of motion
+    at a trocar behind compared with the visible part; negative: ahead."""
 
     origin: Tensor
     direction: Tensor
@@ -69,9 +69,9 @@ class Shaft:
 
 @dataclass(frozen=True, eq=False)
 class CylinderViews:
-    """Evidence of F frames for cylinders: unit rays [F, P, 3] of the cameras, what each pixel is worth [F, P],
-    camera_from_instrument [F, 4, 4] as recorded, and with poses exchanged among the frames, and world_from_instrument
-    [F, 4, 4]. `distance`: mm, that settings are shares of."""
+    """Evidence of F frames for cylinders: unit rays [F, P, 3] of the cameras, the gain of each pixel [F, P],
+    camera_from_instrument [F, 4, 4] as recorded and with exchanged poses, and world_from_instrument [F, 4, 4].
+    `distance`: mm, the unit of settings that are shares."""
 
     rays: Tensor
     worth: Tensor
@@ -82,9 +82,8 @@ class CylinderViews:
 
     @staticmethod
     def of(
-        *, hits: Tensor, sizes: Tensor, intrinsics: Tensor, own: Tensor, exchanged: Tensor, world: Tensor,
-        distance: float, width: int,
-    ) -> CylinderViews:  # fmt: skip
+        *, hits: Tensor, sizes: Tensor, intrinsics: Tensor, distance: float, width: int, **poses: Tensor
+    ) -> CylinderViews:
         """Reduce evidence [F, H, W] in [0, 1] of images of `sizes` [F, 2] px to about `width` pixels."""
         pool = max(1, round(hits.shape[2] / width))
         small = avg_pool2d(hits[:, None], pool)[:, 0]
@@ -97,24 +96,23 @@ class CylinderViews:
         worth = torch.where(inside & moves, small - SETTINGS.threshold, 0.0)
         count = len(hits)
         rays = normalize(rays.reshape(count, -1, 3), dim=-1)
-        return CylinderViews(rays, worth.reshape(count, -1), own, exchanged, world, distance)
+        return CylinderViews(rays, worth.reshape(count, -1), distance=distance, **poses)
 
     def gains(
         self, transforms: Tensor, origins: Tensor, directions: Tensor, chunk: int = 64
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what the lines through origins [C, 3] along unit directions [C, 3] gain under camera_from_instrument
-        [F, 4, 4] with the best radius and tip [C], what they gain more than in the opposite direction, as a share [C],
-        and the radius [C], mm."""
+        """Return the gains of lines through origins [C, 3] along unit directions [C, 3] under camera_from_instrument
+        [F, 4, 4] with the best radius and tip [C], their relative advantage over the opposite direction [C], and the
+        radius [C], mm."""
         parts = [
-            self._gains(transforms, *lines)
-            for lines in zip(origins.split(chunk), directions.split(chunk), strict=True)
-        ]  # fmt: skip
+            self._gains(transforms, *lines) for lines in zip(origins.split(chunk), directions.split(chunk), strict=True)
+        ]
         gains, leads, radii = (torch.cat(values) for values in zip(*parts, strict=True))
         return gains, leads, radii
 
     def rests(self, origins: Tensor, directions: Tensor, center: Tensor) -> Tensor:
-        """Return by how much less lines move somewhere behind than where they pass a `center` [3], as a share, negative
-        where ahead [C]. How far a point moves is its distance from its middle in the world, in the median frame."""
+        """Return the relative reduction of lines' motion somewhere behind compared with that at `center` [3], negative
+        if ahead [C]. Motion of a point is the median distance over frames from its mean position in the world."""
         least, most, count = SETTINGS.trocar
         far = torch.linspace(least, most, count, device=origins.device) * self.distance
         places = ((center - origins) * directions).sum(-1)[:, None] + torch.cat([-far, far.new_zeros(1), far])
@@ -129,7 +127,7 @@ class CylinderViews:
         rotation, shift = transforms[:, :3, :3], transforms[:, :3, 3]
         point = (rotation * origins[:, None, None]).sum(-1) + shift  # [C, F, 3]
         along = (rotation * directions[:, None, None]).sum(-1)
-        # distance of a ray to the line, and where on the line it is reached, by the common perpendicular
+        # distance from ray to line and position along the line, by the common perpendicular
         cosine, ahead = self._on_rays(along), self._on_rays(point)
         sine_squared = (1 - cosine.square()).clamp_min(1e-6)
         moment = self._on_rays(torch.linalg.cross(along, point))
@@ -151,8 +149,8 @@ class CylinderViews:
         return gains, (forward - backward)[row, best] / gains.clamp_min(1e-6), radii[best]
 
     def _on_rays(self, vectors: Tensor) -> Tensor:
-        """Return the products [C, F, P] of vectors [C, F, 3] and the rays. Without a matrix product, whose last bits
-        may differ from run to run with the memory's alignment."""
+        """Return the products [C, F, P] of vectors [C, F, 3] and the rays; without matrix multiplication, whose last
+        bits may depend on memory alignment."""
         x, y, z = (
             ray * vector[..., None] for ray, vector in zip(self.rays.unbind(-1), vectors.unbind(-1), strict=True)
         )
@@ -162,8 +160,8 @@ class CylinderViews:
 def find_shaft(
     coarse: CylinderViews, fine: CylinderViews, points: Tensor, scores: Tensor, generator: torch.Generator
 ) -> Shaft | None:
-    """Return the shaft of an instrument by points [Q, 3] mm on evidence, instrument frame, and their mean evidence [Q];
-    None where these are no two apart. coarse, fine: the evidence for all candidates, and for the best of them."""
+    """Return the shaft of an instrument from points [Q, 3] mm on evidence, instrument frame, and their mean evidence
+    [Q]; None if no two are apart. coarse, fine: the evidence for all candidates, and for the best of them."""
     center = (scores[:, None] * points).sum(0) / scores.sum()
     settings, distance, weight = SETTINGS, coarse.distance, SETTINGS.trocar_weight
     firsts, seconds = (
@@ -185,7 +183,7 @@ def find_shaft(
     for number in range(settings.n_rounds):
         size = (len(origins) * settings.n_steps, 6)
         noise = torch.randn(size, generator=generator, device=generator.device).to(points) * 0.5**number
-        noise[:: settings.n_steps] = 0  # the candidate as it is
+        noise[:: settings.n_steps] = 0  # the unchanged candidate
         tried = origins.repeat_interleave(settings.n_steps, 0) + settings.shift * distance * noise[:, :3]
         turned = directions.repeat_interleave(settings.n_steps, 0) + settings.turn * noise[:, 3:]
         turned = normalize(turned, dim=1)

@@ -1,4 +1,4 @@
-"""Distortion of images by a lens: OpenCV's models, and the round border of an endoscope's field of view."""
+"""Lens distortion: OpenCV's models, and the round border of an endoscope's field of view."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from neeco.geometry.camera import Camera
 class DistortionSettings:
     """Tolerances and steps of undistortion."""
 
-    max_slope: float = 3.0  # limit on the slope of a ray that a lens may bend into the image (72 degrees)
-    max_miss_px: float = 0.05  # distance of a distorted ray from the pixel that it was found for
-    n_newton_steps: int = 6  # limit on the steps of Newton's method from a first guess
-    node_spacing_px: int = 4  # between pixels whose rays are computed; the others are interpolated, to 0.01 px
+    max_slope: float = 3.0  # maximum slope of a ray that a lens may project into the image (72 degrees)
+    max_miss_px: float = 0.05  # maximum error of a ray's distorted position
+    n_newton_steps: int = 6  # maximum number of Newton steps
+    node_spacing_px: int = 4  # spacing of pixels with computed rays; others are interpolated, accurate to 0.01 px
     derivative_step: float = 1e-6  # slope over which the derivative of a distortion is taken
 
 
@@ -27,10 +27,10 @@ DISTORTION = DistortionSettings()
 
 
 class LensField(NamedTuple):
-    """Rays that a camera shows through its lens."""
+    """Rays that a camera observes through its lens."""
 
-    slopes: np.ndarray  # float32 [H, W, 2]: x/z, y/z of the ray of every pixel; NaN where there is none
-    lowest: np.ndarray  # [2] of the slopes
+    slopes: np.ndarray  # float32 [H, W, 2]: x/z, y/z of the ray of every pixel; NaN without a ray
+    lowest: np.ndarray  # [2] minima of the slopes
     highest: np.ndarray
 
 
@@ -44,7 +44,7 @@ def distorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
 
 
 def undistorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """Invert `distorted` by Newton's method; the result is arbitrary where the lens shows no ray.
+    """Invert `distorted` by Newton's method; the result is arbitrary for pixels without a ray.
 
     cv2.undistortPoints stops after five steps, each of which gains one digit at most.
     """
@@ -53,22 +53,22 @@ def undistorted(slopes: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray
     estimate = slopes.astype(np.float64)
     with np.errstate(all="ignore"):
         for _ in range(DISTORTION.n_newton_steps):
-            here = distorted(estimate, distortion)
+            projected = distorted(estimate, distortion)
             (a, c), (b, d) = (
                 (
-                    (distorted(estimate + DISTORTION.derivative_step * axis, distortion) - here)
+                    (distorted(estimate + DISTORTION.derivative_step * axis, distortion) - projected)
                     / DISTORTION.derivative_step
                 ).T
                 for axis in np.eye(2)
             )  # columns of the Jacobian
-            x, y = (slopes - here).T
+            x, y = (slopes - projected).T
             estimate = estimate + (np.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)).T
             estimate = np.clip(np.nan_to_num(estimate), -2 * DISTORTION.max_slope, 2 * DISTORTION.max_slope)
     return estimate
 
 
 def pixels_of_rays(slopes: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels [P, 2] in which `camera` shows rays of slopes [P, 2] through its lens; NaN outside its field of view."""
+    """Return pixels [P, 2] of rays of slopes [P, 2] through the lens of `camera`; NaN outside its field."""
     field = lens_field(camera)
     margin = 1 / camera.fx  # to the edges of the outermost pixels
     with np.errstate(invalid="ignore"):
@@ -79,7 +79,7 @@ def pixels_of_rays(slopes: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def rays_of_pixels(pixels: np.ndarray, camera: Camera) -> np.ndarray:
-    """Slopes [P, 2] (x/z, y/z) of the rays that `camera` shows in pixels [P, 2] through its lens."""
+    """Return slopes [P, 2] (x/z, y/z) of the rays that `camera` observes at pixels [P, 2] through its lens."""
     return undistorted((pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy], camera.distortion)
 
 
@@ -90,8 +90,8 @@ def within(pixels: np.ndarray, border: tuple[float, float, float]) -> np.ndarray
 
 
 def field_pinhole(camera: Camera) -> Camera:
-    """The pinhole camera of the same pose and focal lengths whose image covers all that `camera` shows through its
-    lens; without distortion, in the same pixels."""
+    """Return the pinhole camera of the same pose, focal lengths and pixel grid whose image covers the whole field of
+    view of `camera` through its lens, undistorted."""
     if camera.is_pinhole:
         return camera
     field = lens_field(camera)
@@ -110,7 +110,7 @@ def field_pinhole(camera: Camera) -> Camera:
 
 
 def lens_field(camera: Camera) -> LensField:
-    """Rays that `camera` shows through its lens. The arrays are cached and must not be changed."""
+    """Return the rays that `camera` observes through its lens. The arrays are cached and must not be modified."""
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     return _lens_field(intrinsics, camera.width, camera.height, camera.distortion, camera.border)
 

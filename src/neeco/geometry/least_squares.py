@@ -17,10 +17,10 @@ State = TypeVar("State")
 class DampingSettings:
     """Settings of the damping."""
 
-    max_trials: int = 6  # steps, each shorter, before a state counts as the minimum
-    damping_factor: float = 4.0  # by which damping grows after a trial that fails, and falls after a step
-    min_damping: float = 1e-6  # the least
-    free_damping: float = 1e-5  # at which a step counts as undamped
+    max_trials: int = 6  # maximum number of ever shorter steps, after which a state counts as the minimum
+    damping_factor: float = 4.0  # factor on the damping after a failed trial, and its inverse after a step
+    min_damping: float = 1e-6  # minimum damping
+    free_damping: float = 1e-5  # maximum damping of an undamped step
 
 
 DAMPING = DampingSettings()
@@ -53,11 +53,11 @@ def levenberg_marquardt(
     damping: float,
     tolerance: float,
 ) -> State:
-    """Minimise a cost from a first state.
+    """Minimise a cost from an initial state.
 
-    move(state, step [P]): the state after a step in its own parameters; tolerance: share of the cost that an undamped
-    step must save to be followed by another. Robust losses are the caller's: weights in the linearisation, values in
-    its cost.
+    move(state, step [P]): the state after a step in its own parameters; tolerance: minimum relative decrease of the
+    cost by an undamped step for another one to follow. Robust losses are the caller's: weights in the linearisation,
+    values in its cost.
     """
     for _ in range(max_steps):
         at = linearise(state)

@@ -1,4 +1,4 @@
-"""The line of a shaft that moves about a trocar, from logged poses alone."""
+"""The axis of a shaft that moves about a trocar, estimated from logged poses alone."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 class TrocarSettings:
     """Thresholds of motion about a trocar."""
 
-    min_lever_mm: float = 40.0  # least distance in mm from the instrument to its trocar
+    min_lever_mm: float = 40.0  # minimum distance in mm from the instrument to its trocar
     # root mean square distance of a trocar from the line: beyond, a wrist bends the tracked frame
     max_bend_mm: float = 0.3
-    min_travel_mm: float = 2.0  # least travel in and out, in mm, of a line with a direction
+    min_travel_mm: float = 2.0  # minimum insertion travel, in mm, for determining the direction
 
 
 TROCAR = TrocarSettings()
@@ -30,8 +30,8 @@ class ShaftLine:
 
 
 def line_through_trocar(poses: np.ndarray, max_bend_mm: float = TROCAR.max_bend_mm) -> ShaftLine | None:
-    """The line, fixed to poses [F, 4, 4], that goes through one fixed point in all of them, within max_bend_mm (rms);
-    None where there is none, or none is determined."""
+    """Return the line, fixed to poses [F, 4, 4], that passes through one fixed point in all of them, within max_bend_mm
+    (RMS); None if there is none, or it is not determined."""
     from scipy.optimize import least_squares  # slow to import
 
     back, places = poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3]
@@ -42,7 +42,7 @@ def line_through_trocar(poses: np.ndarray, max_bend_mm: float = TROCAR.max_bend_
         axis = np.linalg.svd(local, full_matrices=False)[2][0]
         return np.asarray((local - np.outer(local @ axis, axis)).ravel())
 
-    solution = least_squares(off, np.zeros(3))  # where arms with a remote centre of motion have it
+    solution = least_squares(off, np.zeros(3))  # for arms, at the remote centre of motion
     local = np.einsum("fij,fj->fi", back, solution.x - places)
     middle = local.mean(0)
     axis = np.linalg.svd(local - middle, full_matrices=False)[2][0]

@@ -1,5 +1,5 @@
-"""Captures made from recordings (video and logs); `pipeline.py` states the stages.
+"""Captures made from recordings (video and logs); `pipeline.py` lists the stages.
 
-Folders, from the last stage back to the first; each imports only from those after it: posing, registration, shaft,
+Folders from the last stage to the first; each imports only from later ones in this list: posing, registration, shaft,
 cameras, foreground, frames, timing, recording, readers, calibration.
 """

@@ -1,4 +1,4 @@
-"""Turn a folder that already holds cameras (nerfstudio, Blender / D-NeRF, COLMAP, EndoNeRF) into a capture."""
+"""Convert a folder that already contains cameras (nerfstudio, Blender / D-NeRF, COLMAP, EndoNeRF) to a capture."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from neeco.ingest.staging import staged
 
 
 def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
-    """Write `folder` as a neeco-capture/1 at `output`; return what it lacks, one sentence each.
+    """Write `folder` as a neeco-capture/1 at `output`; return notes on what it lacks, one sentence each.
 
-    Images are copied bit by bit; distorted ones are undistorted, and their lens is kept. Frames without an image are
-    left out. EndoNeRF's tool masks become loss masks that ignore the tool; where no frame has a mask, an endoscope's
-    round border is looked for, and masked. The capture appears whole or not at all. Raises NeecoError when the folder
-    cannot be read, with the first problem found, when `output` exists already, and when the disk refuses.
+    Images are copied bit by bit; distorted ones are undistorted, and their lens is stored. Frames without an image are
+    left out. EndoNeRF's tool masks become loss masks that ignore the tool; without any mask, an endoscope's round
+    border is detected and masked. The capture appears complete or not at all. Raises NeecoError if the folder cannot be
+    read (with the first problem), if `output` exists, and when the disk refuses.
     """
     folder, output = Path(folder), Path(output)
     with staged(output) as work:
@@ -60,8 +60,8 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
         write_capture(capture, work / "capture")
     settled = ("instruments", "units")  # warnings that `_lacking` repeats; converting settles those of masks
     warnings = [problem for problem in report.problems if problem.severity == "warning" and problem.file != f"{MASKS}/"]
-    others = [str(problem) for problem in condensed(warnings) if problem.field not in settled]
-    return (*_lacking(parsed, masked=bool(tool_masks)), *others, *notes)
+    warning_texts = [str(problem) for problem in condensed(warnings) if problem.field not in settled]
+    return (*_lacking(parsed, masked=bool(tool_masks)), *warning_texts, *notes)
 
 
 def _absent_images(parsed: Parsed) -> list[str]:
@@ -85,8 +85,8 @@ def _inverted_masks(capture: Capture) -> list[str]:
 
 
 def _shared_border(frames: Sequence[Frame]) -> Border | None:
-    """Return the endoscope's dark border that all frames share; None without one, or where they differ in size. Raises
-    NeecoError when an image cannot be read."""
+    """Return the dark border common to all frames; None without one, or for frames of different sizes. Raises
+    NeecoError."""
     if len({(frame.camera.width, frame.camera.height) for frame in frames}) != 1:
         return None
     chosen = evenly_spaced(len(frames), BORDERS.max_frames, floor=True)
@@ -130,7 +130,7 @@ def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path)
 
 
 def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
-    """Return notes on what the capture lacks, and what that costs."""
+    """Return notes on what the capture lacks, and the consequences."""
     sentences = []
     if not parsed.instruments:
         sentences.append(
@@ -159,10 +159,10 @@ def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
 
 @dataclass(frozen=True)
 class Undistorted:
-    """Frames as pinholes see them."""
+    """Frames with pinhole cameras."""
 
     frames: tuple[Frame, ...]
-    lens: Lens | None  # through which all of them were recorded; None: there is no distortion, or several lenses
+    lens: Lens | None  # the recording's lens; None: no distortion, or several lenses
     notes: list[str]
 
 
@@ -175,9 +175,9 @@ def undistort_frames(frames: Sequence[Frame], folder: Path, border: Border | Non
     count = sum(bool(frame.camera.distortion) for frame in frames)
     if not count:
         return Undistorted(tuple(frames), None, [])
-    first, *others = {Lens.of(frame.camera): None for frame in frames}
-    lens = None if others else replace(first, border=border)
-    note = f"of their {1 + len(others)} lenses none is kept" if lens is None else "their lens is kept"
+    first, *other_lenses = {Lens.of(frame.camera): None for frame in frames}
+    lens = None if other_lenses else replace(first, border=border)
+    note = f"of their {1 + len(other_lenses)} lenses none is kept" if lens is None else "their lens is kept"
     straight = [_undistort(frame, folder / str(order)) for order, frame in enumerate(frames)]
     return Undistorted(tuple(straight), lens, [f"{count} of {len(frames)} images are undistorted; {note}."])
 

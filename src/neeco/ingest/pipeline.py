@@ -41,16 +41,16 @@ from neeco.ingest.world import World, find_moving_world, find_still_world, is_st
 
 @dataclass(frozen=True, kw_only=True)
 class SplitSettings:
-    """Settings of the choice of frames that test."""
+    """Settings of the choice of test frames."""
 
-    unseen_margin: int = 3  # video frames on each side of an unseen one chosen by us that no other split may use
+    unseen_margin: int = 3  # video frames on each side of an unseen one that no other split may use
     min_range: float = 0.1  # minimum range of a joint's readings, rad, by which frames are split
-    test_every: int = 8  # frames, or episodes, of which one tests unless the recording states otherwise
+    test_every: int = 8  # test share: one frame, or episode, in this many, unless the recording states another rule
 
 
 SPLITS = SplitSettings()
 
-LEFT_OUT = "left out"  # split of a frame too close to an unseen one to train on
+LEFT_OUT = "left out"  # split of a frame too similar to an unseen one for training
 
 
 def ingest(
@@ -85,7 +85,7 @@ def ingest(
 
 
 def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
-    """Return the capture of the `chosen` rows of the views."""
+    """Return the capture with the `chosen` rows of the views."""
     data, images, views, shaft = world.data, world.images, world.views, world.shaft
     item = data.video_instrument
     deviations = uncertainties(item, shaft) if item and shaft else None
@@ -99,7 +99,7 @@ def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
         )
         for row in chosen.tolist()
     )
-    if world.right is not None:  # one camera more to learn from; what is tested stays one
+    if world.right is not None:  # only for training; test frames have one camera
         frames += _right_frames(data, world.right, frames, views.rows[chosen].tolist())
     assert images.lens is not None
     registered = world.registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
@@ -114,8 +114,8 @@ def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
 
 
 def _shared_uncertainty(world: World, name: str, chosen: np.ndarray) -> BaseUncertainty | None:
-    """Return the covariance of the error that the `chosen` poses of an instrument share: of its base as found in the
-    images, else of the scope's hand-eye calibration; None where poses come from the images, or nothing is known."""
+    """Return the covariance of the error common to the `chosen` poses of an instrument: of its estimated base, else of
+    the scope's hand-eye calibration; None for poses from the images, or if unknown."""
     poses = world.states[name][0][chosen]
     if (base := world.bases.get(name)) is not None:
         return base.uncertainty(world.views.world_from_camera[0], poses)
@@ -125,8 +125,8 @@ def _shared_uncertainty(world: World, name: str, chosen: np.ndarray) -> BaseUnce
 
 
 def _right_frames(data: Episodes, right: RightCamera, frames: Sequence[Frame], rows: list[int]) -> tuple[Frame, ...]:
-    """Return the training frames among `frames`, rows of the chosen ones, as the right camera took them: with the
-    states of its own moments, where these are known."""
+    """Return the training frames among `frames`, rows of the chosen ones, with the right camera's images and the states
+    at their times, if known."""
     taken = [
         (frame, row) for frame, row in zip(frames, rows, strict=True) if frame.split == "train" and row in right.names
     ]
@@ -211,7 +211,7 @@ def _state(states: States, row: int, time: float, uncertainty: Uncertainty | Non
 
 def _measure_roll(world: World, result: IngestResult, capture: Path, progress: StageProgress) -> None:
     """Measure roll and joints of an instrument found in the video in the written capture, for `neeco view --annotate`;
-    not where the roll was logged, nor with a second camera, whose masks are not known."""
+    not if the roll was logged, nor with a second camera, which has no masks."""
     item = world.data.video_instrument
     if item is None or item.roll is not None or world.right is not None or world.masks is None:
         return
@@ -260,9 +260,9 @@ def assign_splits(
     rule: Splits,
     episodes: Mapping[str, tuple[int, int]] | None = None,
 ) -> tuple[np.ndarray, str]:
-    """Split video frames [N], given by number; return the splits [N] and the rule in words.
+    """Assign video frames [N], given by number, to splits; return the splits [N] and a description of the rule.
 
-    Unseen frames are chosen by poses [N, 4, 4] of the instrument and readings [N] rad by joint. A frame too close to
+    Unseen frames are chosen by poses [N, 4, 4] of the instrument and readings [N] rad by joint. A frame too similar to
     one of them is LEFT_OUT. episodes: the frames (first, last) of each of several.
     """
     episodes = episodes or {}
@@ -296,7 +296,7 @@ def assign_splits(
 def _inside(
     frames: np.ndarray, names: Sequence[str], ranges: Sequence[tuple[int, int]], episodes: Mapping[str, tuple[int, int]]
 ) -> np.ndarray:
-    """Return which frames [N] are of the named episodes, or, where none is, in the ranges (first, last)."""
+    """Return which frames [N] belong to the named episodes or, without any, to the ranges (first, last)."""
     spans = [episodes[name] for name in names] or ranges
     return np.any([(frames >= first) & (frames <= last) for first, last in spans], axis=0)
 
@@ -310,8 +310,8 @@ def _listed(names: Sequence[str], ranges: Sequence[tuple[int, int]]) -> str:
 def _extremes(
     poses: np.ndarray, joints: Mapping[str, np.ndarray], fraction: float, by: str | None
 ) -> tuple[np.ndarray, str]:
-    """Return the frames [N] at the far end of one joint, of the instrument's turn from its mean direction, or half of
-    each; and the rule in words."""
+    """Return the frames [N] at the extreme of one joint, of the instrument's rotation from its mean direction, or half
+    of each; and a description of the rule."""
     moving = [name for name, values in joints.items() if np.ptp(values) > SPLITS.min_range]
     joint = by or (moving[0] if moving else None)
     share = fraction if by or joint is None else fraction / 2

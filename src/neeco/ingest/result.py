@@ -24,10 +24,10 @@ from neeco.ingest.timing.episodes import Contradiction
 
 @dataclass(frozen=True, kw_only=True)
 class IngestResult:
-    """Everything about one ingest but the capture itself (images, cameras, states, points), which lies at `capture`."""
+    """Everything about one ingest except the capture (images, cameras, states, points) in `capture`."""
 
     capture: Path
-    recording: str  # where it came from, in words
+    recording: str  # description of the source
     video_frames: int
     video_fps: float
     size: tuple[int, int]  # width, height px
@@ -58,13 +58,13 @@ class IngestResult:
     contradictions: tuple[Contradiction, ...] = ()  # between parts of the recording
 
     def frame_words(self, frame: int) -> str:
-        """Return a video frame's number, and of several recordings which is meant."""
+        """Return a video frame's number, with its episode if there are several."""
         name = self._episode_of(frame)
         return f"video frame {frame}" if name is None else f"{name}: video frame {frame - self.episodes[name][0]}"
 
     def log_times(self, frame: int, seconds: float) -> dict[str, float]:
-        """Return the logs' times, s, of a video frame that is taken at `seconds` of the capture's time, by clock: of
-        several recordings, those of the frame's own."""
+        """Return the logs' times, s, by clock, of a video frame at `seconds` of the capture's time; with several
+        recordings, of the frame's own logs."""
         name = self._episode_of(frame)
         if name is None:
             return {clock: float(ahead.at(np.array(seconds))) for clock, ahead in self.clocks.items()}
@@ -138,12 +138,12 @@ class IngestResult:
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictSettings:
-    """Limits beyond which there is a warning: conventions, not measurements."""
+    """Limits above which warnings are issued: conventions, not measurements."""
 
     position_mm: float = 1.0  # RMS position residual of the registration
     rotation_deg: float = 0.5  # RMS rotation residual of the registration
     reprojection_px: float = 1.0
-    scale: float = 0.015  # standard deviation of the scale, share
+    scale: float = 0.015  # standard deviation of the scale, relative
     clock_mm: float = 0.5  # motion of an instrument within the standard deviation of its clock
     base_mm: float = 2.0  # standard deviation of a base
     base_deg: float = 1.5  # standard deviation of a base's rotation
@@ -162,8 +162,8 @@ ADVICE = {"good": "good", "careful": "usable", "bad": "do not train"}
 
 @dataclass(frozen=True)
 class Assessment:
-    """headline: one sentence; warnings: why it is not better, one sentence each, the worst first; facts: the measured
-    values that decide, with what is usual."""
+    """headline: one sentence; warnings: one sentence each, the worst first; facts: the decisive measured values, with
+    usual ones."""
 
     level: Literal["good", "careful", "bad"]
     headline: str
@@ -184,12 +184,12 @@ class Assessment:
     def lines(self) -> list[str]:
         """Return the verdict for a terminal: headline (in capitals if doubtful) and the first `max_shown` warnings."""
         verdict, _, rest = self.headline.partition(":")
-        others = self.others
+        more_warnings = self.others
         words = {"good": f"good. {self.headline}", "careful": self.headline, "bad": f"{verdict.upper()}:{rest}"}
         lines = [words[self.level]]
-        lines += [f"  - {warning}" for warning in others[: LIMITS.max_shown]]
-        left = len(others) - LIMITS.max_shown
-        return lines + ([f"  - and {left} more warnings"] if left > 0 else [])
+        lines += [f"  - {warning}" for warning in more_warnings[: LIMITS.max_shown]]
+        unlisted = len(more_warnings) - LIMITS.max_shown
+        return lines + ([f"  - and {unlisted} more warnings"] if unlisted > 0 else [])
 
     def as_json(self) -> dict[str, Any]:
         """Return the verdict for scripts (`--json`)."""
@@ -199,9 +199,9 @@ class Assessment:
 
 @dataclass(frozen=True)
 class _Evidence:
-    """Evidence on a capture: a fact, and a sentence that warns where it is unusual.
+    """Evidence on a capture: a fact, and a warning if it is unusual.
 
-    level: 0 where it is usual, 1 for a warning, 2 where the capture is not to be trained on.
+    level: 0 usual, 1 warning, 2 unsuitable for training.
     """
 
     fact: str
@@ -232,8 +232,8 @@ def rms(values: np.ndarray) -> float:
 
 
 def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Problem] = ()) -> Assessment:
-    """Judge a finished ingest by its own numbers, by contradictions in its recording, and by the problems that `check`
-    found in its capture; nothing here knows the truth."""
+    """Assess a finished ingest by its own numbers, contradictions in its recording, and problems that `check` detected
+    in its capture; no ground truth is used."""
     grave = [problem for problem in problems if problem.severity == "error" or problem.contradicted]
     evidence = [_Evidence.of(_sentence(item.sentence), severe=item.severe) for item in result.contradictions]
     evidence += [_Evidence.of(_sentence(str(problem)), severe=True) for problem in grave]
@@ -253,8 +253,8 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
     if result.in_video and any(item is not None and item.rotation_deg[2] >= UNKNOWN_DEG for item in deviations):
         words = "The instrument's roll is not known: log it, or pose frames by hand, before training."
         evidence.append(_Evidence.of(words, severe=False))
-    others = [problem for problem in problems if problem not in grave]
-    evidence += [_Evidence.of(_sentence(str(problem)), severe=False) for problem in others]
+    minor = [problem for problem in problems if problem not in grave]
+    evidence += [_Evidence.of(_sentence(str(problem)), severe=False) for problem in minor]
     if not capture.instruments:
         words = "No instrument was tracked: only methods without states, such as 3dgs, can be trained."
         evidence.append(_Evidence.of(words, severe=False))
@@ -265,7 +265,7 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
 
 
 def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -> Assessment:
-    """Return the assessment that all evidence gives, the worst first."""
+    """Return the assessment from all evidence, the worst first."""
     ordered = sorted(evidence, key=lambda item: -item.level)
     facts = tuple(item.fact for item in ordered[: LIMITS.facts])
     warnings = tuple(item.reason for item in ordered if item.level)
@@ -290,7 +290,7 @@ def _lower(sentence: str) -> str:
 
 
 def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
-    """Return what was measured, the most telling first."""
+    """Return the measurements, the most informative first."""
     linked = {item.name for item in capture.instruments if item.kinematics is not None}
     evidence = [item for name, base in result.bases.items() for item in _of_base(name, base, linked=name in linked)]
     registration = result.registration
@@ -327,8 +327,8 @@ def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
 
 
 def _placed(registration: Registration, capture: Capture, found_in_images: Collection[str]) -> list[_Evidence]:
-    """Return how well the cameras' place in the tracker's frame is known where instruments are, but for those whose
-    bases were found in the images. Residuals do not show it: where a scope turns little, they are small far off."""
+    """Return the accuracy of the cameras' positions in the tracker's frame at instruments, except those with estimated
+    bases. Residuals do not show it: if a scope hardly rotates, they are small but extrapolate badly."""
     places = [
         state.pose[:3, 3].numpy()
         for frame in capture.frames
@@ -362,8 +362,8 @@ def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Eviden
     limit_mm, limit_deg = (
         (HAND_EYE.placed_mm, HAND_EYE.placed_deg) if base.tracked else (LIMITS.base_mm, LIMITS.base_deg)
     )
-    what = f"the {'place' if base.tracked else 'base'} of {name}"
-    measured = [(what, "mm", limit_mm, base.sd_mm), (what, "deg", limit_deg, base.sd_deg)]
+    quantity = f"the {'place' if base.tracked else 'base'} of {name}"
+    measured = [(quantity, "mm", limit_mm, base.sd_mm), (quantity, "deg", limit_deg, base.sd_deg)]
     if base.shaft is not None and linked:
         sd_mm, sd_deg = base.deviations(frame_about(base.shaft).T)
         measured = [
@@ -373,11 +373,11 @@ def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Eviden
         ]
     elif np.isfinite(base.sd_motion_mm):
         measured = [(f"the motion of {name}", "mm", limit_mm, np.array(base.sd_motion_mm))]
-    for what, unit, limit, sds in measured:
+    for quantity, unit, limit, sds in measured:
         worst = float(np.max(sds))
         size = f"±{worst:.1f} {unit}" if np.isfinite(worst) else f"no {unit}"
-        fact = f"{what} is known to {size} (usual: {limit:g} or less)"
-        warning = f"{what[0].upper()}{what[1:]} is known to {size} only."
+        fact = f"{quantity} is known to {size} (usual: {limit:g} or less)"
+        warning = f"{quantity[0].upper()}{quantity[1:]} is known to {size} only."
         evidence.append(_Evidence(fact, 0 if worst <= limit else 1, warning))
     return evidence
 

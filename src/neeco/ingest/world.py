@@ -1,5 +1,5 @@
-"""One world of an ingest: cameras, tissue and instruments. Of a scope that moves, structure from motion finds the
-cameras and its tracker registers them; the frame of one that stands still is the world."""
+"""The world of an ingest: cameras, tissue and instruments. Cameras of a moving scope are estimated by structure from
+motion and registered by its tracker; the frame of a still scope is the world."""
 
 from __future__ import annotations
 
@@ -65,35 +65,35 @@ class World:
     images: ChosenImages
     views: Views
     states: States
-    usable: np.ndarray  # [M] bool, where the states of all instruments are known
+    usable: np.ndarray  # [M] bool, whether the states of all instruments are known
     tissue: PointCloud
     shapes: Mapping[str, RoughShape]  # by instrument
-    bases: Mapping[str, BaseRegistration]  # by instrument, of those found from what moves
+    bases: Mapping[str, BaseRegistration]  # by instrument, if estimated from moving pixels
     still: bool  # the scope stood still
     shaft: FoundShaft | None = None  # the instrument found in the video
-    masks: np.ndarray | None = None  # bool [M, h, w], what moves, where an instrument was found in the video
+    masks: np.ndarray | None = None  # bool [M, h, w], moving foreground, if an instrument was found in the video
     # of a scope that moves
-    registration: Registration | None = None  # None: instrument poses stay in their tracker's frame
+    registration: Registration | None = None  # None: poses remain in their tracker's frame
     reprojection_px: float | None = None
-    search: tuple[str, ...] = ()  # what was tried to find cameras, one sentence each
-    moving: Mapping[int, np.ndarray] = field(default_factory=dict)  # video frame -> [h, w] how often pixels moved
+    search: tuple[str, ...] = ()  # attempts at finding cameras, one sentence each
+    moving: Mapping[int, np.ndarray] = field(default_factory=dict)  # video frame -> [h, w] motion frequency
     # of a scope that stands still
-    depth_source: str | None = None  # how the tissue's depth was found, after "the tissue's depth is"
+    depth_source: str | None = None  # continues "the tissue's depth is"
     right: RightCamera | None = None
 
 
 def residual_flow(sfm: SfmResult, views: Views) -> ResidualFlow:
-    """Return the optical flow between the views that a still scene does not explain."""
+    """Return the residual optical flow between the views, beyond that of a still scene."""
     return ResidualFlow(views.load, sfm, views.times, views.pinhole, visible=views.visible, episodes=views.episodes)
 
 
 def longest_lag(data: Episodes) -> float:
-    """Return the s by which the poses of a log may be off its clock: what is longer leaves half of the frames none."""
+    """Return the maximum plausible clock error of a log, s: a longer one leaves half of the frames without poses."""
     return float(max(np.ptp(part.times) for part in data.parts)) / 2
 
 
 def note_motion_contradiction(data: Episodes, name: str, moves: bool, lag: float) -> None:
-    """Note an instrument with whose poses nothing in the images moves, or something moves at another time."""
+    """Note an instrument whose poses do not match any motion in the images, or match it at another time."""
     logs = data.parts[0].poses
     clock, sentence = logs[name].clock if name in logs else "", ""
     if lag and not data.notes.is_contradicted(f"sync {clock}"):
@@ -110,18 +110,17 @@ def note_motion_contradiction(data: Episodes, name: str, moves: bool, lag: float
 
 
 def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progress: StageProgress) -> World:
-    """Find cameras, registration, clocks, bases and instruments; then adjust the cameras without what moves.
+    """Estimate cameras, registration, clocks, bases and instruments; then adjust the cameras without moving features.
 
-    folder: for temporary files. Raises NeecoError where too few images get a camera.
+    folder: for temporary files. Raises NeecoError if too few images get a camera.
     """
     check_reference_frames(data, moving=True)
     settings = data.recording.settings
     lens = images.lens
-    motion = StructureFromMotion(
-        work=folder / "sfm", source=data.video.path, folder=images.folder / "raw", names=images.names,
-        size=images.size, pinhole=lens.pinhole(images.size) if lens else None, masks=images.masks, settings=settings,
-        episodes=data.episode_of(images.selected),
-    )  # fmt: skip
+    pinhole, episodes = lens.pinhole(images.size) if lens else None, data.episode_of(images.selected)
+    begin = partial(StructureFromMotion, folder=images.folder / "raw", names=images.names, size=images.size)
+    begin = partial(begin, work=folder / "sfm", source=data.video.path, masks=images.masks)
+    motion = begin(pinhole=pinhole, settings=settings, episodes=episodes)
     sfm = motion.reconstruct(progress)
     _check_joined(data, images.selected[sfm.indices])
     if lens is None:
@@ -164,7 +163,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     first = sfm.indices
     sfm = motion.adjust(sfm, on_instruments, progress)
     views = images.views(data, sfm.indices, sfm.world_from_camera)
-    data, registration = register(data, views)  # first: it may find clocks
+    data, registration = register(data, views)  # may estimate clocks
     distance, shaft = settings.scene_distance_mm, None
     placed, points = _in_mm(sfm, views, registration, distance)
     if before is not None and registration is not None:
@@ -181,15 +180,26 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         _compare_motion(data, placed, shapes, evidence, flow.pinhole)
     states, usable = data.states_at(views.times)
     return World(
-        data=data, images=images, views=placed, states=states, usable=usable, tissue=_reliable(data, sfm, points),
-        shapes=shapes, bases=bases, shaft=shaft, masks=masks, registration=registration,
-        reprojection_px=sfm.reprojection_px, search=motion.search, moving=evidence, still=False,
-    )  # fmt: skip
+        data=data,
+        images=images,
+        views=placed,
+        states=states,
+        usable=usable,
+        tissue=_reliable(data, sfm, points),
+        shapes=shapes,
+        bases=bases,
+        shaft=shaft,
+        masks=masks,
+        registration=registration,
+        reprojection_px=sfm.reprojection_px,
+        search=motion.search,
+        moving=evidence,
+        still=False,
+    )
 
 
 def _check_joined(data: Episodes, placed: np.ndarray) -> None:
-    """Raise NeecoError for an episode that structure from motion did not join to the others. placed [M]: the frames
-    that got a camera."""
+    """Raise NeecoError for an episode that structure from motion did not join. placed [M]: frames with a camera."""
     counts = np.bincount(data.episode_of(placed), minlength=len(data.parts))
     for part, count in zip(data.parts, counts, strict=True):
         if count < MIN_FRAMES and not data.single:
@@ -222,7 +232,7 @@ def _distances(points: np.ndarray, cameras: np.ndarray) -> np.ndarray:
 
 
 def _reliable(data: Episodes, sfm: SfmResult, points: np.ndarray) -> PointCloud:
-    """Return the tissue from the points [P, 3] mm of a reconstruction that several images observe and that fit well."""
+    """Return the tissue: points [P, 3] mm of a reconstruction with several observations and a small residual."""
     reliable = sfm.reliable_points()
     if not reliable.any():
         reliable = np.ones(len(points), dtype=bool)
@@ -233,9 +243,9 @@ def _reliable(data: Episodes, sfm: SfmResult, points: np.ndarray) -> PointCloud:
 def _carve_instruments(
     data: Episodes, sfm: SfmResult, views: Views, flow: ResidualFlow, registration: Registration
 ) -> tuple[np.ndarray, dict[str, RoughShape], dict[int, np.ndarray]]:
-    """Carve the rough shape of every tracked instrument from what moves with its pose.
+    """Carve the rough shape of every tracked instrument from pixels that move with its pose.
 
-    Return the observations bool [Q] on instruments, the shapes, and by video frame where [h, w] pixels moved.
+    Return the observations bool [Q] on instruments, the shapes, and moving pixels [h, w] by video frame.
     """
     settings = data.recording.settings
     rows = np.unique(np.linspace(0, len(sfm.indices) - 1, settings.shape_frames).astype(int))
@@ -252,19 +262,17 @@ def _carve_instruments(
             continue
         shapes[name] = shape
         for row in np.flatnonzero(valid):
-            on_instruments |= observations_on(
-                shape, camera_from_instrument[row], sfm, int(row), points,
-                camera=flow.pinhole.camera(views.world_from_camera[row]),
-            )  # fmt: skip
+            camera = flow.pinhole.camera(views.world_from_camera[row])
+            on_instruments |= observations_on(shape, camera_from_instrument[row], sfm, int(row), points, camera)
     return on_instruments, shapes, dict(zip(views.frames[rows].tolist(), evidence, strict=True))
 
 
 def _compare_motion(
     data: Episodes, views: Views, shapes: Mapping[str, RoughShape], evidence: Mapping[int, np.ndarray], pinhole: Lens
 ) -> None:
-    """Note instruments that do not move in the images as their poses do, by the capture's own clocks and cameras.
+    """Note instruments whose motion in the images differs from their poses, given the capture's clocks and cameras.
 
-    evidence: by video frame where [h, w] pixels moved.
+    evidence: moving pixels [h, w] by video frame.
     """
     rows = np.flatnonzero(np.isin(views.frames, list(evidence)))
     moved = np.stack([evidence[frame] for frame in views.frames[rows].tolist()])
@@ -280,7 +288,7 @@ def _compare_motion(
 
 
 def is_still(data: Episodes, images: ChosenImages, progress: StageProgress) -> bool:
-    """Return whether the scope stands still: as the recording states, else as its images show."""
+    """Return whether the scope is still: as the recording states, else according to its images."""
     stated, stereo = data.recording.camera, data.recording.stereo is not None
     if stereo and stated == MOVING:
         data.notes.add("stereo: the second camera of a scope that moves is not used")
@@ -297,7 +305,7 @@ def is_still(data: Episodes, images: ChosenImages, progress: StageProgress) -> b
 
 
 def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progress: StageProgress) -> World:
-    """Find clocks, bases, instruments and tissue in front of a scope whose frame is the world.
+    """Estimate clocks, bases, instruments and tissue for a still scope, whose frame is the world.
 
     folder: for temporary files. Raises NeecoError for an unknown lens.
     """
@@ -341,21 +349,30 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
         note_motion_contradiction(data, name, name in behind.shapes, lag)
     states, usable = data.states_at(views.times)
     return World(
-        data=data, images=images, views=views, states=states, usable=usable,
+        data=data,
+        images=images,
+        views=views,
+        states=states,
+        usable=usable,
         tissue=PointCloud(behind.points.astype(np.float32), (behind.colors / 255).astype(np.float32)),
-        shapes=behind.shapes, bases=bases, shaft=shaft, masks=masks, still=True, depth_source=behind.how,
+        shapes=behind.shapes,
+        bases=bases,
+        shaft=shaft,
+        masks=masks,
+        still=True,
+        depth_source=behind.how,
         right=right,
-    )  # fmt: skip
+    )
 
 
 def _rows_by_episode(data: Episodes, images: ChosenImages) -> dict[int, np.ndarray]:
-    """Return the rows of the chosen frames, by episode, of those that have some."""
+    """Return the rows of the chosen frames by episode."""
     episodes = data.episode_of(images.selected)
     return {int(episode): np.flatnonzero(episodes == episode) for episode in np.unique(episodes)}
 
 
 def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgress) -> None:
-    """Raise NeecoError for an episode in which a still scope looked at something else than in the first."""
+    """Raise NeecoError for an episode in which a still scope observed another scene than in the first."""
     if data.single:
         return
     progress("comparing what the recordings show", 0, 0)
@@ -364,8 +381,8 @@ def _check_one_place(data: Episodes, images: ChosenImages, progress: StageProgre
         load = images.loader(rows[evenly_spaced(len(rows), STILL_SCOPE.n_frames)])
         background = find_background(load, min(len(rows), STILL_SCOPE.n_frames))
         backgrounds[episode] = np.clip(background.colors, 0, 255).astype(np.uint8)
-    first, *others = backgrounds
-    for episode in others:
+    first, *later_backgrounds = backgrounds
+    for episode in later_backgrounds:
         share = same_place(backgrounds[first], backgrounds[episode])
         name, before = data.parts[episode].name, data.parts[first].name
         if share is not None and share < WORLD.same_place:

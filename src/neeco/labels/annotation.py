@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
 
 SHAFT_ENDS = ("shaft_far", "shaft_near")  # keypoints; all others are of the working end
-OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2  # OUTSIDE: of the image, or the instrument is not rendered at all
+OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2  # OUTSIDE: outside the image, or the instrument is not rendered at all
 
 
 @dataclass(frozen=True)
@@ -51,28 +51,28 @@ class Keypoint(NamedTuple):
 
 @dataclass(frozen=True)
 class InstrumentLabel:
-    """The labels of one instrument in one image. Contours are found when they are asked for: a network needs none."""
+    """Labels of one instrument in one image. Contours are computed on access, as networks need none."""
 
     name: str
     image: np.ndarray  # uint8 [H, W]: part ids
     ids: Mapping[str, int]  # of the instrument's parts
-    visibility: float  # visible pixels / pixels if nothing else were there
+    visibility: float  # visible pixels / pixels of the unoccluded instrument
     keypoints: dict[str, Keypoint]
     camera_from_instrument: list[list[float]]  # 4x4 rigid, mm, OpenCV camera axes
 
     @cached_property
     def mask(self) -> np.ndarray:
-        """[H, W] bool: its visible pixels."""
+        """Return its visible pixels, [H, W] bool."""
         return shows_any(self.image, tuple(self.ids.values()))
 
     @cached_property
     def shape(self) -> Shape | None:
-        """Its visible pixels in numbers; None: there are none."""
+        """Return the shape of its visible pixels; None without any."""
         return shape_of(self.mask)
 
     @cached_property
     def parts(self) -> dict[str, Shape]:
-        """Its visible parts."""
+        """Return its visible parts."""
         return {part: shape for part, index in self.ids.items() if (shape := shape_of(self.image == index))}
 
     def to_json(self) -> dict[str, Any]:
@@ -92,7 +92,7 @@ def annotate(
     scene: GaussianScene, drawing: LayeredDrawing, names: tuple[tuple[str, str], ...]
 ) -> list[InstrumentLabel]:
     """Return the labels of every instrument of a rendering; names: (instrument, part) of its part ids."""
-    drawn_at = scene.registered(drawing.state)  # the pose that agrees with the pixels
+    drawn_at = scene.registered(drawing.state)  # the pose as rendered
     parts = drawing.parts.numpy()
     labels = []
     for instrument in instruments_of(names):
@@ -130,7 +130,7 @@ def visibility(visible: np.ndarray, unoccluded: np.ndarray) -> float:
 
 
 def place_in_image(point: np.ndarray, camera: Camera) -> tuple[float, float, float] | None:
-    """Return position (x, y) px and depth mm of a world point [3] mm; None where it is outside of the image."""
+    """Return position (x, y) px and depth mm of a world point [3] mm; None if it is outside the image."""
     local = (camera.camera_from_world @ np.append(point, 1.0))[:3]
     x, y = project_local(local, camera, nearest=camera.near)
     inside = local[2] > camera.near and 0 <= x < camera.width and 0 <= y < camera.height
@@ -138,12 +138,12 @@ def place_in_image(point: np.ndarray, camera: Camera) -> tuple[float, float, flo
 
 
 def project_keypoints(drawing: LayeredDrawing, instrument: str) -> dict[str, Keypoint]:
-    """Return an instrument's keypoints (world mm) in the image, and whether anything hides them.
+    """Project an instrument's keypoints (world mm) to the image and determine their visibility.
 
-    Keypoints of an instrument that has no pixel even alone are OUTSIDE.
+    Keypoints of an instrument without any pixel, even alone, are OUTSIDE.
     """
     camera = drawing.camera
-    others = [drawing.tissue_depth] + [layer.depth for name, layer in drawing.layers.items() if name != instrument]
+    depths = [drawing.tissue_depth] + [layer.depth for name, layer in drawing.layers.items() if name != instrument]
     absent = not drawing.layers[instrument].mask.any()
     projected = {}
     for name, point in drawing.keypoints.get(instrument, {}).items():
@@ -152,7 +152,7 @@ def project_keypoints(drawing: LayeredDrawing, instrument: str) -> dict[str, Key
         if not absent and place is not None:
             x, y, z = place
             pixel = int(y), int(x)
-            hidden = any(0 < depth[pixel] < z - LABELS.occlusion_mm for depth in others)
+            hidden = any(0 < depth[pixel] < z - LABELS.occlusion_mm for depth in depths)
             hidden |= 0 < drawing.layers[instrument].depth[pixel] < z - LABELS.self_occlusion_mm
             projected[name] = Keypoint(round(x, 2), round(y, 2), OCCLUDED if hidden else VISIBLE)
     return projected
@@ -177,7 +177,7 @@ def working_ends_of(keypoints: Mapping[str, Mapping[str, np.ndarray]]) -> dict[s
 
 
 def working_ends_or_origins(scene: GaussianScene, state: State) -> dict[str, list[np.ndarray]]:
-    """Return the `working_ends_of` a scene; without any, every instrument's origin [3] mm."""
+    """Return the `working_ends_of` a scene; if there are none, every instrument's origin [3] mm."""
     return working_ends_of(keypoint_arrays(scene, state)) or {
         name: [to_numpy(item.pose[:3, 3])] for name, item in scene.registered(state).instruments.items()
     }
@@ -195,16 +195,16 @@ def bounding_box(mask: np.ndarray) -> tuple[int, int, int, int]:
 
 
 def minimum_rectangle(mask: np.ndarray) -> np.ndarray | None:
-    """Return the corners [4, 2] (x, y) of the smallest rectangle about all pixels of a mask; None when it is empty.
+    """Return the corners [4, 2] (x, y) of the minimum-area rectangle of a mask's pixels; None when it is empty.
 
-    The direction is OpenCV's, the extent along it computed here: cv2.minAreaRect works in float32 and leaves corners of
-    pixels outside.
+    The direction is OpenCV's, the extent is computed here: cv2.minAreaRect works in float32 and may exclude corners of
+    pixels.
     """
     left, top, width, height = bounding_box(mask)
     if not width:
         return None
     inside = mask[top : top + height, left : left + width]
-    # the first and last pixel of every row carry the hull
+    # the first and last pixel of every row determine the hull
     rows = np.flatnonzero(inside.any(1))
     first = left + inside[rows].argmax(1)
     last = left + width - inside[rows, ::-1].argmax(1)
@@ -227,7 +227,7 @@ def outer_polygons(mask: np.ndarray) -> list[np.ndarray]:
 
 def exact_polygons(mask: np.ndarray) -> list[np.ndarray]:
     """Return polygons [P, 2] (x, y) on pixel edges that together cover exactly the pixels of a mask, which is cut below
-    the top row of every hole: no piece has one."""
+    the top row of every hole, so that no piece has one."""
     loops, cuts = _outer_loops(mask)
     if cuts:
         bands = zip([0, *cuts], np.split(mask, cuts), strict=True)
@@ -242,11 +242,11 @@ def signed_area(polygon: np.ndarray) -> float:
 
 
 def _outer_loops(mask: np.ndarray) -> tuple[list[np.ndarray], list[int]]:
-    """Return a closed loop of corners [P, 2] (x, y) about every (edge-connected) component of a mask, on pixel edges,
-    and the rows below the top rows of its holes, sorted.
+    """Return a closed loop of corners [P, 2] (x, y) for every (edge-connected) component of a mask, on pixel edges, and
+    the rows below the top rows of its holes, sorted.
 
     OpenCV's contours join pixel centres, and pixels that touch at a corner only. In a magnified mask every centre has
-    one nearest corner; where two pixels touch at a corner only, the touching ones are cut away.
+    one nearest corner; pixels that touch only at a corner are separated.
     """
     x, y, width, height = bounding_box(mask)
     if not width:
@@ -272,7 +272,7 @@ def _outer_loops(mask: np.ndarray) -> tuple[list[np.ndarray], list[int]]:
 
 
 def _simplified(loop: np.ndarray) -> np.ndarray:
-    """Return the loop with fewer corners (Douglas and Peucker 1973), its area kept within `max_area_change`."""
+    """Return a loop with fewer corners (Douglas and Peucker 1973) whose area changes by at most `max_area_change`."""
     area = signed_area(loop)
     tolerance = LABELS.simplify_px
     while tolerance > 0.1:
@@ -284,7 +284,7 @@ def _simplified(loop: np.ndarray) -> np.ndarray:
 
 
 def _approximated(loop: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the corners [P, 2] of a polygon from which a closed loop [N, 2] is at most `tolerance` px away."""
+    """Return a polygon's corners [P, 2] within `tolerance` px of a closed loop [N, 2]."""
     return cv2.approxPolyDP(loop.astype(np.float32)[:, None], tolerance, True)[:, 0].astype(float)
 
 
@@ -311,7 +311,7 @@ class LabelledImage(RGBDImage):
     """
 
     parts: Tensor  # uint8 [H, W]: 0 tissue, else part_names[id - 1]
-    ignore: Tensor  # bool [H, W]: pixels that a loss should ignore, of uncertain edges and what no frame observed
+    ignore: Tensor  # bool [H, W]: pixels that a loss should ignore (uncertain edges, unobserved surfaces)
     instruments: tuple[str, ...]  # names of the I instruments
     masks: Tensor  # bool [I, H, W]
     boxes: Tensor  # float32 [I, 4]: left, top, right, bottom
@@ -332,7 +332,7 @@ class LabelledImage(RGBDImage):
         part_names: tuple[tuple[str, str], ...],
         keypoint_names: tuple[str, ...],
     ) -> LabelledImage:
-        """Make one from a rendering and the `labels` that `annotate` finds in it."""
+        """Return a labelled image from a rendering and the `labels` of `annotate`."""
         visible = [label for label in labels if label.mask.any()]
         parts, count = drawing.parts, len(visible)
         boxes = [(x, y, x + width, y + height) for x, y, width, height in (bounding_box(one.mask) for one in visible)]

@@ -1,6 +1,6 @@
-"""Renderings of one state with their labels, on the CPU whatever device renders.
+"""Renderings of one state with their labels, on the CPU, on whatever device they are rendered.
 
-`draw` is for viewing and scoring; `draw_layers` also renders what labels need: the tissue and each instrument alone.
+`draw` is for viewing and scoring; `draw_layers` also renders tissue and instruments alone, for labels.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from neeco.raster.types import Gaussians, Layer, Rendering
 if TYPE_CHECKING:
     from neeco.scene import DrawableScene, GaussianScene
 
-NEIGHBOURS = np.ones((3, 3), np.uint8)  # with corners: else the band of a slanted border is thinner than a pixel
+NEIGHBOURS = np.ones((3, 3), np.uint8)  # 8-neighbourhood: with 4, the band of a slanted border is thinner than a pixel
 
 
 @dataclass(frozen=True)
@@ -55,14 +55,14 @@ class LayeredDrawing(Drawing):
     camera: Camera
     depth: np.ndarray
     tissue_depth: np.ndarray  # of the tissue alone
-    tissue_image: Tensor | None  # [H, W, 3] in [0, 1] of the tissue alone, where it was asked for
+    tissue_image: Tensor | None  # [H, W, 3] in [0, 1] of the tissue alone, if requested
     layers: dict[str, InstrumentLayer]  # by instrument
     unobserved: Tensor  # [H, W] in [0, 1]: share of a pixel that no training frame observed from a similar direction
     keypoints: dict[str, dict[str, np.ndarray]]  # by instrument and name, [3] mm, world
 
     @property
     def ignored(self) -> Tensor:
-        """[H, W] bool: pixels that a loss should ignore: the instruments' `uncertain_edge`, and unobserved pixels."""
+        """Return bool [H, W]: pixels that a loss should ignore, at `uncertain_edge` of instruments or unobserved."""
         edge = torch.from_numpy(uncertain_edge(self.share.numpy(), self.parts.numpy() > 0))
         return edge | (self.unobserved > LABELS.max_unobserved)
 
@@ -161,9 +161,9 @@ def to_numpy(tensor: Tensor) -> np.ndarray:
 def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return bool [H, W]: pixels at the edge of a mask (bool [H, W]) whose label is uncertain.
 
-    These touch the border from either side, since a border may be a pixel off even where the share of instrument
-    ([H, W] in [0, 1]) jumps, or are within `edge_width` of it with a share between `clear_shares`. The image's own
-    border is not an edge.
+    These are adjacent to the border, which may be a pixel off even where the share of instrument ([H, W] in [0, 1]) is
+    discontinuous, or are within `edge_width` of it with a share between `clear_shares`. The image border is not an
+    edge.
     """
     edge = np.zeros(mask.shape, dtype=bool)
     reach = float(LABELS.edge_width * np.hypot(*mask.shape))
@@ -181,7 +181,7 @@ def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def without_small_components(mask: np.ndarray, share: float) -> np.ndarray:
     """Return the mask without the (edge-connected) components smaller than `share` of its largest."""
     count, components, statistics, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=4)
-    if count < 3:  # the background is the first
+    if count < 3:  # label 0 is the background
         return mask
     areas = statistics[:, cv2.CC_STAT_AREA]
     keep = areas >= share * areas[1:].max()
@@ -252,13 +252,13 @@ def _drop_small_components(
 
 
 def shows_any(parts: np.ndarray, ids: Sequence[int]) -> np.ndarray:
-    """Return bool [H, W]: the pixels of a part image (uint8 [H, W]) that have one of these ids."""
+    """Return bool [H, W]: pixels of a part image (uint8 [H, W]) with one of these ids."""
     chosen = np.zeros(256, dtype=np.uint8)
     chosen[list(ids)] = 1
     return cv2.LUT(parts, chosen).view(bool)
 
 
 def distances_to(pixels: np.ndarray) -> np.ndarray:
-    """Return distances [H, W] px, between centres, to the nearest of the pixels (bool [H, W]), huge without any;
-    exact (Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012)."""
+    """Return distances [H, W] px, between centres, to the nearest of the pixels (bool [H, W]), huge without any; exact
+    (Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012)."""
     return cv2.distanceTransform((~pixels).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -1,8 +1,8 @@
-"""Labels of pixels: the instrument and part that each shows.
+"""Labels of pixels: instrument and part.
 
-`CompositedLabels` (the default, which evaluation scores): every Gaussian carries the instrument and part that it
-belongs to, and compositing handles occlusion by tissue and other instruments. `ThresholdLabels` (the paper's): what
-moves is the instrument, without parts and occlusion.
+`CompositedLabels` (the default, which evaluation scores): every Gaussian carries its instrument and part, and
+compositing handles occlusion by tissue and other instruments. `ThresholdLabels` (the paper's): whatever moves is the
+instrument, without parts and occlusion.
 """
 
 from __future__ import annotations
@@ -51,18 +51,18 @@ def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, T
             "labels: the image was rendered without label channels; render it with channels=scene.label_channels()"
         )
     channels = channels.detach()
-    # PyTorch takes four times as long for a pixel's few numbers as for whole columns; up to 4 its order is the same
+    # for the few values per pixel, PyTorch is four times faster on columns; up to 4, its order of summation is the same
     few = 0 < channels.shape[-1] <= 4
     share = sum(channels.unbind(-1)[1:], start=channels[..., 0].clone()) if few else channels.sum(dim=-1)
     parts = torch.zeros(share.shape, dtype=torch.uint8, device=share.device)
     if channels.shape[-1] > 0:
-        chosen = (share > threshold).flatten().nonzero()[:, 0]  # argmax is slow: of few pixels
+        chosen = (share > threshold).flatten().nonzero()[:, 0]  # only foreground pixels, as argmax is slow
         parts.view(-1)[chosen] = (channels.flatten(0, 1)[chosen].argmax(dim=-1) + 1).to(torch.uint8)
     return parts, share
 
 
 class CompositedLabels:
-    """Labels from what every Gaussian carries (`scene.label_channels()`).
+    """Labels from the Gaussians' own label weights (`scene.label_channels()`).
 
     names: (instrument, part) of part id 1, 2, ...
     """
@@ -111,7 +111,7 @@ class CompositedLabels:
 class DeltaThresholds:
     """Magnitudes above which a Gaussian counts as moved: position (mm), rotation (quaternion), scale (mm).
 
-    A kind of delta that is the same for all Gaussians has no threshold.
+    None for a kind of delta that is the same for all Gaussians.
     """
 
     means: float | None
@@ -119,14 +119,14 @@ class DeltaThresholds:
     scales: float | None
 
     def moved(self, magnitudes: dict[str, Tensor]) -> Tensor:
-        """Return [N] bool: which Gaussians exceed every threshold there is."""
+        """Return [N] bool: which Gaussians exceed all thresholds that are set."""
         tests = [magnitudes[kind] > limit for kind, limit in vars(self).items() if limit is not None]
         return torch.stack(tests).all(dim=0)
 
 
 class ThresholdLabels:
-    """The paper's labels: Gaussians whose deltas exceed thresholds are rendered alone on black, whose other pixels are
-    the mask. The paper has one instrument; of several, the nearest owns a moved Gaussian."""
+    """The paper's labels: Gaussians whose deltas exceed thresholds are rendered alone on black, and all other than
+    black pixels are the mask. The paper has one instrument; of several, the nearest owns a moved Gaussian."""
 
     def __init__(self, scene: GaussianScene, thresholds: DeltaThresholds | None = None) -> None:
         instruments = tuple(instrument.name for instrument in scene.instruments)
@@ -158,7 +158,7 @@ class ThresholdLabels:
         unobserved: Tensor | None = None,
         alone: Sequence[Tensor] = (),
     ) -> tuple[Rendering, Tensor, Tensor]:
-        """Render as `CompositedLabels` does; ids and share (the alpha) are from the moved Gaussians alone."""
+        """Render like `CompositedLabels`; ids and share (the alpha) are from the moved Gaussians alone."""
         moved = owners >= 0
         shares = torch.nn.functional.one_hot(owners[moved], len(self.names)).to(gaussians.means)
         instruments = rasterize(gaussians.select(moved), camera, channels=shares)

@@ -1,4 +1,4 @@
-"""Settings of labels. Imports nothing heavy, as those of data sets, which take a default from here, do not."""
+"""Settings of labels. Imports nothing heavy, as the settings of data sets, which take a default from here."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class LabelSettings:
-    """Thresholds of the labels of pixels, and limits of those of an image."""
+    """Thresholds of pixel labels, and limits of image labels."""
 
     # The instrument's moving shadow is learned with labels of 0.3 to 0.5, so that 0.5 is too low; 0.65 to 0.7 is best.
     threshold: float = 0.65
@@ -23,12 +23,12 @@ class LabelSettings:
     # Of the image's diagonal: 3 px of 320 x 256. Without it, on two rendered captures, the band has 36% and 66% more
     # pixels, nearly all of them rightly labelled (the instrument's shadow on the tissue, mostly).
     edge_width: float = 0.008
-    magnification: int = 4  # at which contours along pixel edges are found
-    occlusion_mm: float = 1.0  # a surface of something else this much nearer than a keypoint hides it
-    self_occlusion_mm: float = 6.0  # the same of the instrument's own surface, inside which its keypoints lie
-    simplify_px: float = 0.8  # the pixels of a straight edge deviate less than this from its line
-    max_area_change: float = 0.02  # share by which a simpler polygon may change the area
-    min_component: float = 0.01  # of an instrument's largest: smaller ones are not labelled
+    magnification: int = 4  # factor by which masks are enlarged for contours along pixel edges
+    occlusion_mm: float = 1.0  # another surface this much nearer than a keypoint occludes it
+    self_occlusion_mm: float = 6.0  # the same for the instrument's own surface, as keypoints lie inside it
+    simplify_px: float = 0.8  # tolerance of polygons: below, a straight line's pixels would remain corners
+    max_area_change: float = 0.02  # maximum relative change of area by simplification
+    min_component: float = 0.01  # minimum share of an instrument's largest component for a component to be labelled
 
 
 LABELS = LabelSettings()

@@ -26,18 +26,18 @@ from neeco.scene.training_views import TrainingViews
 class BreathingSettings:
     """Settings of the search for breathing."""
 
-    n_harmonics: int = 2  # breath is no pure sine: the pause after breathing out is longer
+    n_harmonics: int = 2  # number of harmonics; the pause after exhalation makes breathing deviate from a sine
     n_control_points: int = 24  # of the tissue's motion
-    max_frames: int = 240  # in which displacements are measured
-    n_pixels: int = 96 * 77  # of the images in which they are measured: the motion is a pixel or two there
-    robust_scale: float = 0.04  # of white: larger residuals have little weight (instruments, highlights)
-    n_reweightings: int = 4  # of the robust fit
-    periods_s: tuple[float, float] = (1.5, 10.0)  # of breath
-    min_breaths: float = 2.0  # in the recording, so that the second confirms the first
-    oversampling: int = 8  # periods tried per independent frequency
-    n_folds: int = 4  # intervals of time, each of which is predicted from the others
-    min_explained: float = 0.5  # share of the displacement's variance in stretches that were left out
-    min_amplitude: float = 0.2  # mm, rms over time: less does not blur
+    max_frames: int = 240  # frames in which displacements are measured, at most
+    n_pixels: int = 96 * 77  # pixels of the images used for measuring; the motion is one or two px at this size
+    robust_scale: float = 0.04  # fraction of white; larger residuals (instruments, highlights) get little weight
+    n_reweightings: int = 4  # iterations of the robust fit
+    periods_s: tuple[float, float] = (1.5, 10.0)  # search range of the breathing period
+    min_breaths: float = 2.0  # minimum number of breaths in the recording
+    oversampling: int = 8  # candidate periods per independent frequency
+    n_folds: int = 4  # contiguous time intervals for cross-validation
+    min_explained: float = 0.5  # minimum share of variance explained on held-out intervals
+    min_amplitude: float = 0.2  # mm, RMS over time; smaller motion causes no visible blur
 
 
 BREATHING = BreathingSettings()
@@ -46,13 +46,12 @@ RATES = {"period": 5e-4, "swings": 2e-2}  # s and mm, Adam's at the start
 
 
 class Breathing(nn.Module):
-    """A displacement, mm, of tissue that rests at x: Fourier series in time at control points, between which weights w
-    (normalised radial basis functions, of sum 1) interpolate,
+    """Displacement, mm, of tissue at rest position x: Fourier series in time at control points, interpolated by
+    normalised radial basis functions w,
 
         u(x, t) = sum_k w_k(x) sum_h (a_hk cos(2 pi h t / T) + b_hk sin(2 pi h t / T)).
 
-    t is counted from the middle of the recording, where a change of the period moves least. At rest, its mean over a
-    breath, u is zero. No gradient reaches the weights: they change slowly in space.
+    t is 0 in the middle of the recording. u averages to zero over one breath. No gradient reaches the weights.
     """
 
     points: Tensor  # [K, 3] mm, world frame
@@ -69,8 +68,8 @@ class Breathing(nn.Module):
 
     @classmethod
     def of(cls, tissue: Tensor, period: float, swing: Tensor, origin: float) -> Breathing:
-        """Return a breathing that moves all of the tissue, points [P, 3] mm, by `swing` [2 `n_harmonics`, 3] mm (a_1,
-        b_1, …)."""
+        """Return a breathing motion of the tissue, points [P, 3] mm, that starts with `swing` [2 `n_harmonics`, 3] mm
+        (a_1, b_1, …) everywhere."""
         from scipy.cluster.vq import kmeans2  # slow to import
 
         places, _ = kmeans2(
@@ -96,8 +95,8 @@ class Breathing(nn.Module):
 
     @torch.no_grad()
     def describe(self, cameras: Sequence[Camera]) -> dict[str, float]:
-        """Return the period and the largest amplitude of any control point; across the line of sight alone where all
-        cameras were in one place, since motion along it is not observable."""
+        """Return the period and the largest amplitude over control points; if all cameras share one position, only the
+        component across the line of sight, as motion along it is not observable."""
         shares = torch.linspace(0, 1, 33).to(self.swings)
         moved = torch.stack([torch.einsum("w,wkd->kd", _waves(share), self.swings) for share in shares])  # [33, K, 3]
         centres = torch.stack([camera.world_from_camera[:3, 3] for camera in cameras]).to(self.points)
@@ -109,17 +108,16 @@ class Breathing(nn.Module):
 
 
 def _waves(breaths: Tensor) -> Tensor:
-    """Return cosine and sine [2 `n_harmonics`] of every harmonic after so many breaths []."""
+    """Return cosine and sine [2 `n_harmonics`] of every harmonic after `breaths` [] periods."""
     angles = 2 * math.pi * breaths * torch.arange(1, BREATHING.n_harmonics + 1, device=breaths.device)
     return torch.stack([angles.cos(), angles.sin()], 1).flatten()
 
 
 class BreathingTissue(nn.Module):
-    """Mixin of deformations whose tissue may breathe; without a `breathing` the tissue is static, and none is
-    stored."""
+    """Mixin of deformations whose tissue may breathe. Without a `breathing` module the tissue is static."""
 
     breathing: Breathing | None
-    may_breathe: bool = False  # whether training searches for it
+    may_breathe: bool = False  # whether training searches for breathing
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -155,8 +153,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Found:
-    """A period, s, the Fourier series [2 `n_harmonics`, 3] mm of the displacement from its time `origin` on (see
-    `Breathing`), and the share of the displacement's variance that it predicts in times that it was not fitted to."""
+    """Estimated period, s; Fourier series [2 `n_harmonics`, 3] mm of the displacement, from its time `origin` on (see
+    `Breathing`); and the share of variance explained on held-out times."""
 
     period: float
     swing: Array
@@ -165,8 +163,8 @@ class Found:
 
 
 def find_period(times: Array, shifts: Array) -> Found | None:
-    """Return the period of displacements `shifts` [F, 3] mm at `times` [F] s, in any order and at any intervals; None
-    where none predicts clearly."""
+    """Return the period of displacements `shifts` [F, 3] mm at `times` [F] s (unsorted, irregular); None where no
+    period predicts them."""
     duration = float(np.ptp(times)) if len(times) else 0.0
     longest = min(BREATHING.periods_s[1], duration / BREATHING.min_breaths)
     if len(times) < 8 * BREATHING.n_folds or longest <= BREATHING.periods_s[0]:
@@ -187,7 +185,7 @@ def find_period(times: Array, shifts: Array) -> Found | None:
 
 
 def _design(times: Array, frequency: float, harmonics: int) -> Array:
-    """[F, 1 + 2 harmonics]: a constant, then cosine and sine of every harmonic."""
+    """Return the design matrix [F, 1 + 2 harmonics]: a constant, then cosine and sine of every harmonic."""
     angles = 2 * np.pi * frequency * times[:, None] * np.arange(1, harmonics + 1)
     return np.column_stack(
         [np.ones(len(times)), np.stack([np.cos(angles), np.sin(angles)], -1).reshape(len(times), -1)]
@@ -195,36 +193,36 @@ def _design(times: Array, frequency: float, harmonics: int) -> Array:
 
 
 def _explained(times: Array, shifts: Array, frequency: float, harmonics: int) -> float:
-    """Return the share of the variance of each interval that a fit to the others predicts."""
+    """Return the share of variance explained on each interval by a fit to the others (cross-validation)."""
     design = _design(times, frequency, harmonics)
     fold = np.minimum(BREATHING.n_folds * (times - times.min()) / np.ptp(times), BREATHING.n_folds - 1).astype(int)
     error = 0.0
     for left_out in range(BREATHING.n_folds):
-        held = fold == left_out
-        fitted = np.linalg.lstsq(design[~held], shifts[~held], rcond=1e-6)[0]
-        error += float(((shifts[held] - design[held] @ fitted) ** 2).sum())
+        in_fold = fold == left_out
+        fitted = np.linalg.lstsq(design[~in_fold], shifts[~in_fold], rcond=1e-6)[0]
+        error += float(((shifts[in_fold] - design[in_fold] @ fitted) ** 2).sum())
     return 1 - error / max(float((shifts**2).sum()), 1e-12)
 
 
 @torch.no_grad()
 def find_breathing(tissue: GaussianScene, views: TrainingViews) -> tuple[Breathing, Found] | None:
-    """Estimate the breathing from one displacement of all tissue per frame; None without a period. `tissue`: a scene of
-    static tissue alone, learned from these views."""
+    """Estimate the breathing from one global displacement of the tissue per frame; None without a period. `tissue`: a
+    static scene of the tissue alone, learned from these views."""
     picked = range(0, len(views), max(1, -(-len(views) // BREATHING.max_frames)))
     times = np.array([views.frames[index].state.time for index in picked], np.float64)
     if np.ptp(times) < BREATHING.min_breaths * BREATHING.periods_s[0]:
         return None
     shifts = torch.stack([tissue_shift(tissue, views, index) for index in picked])
-    found = find_period(times, shifts.double().cpu().numpy())
-    if found is None:
+    periodic_motion = find_period(times, shifts.double().cpu().numpy())
+    if periodic_motion is None:
         return None
-    swing = torch.from_numpy(found.swing).to(tissue.canonical.means)
-    return Breathing.of(tissue.canonical.means, found.period, swing, found.origin), found
+    swing = torch.from_numpy(periodic_motion.swing).to(tissue.canonical.means)
+    return Breathing.of(tissue.canonical.means, periodic_motion.period, swing, periodic_motion.origin), periodic_motion
 
 
 def tissue_shift(tissue: GaussianScene, views: TrainingViews, index: int) -> Tensor:
-    """Return the displacement [3] mm, world frame, of all tissue that best explains frame `index` to first order,
-    together with a gain per colour; pixels that neither explains have little weight."""
+    """Return the displacement [3] mm, world frame, of the whole tissue that best explains frame `index` to first order,
+    jointly with a gain per colour channel; outlier pixels are down-weighted."""
     frame, target, mask = views.frames[index], views.target(index), views.mask(index)
     camera = frame.camera.within(BREATHING.n_pixels)
     width, height = camera.width, camera.height
@@ -245,8 +243,8 @@ def tissue_shift(tissue: GaussianScene, views: TrainingViews, index: int) -> Ten
     if not len(design):
         return fitted[:3]
     for _ in range(BREATHING.n_reweightings):
-        left = (residual - design @ fitted).square().mean(-1, keepdim=True)
-        weight = (1 + left / BREATHING.robust_scale**2) ** -2  # Geman and McClure
+        unexplained = (residual - design @ fitted).square().mean(-1, keepdim=True)
+        weight = (1 + unexplained / BREATHING.robust_scale**2) ** -2  # Geman and McClure
         weighted = (design * weight[..., None]).reshape(-1, 6)
         flat = design.reshape(-1, 6)
         normal = weighted.T @ flat

@@ -37,20 +37,20 @@ from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Perturbation, Posed, log_linear
 from neeco.scene.method import PLAIN_TRAINING
 
-MARGIN = 1.2  # the cube's side, in those of the points' longest
+MARGIN = 1.2  # side of the planes' cube relative to the longest side of the points' bounding box
 
 
 @dataclass(frozen=True, kw_only=True)
 class HexPlaneSettings:
     """Settings of the method."""
 
-    channels: int = 16  # of a plane, per resolution
-    resolution: int = 64  # of space, the lowest
-    levels: int = 2  # resolutions of space, each twice the one before
-    time_resolution: int = 25  # of time
-    width: int = 64  # of the network
-    warm_up: float = 3 / 17  # share of the training over which all of it is off
-    rate_scale: float = 5.0  # times the learning rates
+    channels: int = 16  # feature channels per plane and resolution
+    resolution: int = 64  # lowest spatial resolution
+    levels: int = 2  # number of spatial resolutions, each twice the previous
+    time_resolution: int = 25  # temporal resolution
+    width: int = 64  # width of the network
+    warm_up: float = 3 / 17  # share of the run before the deformation starts
+    rate_scale: float = 5.0  # factor on the learning rates
     space_smoothness: float = 1e-4  # weight in the loss
     time_smoothness: float = 1e-2  # weight in the loss
     time_l1: float = 1e-4  # weight in the loss
@@ -90,7 +90,7 @@ class HexPlane(LabelledByMotion):
         nn.init.xavier_uniform_(self.trunk.weight)
 
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
-        """Time from 0 to 1 over the recording; the cube about the points [P, 3]."""
+        """Normalise time to [0, 1] over the recording, and set the cube around the points [P, 3]."""
         self.times.fit(states)
         self.center, self.half_extent = robust_bounds(means)
 
@@ -107,7 +107,7 @@ class HexPlane(LabelledByMotion):
         return Posed(canonical.means + self.half_extent * d_means, canonical.quats + d_quats, scales)
 
     def rows_at(self, time: Tensor, noise: float = 0.0) -> list[Tensor]:
-        """The planes xt yt zt at `time`, a scalar in [0, 1]: [3, C, side] per resolution. `noise` is the standard
+        """Return the planes xt, yt, zt at `time`, a scalar in [0, 1]: [3, C, side] per resolution. `noise`: standard
         deviation of the compensation."""
         rows = []
         for plane in self.time:
@@ -120,18 +120,18 @@ class HexPlane(LabelledByMotion):
         return rows
 
     def features(self, positions: Tensor, rows: list[Tensor]) -> Tensor:
-        """[N, levels * C] of positions [N, 3] in [-1, 1] (beyond: as at the border) and the time's `rows`."""
+        """Return features [N, levels * C] of positions [N, 3] in [-1, 1] (clamped) and the time's `rows`."""
         pairs = torch.stack([positions[:, [0, 1]], positions[:, [0, 2]], positions[:, [1, 2]]])[:, None]  # [3, 1, N, 2]
         across = positions.T[:, None, :, None]
         lines = torch.cat([across, torch.zeros_like(across)], -1)  # [3, 1, N, 2]
-        found = []
+        products = []
         for plane, row in zip(self.space, rows, strict=True):
             space, time = _sample(plane, pairs), _sample(row[:, :, None], lines)  # [3, C, N]
-            found.append(space[0] * space[1] * space[2] * time[0] * time[1] * time[2])
-        return torch.cat(found).T
+            products.append(space[0] * space[1] * space[2] * time[0] * time[1] * time[2])
+        return torch.cat(products).T
 
     def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor:
-        """Second differences squared, of the planes of space and along time, and the distance of time's from 1."""
+        """Return squared second differences in space and time, and the distance of the temporal planes from 1."""
         weights: HexPlaneSettings = self.settings
         total = canonical.means.new_zeros(())
         for space, time in zip(self.space, self.time, strict=True):
@@ -154,7 +154,7 @@ class HexPlane(LabelledByMotion):
 
 
 def _head(width: int, size: int) -> nn.Sequential:
-    """Two layers from [N, width] to [N, size], the last one zero."""
+    """Return two layers from [N, width] to [N, size], the last one initialised to zero."""
     inner, last = nn.Linear(width, width), nn.Linear(width, size)
     nn.init.xavier_uniform_(inner.weight)
     nn.init.zeros_(last.weight)
@@ -163,11 +163,11 @@ def _head(width: int, size: int) -> nn.Sequential:
 
 
 def _sample(planes: Tensor, positions: Tensor) -> Tensor:
-    """Bilinear: planes [3, C, H, W] at positions [3, 1, N, 2] (along W, along H; -1 and 1 at the outer centres) to
-    [3, C, N]."""
+    """Sample planes [3, C, H, W] bilinearly at positions [3, 1, N, 2] (along W, along H; -1 and 1 at the outer
+    centres): [3, C, N]."""
     return nn.functional.grid_sample(planes, positions, align_corners=True, padding_mode="border")[:, :, 0]
 
 
 def _curvature(planes: Tensor) -> Tensor:
-    """Mean squared second difference of planes [3, C, H, W] along H, summed over the three."""
+    """Return the mean squared second difference of planes [3, C, H, W] along H, summed over the three."""
     return 3 * planes.diff(n=2, dim=2).square().mean()

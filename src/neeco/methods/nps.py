@@ -189,8 +189,8 @@ class NPS(LabelledByMotion):
     def begin(self, session: GaussianSession) -> None:
         if self.settings.seeds:
             with session.searching():
-                found = carve_seeds(session)
-            session.scene.canonical = self._with_seeds(session.scene.canonical, found)
+                carved = carve_seeds(session)
+            session.scene.canonical = self._with_seeds(session.scene.canonical, carved)
 
     def _with_seeds(self, canonical: CanonicalGaussians, found: Sequence[tuple[Tensor, float]]) -> CanonicalGaussians:
         """Return `canonical` with Gaussians on the carved instruments, given as points [P, 3] mm in each one's frame
@@ -217,12 +217,12 @@ class NPS(LabelledByMotion):
         rad."""
         kind, parts = kind or self.settings.state, []
         for index, instrument in enumerate(self.instruments):
-            given = state_of(instrument, state)
-            pose = given.pose.to(self.first_quats)
+            instrument_state = state_of(instrument, state)
+            pose = instrument_state.pose.to(self.first_quats)
             quat = matrix_to_quat(pose[:3, :3])
             quat = torch.where((quat * self.first_quats[index]).sum() < 0, -quat, quat)
             parts += {"full": [pose[:3, 3], quat], "rotation_jaw": [quat], "joints": []}[kind]
-            parts += [pose.new_full((1,), given.joints[name]) for name in instrument.joints]
+            parts += [pose.new_full((1,), instrument_state.joints[name]) for name in instrument.joints]
         return torch.cat(parts) if parts else self.first_quats.new_zeros(1)
 
     def state_vector(self, state: State) -> Tensor:

@@ -116,8 +116,8 @@ class TimeMLP(LabelledByMotion):
     def perturb(
         self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator
     ) -> Perturbation:
-        left = max(0.0, 1 - progress / self.settings.time_noise_stop)
-        noise = 0.0 if self.settings.synthetic else self.settings.time_noise * left
+        noise_share = max(0.0, 1 - progress / self.settings.time_noise_stop)
+        noise = 0.0 if self.settings.synthetic else self.settings.time_noise * noise_share
         return NoisyTime(perturbation.state_noise, noise) if noise else perturbation
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:

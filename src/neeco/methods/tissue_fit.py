@@ -111,11 +111,11 @@ def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, sha
     """
     search = session.config.deformation.carving
     views = posed_views(evidence, name, search)
-    own, _ = score_points(evidence, views.own, shape.seeds)
+    recorded_scores, _ = score_points(evidence, views.own, shape.seeds)
     other = views.exchanged_scores(shape.seeds)
-    moves = float(own.mean()) > search.motion_ratio * float(other.mean())
+    moves = float(recorded_scores.mean()) > search.motion_ratio * float(other.mean())
     session.scene.diagnostics.setdefault("instruments", {})[name] = {
-        "evidence": round(float(own.mean()), 4),
+        "evidence": round(float(recorded_scores.mean()), 4),
         "evidence_of_other_poses": round(float(other.mean()), 4),
         "moves_with_its_pose": moves,
     }

@@ -103,8 +103,8 @@ def pose_bodies(
     if kernel is None:
         return pose_bodies_reference(means, quats, log_scales, logits, counts, bodies)
     numbers = [None if body is None else body.numbers().to(means) for body in bodies]
-    how = [(0, 0, 0.0) if body is None else (body.link_count, body.slide_mask, body.roll) for body in bodies]
-    return _Pose.apply(kernel, means, quats, log_scales, logits, tuple(counts), how, *numbers)
+    body_arguments = [(0, 0, 0.0) if body is None else (body.link_count, body.slide_mask, body.roll) for body in bodies]
+    return _Pose.apply(kernel, means, quats, log_scales, logits, tuple(counts), body_arguments, *numbers)
 
 
 def pose_bodies_reference(

@@ -67,11 +67,9 @@ def _draw(
     means, quats, scales, opacities, sh, falloff, channels, left, vignette, world_from_camera, background = plain
     assert means is not None
     try:
-        drawing = native().Drawing(
-            means, quats, scales, opacities, sh, frames, falloff, vignette, left, channels, background,
-            world_from_camera,
-            camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
-        )  # fmt: skip
+        arrays = (means, quats, scales, opacities, sh, frames, falloff, vignette, left, channels, background)
+        view = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
+        drawing = native().Drawing(*arrays, world_from_camera, *view)
         height, width = camera.height, camera.width
         color = torch.empty(height, width, 3)
         alpha = torch.empty(height, width)

@@ -51,9 +51,9 @@ def device_failure(error: BaseException) -> str | None:
     message = _first_line(error)
     if isinstance(error, torch.cuda.OutOfMemoryError) or re.match("CUDA error: (out of memory|CUBLAS.*ALLOC)", message):
         asked = re.search(r"Tried to allocate ([\d.]+ \w+)", message)
-        there = re.search(r"total capacity of ([\d.]+ \w+) of which ([\d.]+ \w+) is free", message)
+        memory = re.search(r"total capacity of ([\d.]+ \w+) of which ([\d.]+ \w+) is free", message)
         numbers = [f"{asked[1]} more were asked for"] if asked else []
-        numbers += [f"{there[2]} of {there[1]} are free"] if there else []
+        numbers += [f"{memory[2]} of {memory[1]} are free"] if memory else []
         details = f" ({', '.join(numbers)})" if numbers else ""
         return (
             f"--device: the GPU's memory is full{details}: close what else uses it, take smaller budgets of Gaussians "

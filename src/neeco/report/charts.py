@@ -181,10 +181,8 @@ def line_chart(
         right = x - first > 0.75 * (last - first)
         axes.axvline(x, color=PALETTE["phase"], linewidth=1, dashes=(4, 3), gid="phase")
         offset, align = (-4 if right else 4, -12 if falling else 5), "right" if right else "left"
-        axes.annotate(
-            words, (x, 1 if falling else 0), offset, axes.get_xaxis_transform(), "offset points",
-            ha=align, color=PALETTE["phase"],
-        )  # fmt: skip
+        at, transform = (x, 1 if falling else 0), axes.get_xaxis_transform()
+        axes.annotate(words, at, offset, transform, "offset points", ha=align, color=PALETTE["phase"])
     return inline_svg(axes, f"{title} over {over}{', vertical axis cut' if cut else ''}")
 
 

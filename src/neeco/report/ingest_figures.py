@@ -1,4 +1,4 @@
-"""Figures of an ingested capture: sample frames with the tracked poses over them, and how its states are covered.
+"""Figures of an ingested capture: sample frames with overlaid poses, and the coverage of its states.
 
 Coverage is of every degree of freedom of every instrument, by split, with the range of the training frames.
 """
@@ -32,11 +32,11 @@ class FigureSettings:
     """Sizes of overlays and charts."""
 
     samples: int = 12  # number of frames shown
-    min_depth_mm: float = 1.0  # least depth in mm of points that are drawn
+    min_depth_mm: float = 1.0  # minimum depth in mm of points that are drawn
     axis_share: float = 0.16  # length of the frame axes as a share of the image's width
-    shaft_diameters: float = 30.0  # length drawn of a shaft from video, in diameters
+    shaft_diameters: float = 30.0  # drawn length of a shaft from video, in diameters
     bins: int = 24  # bins of a histogram
-    constant: float = 1e-6  # largest range in mm or deg that counts as one value
+    constant: float = 1e-6  # maximum range in mm or deg of a constant value
 
 
 SETTINGS = FigureSettings()
@@ -141,7 +141,7 @@ def _project(points: np.ndarray, pose: Tensor, camera: Camera) -> tuple[np.ndarr
 
 
 def round_length(wanted: float) -> float:
-    """Return the greatest of 1, 2, 5, 10, 20, ... that is not above `wanted`."""
+    """Return the greatest of 1, 2, 5, 10, 20, ... not above `wanted`."""
     power = 10.0 ** np.floor(np.log10(max(wanted, 1e-9)))
     return float(max(step * power for step in (1, 2, 5) if step * power <= wanted * 1.000001))
 
@@ -161,16 +161,15 @@ class Degree:
 
     @property
     def trained(self) -> tuple[float, float] | None:
-        """Lowest and highest value of the training frames; None when there are none."""
+        """Return the minimum and maximum of the training frames; None without any."""
         values = self.of("train")
         return (float(values.min()), float(values.max())) if len(values) else None
 
 
 def degrees_of_freedom(capture: Capture) -> list[Degree]:
-    """Position x, y, z mm; pitch, yaw, roll deg about the mean direction of the training frames; each joint.
+    """Return position x, y, z mm; pitch, yaw, roll deg about the mean direction of the training frames; each joint.
 
-    Pitch, yaw and roll are intrinsic rotations in that order about the tracked frame's x, y and z axis, away from the
-    mean.
+    Pitch, yaw and roll are intrinsic rotations in that order about the tracked frame's x, y and z axis, from the mean.
     """
     degrees = []
     for instrument in capture.instruments:
@@ -198,7 +197,7 @@ def degrees_of_freedom(capture: Capture) -> list[Degree]:
 
 
 def unvisited(degrees: Sequence[Degree]) -> list[str]:
-    """Stretches inside the trained range, a tenth of it or longer, that no training frame visits."""
+    """Return intervals inside the trained range, of at least a tenth of it, without a training frame."""
     sentences = []
     several = len({degree.instrument for degree in degrees}) > 1
     for degree in degrees:
@@ -216,7 +215,7 @@ def unvisited(degrees: Sequence[Degree]) -> list[str]:
 
 @page_style()
 def histogram(degree: Degree) -> str:
-    """Stacked bars of a degree of freedom, coloured by split, as inline SVG; what training lacks is shaded."""
+    """Return stacked bars of a degree of freedom, coloured by split, as inline SVG; gaps in training are shaded."""
     low, high = float(degree.values.min()), float(degree.values.max())
     trained = degree.trained
     caption = "never trained" if trained is None else f"trained {_number(trained[0])} … {_number(trained[1])}"

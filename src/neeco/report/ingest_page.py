@@ -68,8 +68,8 @@ class Ingested:
         verdict: list[str] = []
         if self.assessment is not None:
             lines.append(f"page: {self.output / PAGE}")
-            first, *others = self.assessment.lines()
-            verdict = [f"verdict: {first}", *others, self.assessment.conclusion]
+            first, *caveats = self.assessment.lines()
+            verdict = [f"verdict: {first}", *caveats, self.assessment.conclusion]
         stated = " ".join(verdict).casefold()
 
         def repeats(line: str) -> bool:
@@ -188,12 +188,12 @@ def _coverage(capture: Capture) -> dict[str, Any]:
     """Return the range of states: stretches without a training frame, and charts by instrument."""
     degrees = figures.degrees_of_freedom(capture)
     named = [name for name in capture.splits if name in figures.SPLIT_COLORS]
-    others = ", ".join(name for name in capture.splits if name not in named)
+    rest = ", ".join(name for name in capture.splits if name not in named)
     return {
         "degrees": degrees,
         "trained": any(degree.trained is not None for degree in degrees),
         "unvisited": figures.unvisited(degrees),
-        "split_colors": [(figures.SPLIT_COLORS[name], name) for name in named] + ([("soft", others)] if others else []),
+        "split_colors": [(figures.SPLIT_COLORS[name], name) for name in named] + ([("soft", rest)] if rest else []),
         "instruments": [
             {
                 "name": item.name,

@@ -64,7 +64,7 @@ IMAGE_SCORES = (
     Score("fps", "FPS", "{:.1f}", "Posed images rendered per second on the machine that evaluated."),
     Score("num_gaussians", "Gaussians", "{:,}", "Gaussians of the finished scene; finishing adds some, as of shafts."),
     Score("frames", "frames", "{}", "How many frames were scored."),
-)  # fmt: skip
+)
 LABEL_SCORES = (
     Score("mask_iou", "mask IoU", "{:.3f}", "Label mask against true mask: shared area over joint area; 1 is perfect."),
     Score("mask_precision", "mask precision", "{:.3f}", "How much of the label mask is truly instrument."),
@@ -72,7 +72,7 @@ LABEL_SCORES = (
     Score("estimated_iou", "estimated IoU", "{:.3f}", "The mask IoU, estimated from the images alone, without masks."),
     Score("shaft_recall", "recall on shafts", "{:.3f}", "How much of the true shafts is labelled instrument."),
     Score("shadow_labelled", "shadow labelled", "{:.1%}", "How much of the instruments' shadow on tissue is labelled."),
-)  # fmt: skip
+)
 SCORES = (*IMAGE_SCORES, *LABEL_SCORES)
 KINDS = {
     "given": "As given: rendered at the poses the capture states, tracker errors included",
@@ -192,12 +192,12 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
     tiles = []
     for split, numbers in evaluation["given"].items():
         if numbers["psnr"] is not None:
-            what = f"PSNR, {split} frames: similarity to the recorded (30 is close, 20 rough)"
-            tiles.append((f"{numbers['psnr']:.1f} dB", what))
+            meaning = f"PSNR, {split} frames: similarity to the recorded (30 is close, 20 rough)"
+            tiles.append((f"{numbers['psnr']:.1f} dB", meaning))
     for split, numbers in evaluation[labelled].items():
         if numbers["mask_iou"] is not None:
-            what = f"overlap of labels and true masks (IoU; 1 is perfect), {split} frames {KIND_NAMES[labelled]}"
-            tiles.append((f"{numbers['mask_iou']:.3f}", what))
+            meaning = f"overlap of labels and true masks (IoU; 1 is perfect), {split} frames {KIND_NAMES[labelled]}"
+            tiles.append((f"{numbers['mask_iou']:.3f}", meaning))
     doubts = evaluation.get("doubts", ())
     measured = any(numbers.get("estimated_iou") is not None for numbers in evaluation["given"].values())
     trust = "doubtful" if doubts else "no doubt" if measured else "unknown"

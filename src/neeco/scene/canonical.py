@@ -22,7 +22,7 @@ SH_COEFFICIENTS = 16  # degree 3
 class CanonicalGaussians:
     """Raw (unactivated) parameters, ordered by body: tissue first, then instrument 1, 2, ...
 
-    `extras` holds whatever per-Gaussian parameters a deformation adds ([N, ...] each); density control carries them
+    `extras` holds the per-Gaussian parameters that a deformation adds ([N, ...] each), which density control carries
     along.
     """
 
@@ -50,7 +50,7 @@ class CanonicalGaussians:
         """Body [N] int64 of each row; do not modify."""
         like = self.means
         rows = [like.new_full((count,), body, dtype=torch.int64) for body, count in enumerate(self.counts)]
-        return torch.cat(rows)  # filled on the device: copying the counts would wait for it
+        return torch.cat(rows)  # filled on the device: copying the counts would synchronise
 
     @cached_property
     def of_instruments(self) -> Tensor:
@@ -81,7 +81,7 @@ class CanonicalGaussians:
         return replace(self, extras={**self.extras, **extras})
 
     def spherical_harmonics(self, degree: int) -> Tensor:
-        """Return the harmonics [N, (degree + 1)^2, 3]; do not modify. Cached while no gradient is wanted."""
+        """Return the harmonics [N, (degree + 1)^2, 3]; do not modify. Cached without gradients."""
         if degree == 0:
             return self.sh_dc
         parts = self.sh_dc, self.sh_rest

@@ -24,12 +24,12 @@ from neeco.scene.method import Method
 
 @dataclass(frozen=True, kw_only=True)
 class DeformationSettings:
-    """Decay of learning rates, and what counts as moving."""
+    """Decay of learning rates, and the threshold of motion."""
 
     final_rate: float = 0.03  # of the initial learning rate, at the end (3DGS: 0.01; runs here are shorter)
     min_module_rate: float = 0.3  # of the initial learning rate: joints keep learning to the end
-    min_motion_mm: float = 1e-6  # a Gaussian that moves less is static
-    marking_stride: int = 4  # every fourth recorded state is used to find moving Gaussians
+    min_motion_mm: float = 1e-6  # maximum motion of a static Gaussian
+    marking_stride: int = 4  # stride of the recorded states used for detecting moving Gaussians
 
 
 DEFORMATION = DeformationSettings()
@@ -48,10 +48,10 @@ class Posed:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """Deliberate perturbation of a training step; rendering never perturbs. A method that perturbs more has a subclass.
+    """Perturbation of a training step; rendering is never perturbed. Methods with further perturbations subclass it.
 
-    `state_noise`: standard deviation added to the encoded state, or to the encoded time of a method that encodes the
-    time (the paper's compensation). Normal numbers come from torch's own generator.
+    `state_noise`: standard deviation added to the encoded state or time (the paper's compensation). Normal numbers come
+    from torch's own generator.
     """
 
     state_noise: float = 0.0
@@ -62,8 +62,8 @@ UNPERTURBED = Perturbation()
 
 @dataclass(frozen=True)
 class Deltas:
-    """Change of each Gaussian between two states of the scene, or from canonical to posed (the paper's d_mu,
-    d_r, d_s)."""
+    """Change of each Gaussian between two states of the scene, or from canonical to posed (the paper's d_mu, d_r,
+    d_s)."""
 
     means: Tensor  # [N, 3] mm
     quats: Tensor  # [N, 4]
@@ -133,31 +133,31 @@ class Deformation(nn.Module, Method):
         return ()
 
     def motion(self, canonical: CanonicalGaussians) -> ArticulatedMotion | None:
-        """Return the articulation where it determines all motion; None otherwise. Subclasses do not inherit it: they
-        may pose differently."""
+        """Return the articulation if it determines all motion, else None. Not inherited, as subclasses may pose
+        differently."""
         return None
 
     @classmethod
     def combined(cls, deformations: Sequence[Deformation]) -> Deformation:
-        """Return one deformation of the instruments of several deformations of this method, in their order."""
+        """Return one deformation for the instruments of several deformations of this method, in their order."""
         raise NotImplementedError
 
     def fit_extras(self, extras: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the method's per-Gaussian parameters, of a deformation that was combined into this one, in the shapes
-        of this one."""
+        """Return the method's per-Gaussian parameters, from a deformation combined into this one, in this one's
+        shapes."""
         return {}
 
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
-        """Set ranges by the recorded states and the points [P, 3] mm, once before training; nothing by default."""
+        """Set ranges from the recorded states and the points [P, 3] mm, once before training; nothing by default."""
 
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
-        """Return the method's per-Gaussian parameters [N, ...] of the initial Gaussians, the tissue's, by name; density
+        """Return the method's per-Gaussian parameters [N, ...] of the initial (tissue) Gaussians, by name; density
         control carries them along."""
         return {}
 
     def begin(self, session: Any) -> Mapping[str, KinematicTree] | None:
-        """Called once before the first step of a new scene (not on resume); may replace the canonical Gaussians. Where
-        it returns links of instruments, a scene in which these are stated takes the place of this one."""
+        """Prepare a new scene, once before the first step (not on resume); may replace the canonical Gaussians. If it
+        returns links of instruments, training restarts with a scene in which these are stated."""
         return None
 
     def perturb(
@@ -185,26 +185,25 @@ class Deformation(nn.Module, Method):
         return {}
 
     def between_steps(self, session: Any) -> None:
-        """Called after every step, which may be several iterations (`batch_size`)."""
+        """Run after every step, which may be several iterations (`batch_size`)."""
 
     def act(self, session: Any, action: str) -> None:
-        """Called after `between_steps` where an event of `schedule.events` is due, with its action, one of
-        `actions`."""
+        """Perform `action`, one of `actions`, of an event of `schedule.events` that is due; after `between_steps`."""
 
     def finish(self, session: Any) -> None:
-        """Called after the last step; may replace the canonical Gaussians."""
+        """Run after the last step; may replace the canonical Gaussians."""
 
 
 class LabelledByMotion(Deformation):
-    """Deformation with one label column, "instrument", for all instruments together (none without any): the Gaussians
-    that move in the trained scene."""
+    """Deformation with one label column, "instrument", for all instruments (none without any): the Gaussians that move
+    in the trained scene."""
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: Any = None) -> None:
         super().__init__(instruments, settings)
         self.label_names = (("+".join(i.name for i in instruments), "instrument"),) if instruments else ()
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
-        """Return the moving Gaussians [N, len(label_names)] found by `finish`; zeros before that."""
+        """Return the moving Gaussians [N, len(label_names)] detected by `finish`; zeros before that."""
         if MEMBERSHIP not in canonical.extras or not self.label_names:
             return super().label_channels(canonical)
         return canonical.extras[MEMBERSHIP][:, None]
@@ -223,7 +222,7 @@ def mark_moving(deformation: Deformation, canonical: CanonicalGaussians, states:
     moved = torch.stack([deformation.deltas(canonical, state).means for state in states])  # [F, N, 3]
     spread = (moved - moved.mean(0)).square().sum(-1).mean(0).sqrt()
     size = spread.clamp_min(DEFORMATION.min_motion_mm).log()
-    evaluated = spread > DEFORMATION.min_motion_mm  # those that nothing moves would be a second cluster of their own
+    evaluated = spread > DEFORMATION.min_motion_mm  # static Gaussians would form a separate cluster
     threshold = otsu(size[evaluated]) if evaluated.any() else math.inf
     return canonical.with_extras(**{MEMBERSHIP: (size > threshold).float()})
 
@@ -240,7 +239,7 @@ def otsu(values: Tensor, bins: int = 256) -> float:
     sums = np.cumsum(counts * (edges[:-1] + edges[1:]) / 2)
     mean_below, mean_above = sums[:-1] / np.maximum(below, 1), (sums[-1] - sums[:-1]) / np.maximum(above, 1)
     between = below * above * (mean_below - mean_above) ** 2
-    best = np.flatnonzero(between >= between.max() * (1 - 1e-9))  # a gap is a plateau
+    best = np.flatnonzero(between >= between.max() * (1 - 1e-9))  # a gap between classes is a plateau
     return float(edges[1 + round(float(best.mean()))])
 
 

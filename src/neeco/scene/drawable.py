@@ -1,5 +1,4 @@
-"""Interface of learned scenes, whether of Gaussians or a radiance field, and the recording that they were learned
-from."""
+"""Interface of learned scenes (Gaussians or a radiance field), and the recording that they were learned from."""
 
 from __future__ import annotations
 
@@ -19,8 +18,8 @@ from neeco.geometry.lens import Lens
 from neeco.raster.types import Rendering
 
 Skeleton = tuple[tuple[str, str], ...]  # pairs of keypoints' names that a line joins
-LIMIT_RANGES = 2.0  # recorded ranges beyond the recorded values that limit a joint without stated limits
-N_NEIGHBOURS = 4  # training frames from which an unrecorded joint is interpolated
+LIMIT_RANGES = 2.0  # limits of a joint without stated ones: its recorded range, extended on both sides by this multiple
+N_NEIGHBOURS = 4  # training frames for interpolating an unrecorded joint
 
 
 @dataclass(frozen=True)
@@ -42,10 +41,10 @@ class Recorded:
     states: tuple[State, ...] = ()
     cameras: tuple[Camera, ...] = ()
     _: KW_ONLY
-    lens: Lens | None = None  # whose distortion was removed from the images; None: not known
-    scale: float = 1.0  # of the cameras' images, at which the scene was learned
+    lens: Lens | None = None  # lens whose distortion was removed from the images; None: unknown
+    scale: float = 1.0  # scale of the images at which the scene was learned
     still: bool = False  # whether the camera did not move
-    error_scale: float = 0.0  # of its states' errors, in units of a robot's usual ones; 0: no larger than a tracker's
+    error_scale: float = 0.0  # size of state errors in units of a robot's usual ones; 0: no larger than a tracker's
 
     @classmethod
     def of(
@@ -71,7 +70,7 @@ class Recorded:
         return cls(names, splits, tuple(states), cameras, lens=lens, scale=scale, still=still)
 
     def as_fitted(self, capture: Capture) -> Capture:
-        """Return `capture`, which the scene learned from, with training frames' states as fitted to their images."""
+        """Return `capture`, which the scene was learned from, with training states as fitted to their images."""
         fitted = dict(zip(self.names, self.states, strict=True))
         frames = []
         for frame in capture.frames:
@@ -83,8 +82,8 @@ class Recorded:
         return replace(capture, frames=tuple(frames))
 
     def completed(self, capture: Capture, instruments: Sequence[Instrument]) -> Capture:
-        """Return `capture`, of the scene's `instruments`, with the joints that neither recording states, interpolated
-        from the training frames nearest to each frame."""
+        """Return `capture`, of the scene's `instruments`, with joints that neither recording states interpolated from
+        the nearest training frames."""
         unstated = {item.name: set(item.unrecorded) for item in capture.instruments}
         incomplete = [
             replace(item, unrecorded=tuple(joint for joint in item.unrecorded if joint in unstated[item.name]))
@@ -117,12 +116,12 @@ class Recorded:
 
     @cached_property
     def _poses(self) -> dict[str, RecordedStates]:
-        """The recorded poses of every instrument."""
+        """Return the recorded poses of every instrument."""
         return {name: RecordedStates(self.states, [name], joints=False) for name in self.states[0].instruments}
 
     def with_limits(self, instruments: Sequence[Instrument]) -> tuple[Instrument, ...]:
-        """Return the instruments with limits for joints that state none: LIMIT_RANGES recorded ranges beyond the
-        recorded values."""
+        """Return the instruments with limits for joints without stated ones: the recorded values, extended on both
+        sides by LIMIT_RANGES recorded ranges."""
         limited = []
         for item in instruments:
             joints = dict(item.joints)
@@ -134,7 +133,7 @@ class Recorded:
         return tuple(limited)
 
     def as_learned(self, camera: Camera) -> Camera:
-        """Return the camera with the focal length of the training images that is nearest its own, unless it has one."""
+        """Return the camera with the nearest focal length of the training images, unless its own is in their range."""
         if camera.learned_fx is not None:
             return camera
         least, most = self._learned_focal
@@ -143,7 +142,7 @@ class Recorded:
 
     @cached_property
     def _learned_focal(self) -> tuple[float, float]:
-        """Smallest and largest focal length, px, of the training images; 0 and infinity without any."""
+        """Return the smallest and largest focal length, px, of the training images; 0 and infinity without any."""
         focal = [self.scale * camera.fx for camera in self.cameras]
         return min(focal, default=0.0), max(focal, default=math.inf)
 
@@ -171,7 +170,7 @@ class DrawableScene(Protocol):
 
     @property
     def casts_shadow(self) -> bool:
-        """Whether the instruments' shadow is rendered as a shadow, so that none is learned as a faint part of them."""
+        """Whether the instruments' shadow is rendered explicitly, so that none is learned as a faint part of them."""
 
     @property
     def label_names(self) -> Sequence[tuple[str, str]]:
@@ -179,14 +178,13 @@ class DrawableScene(Protocol):
 
     @property
     def num_gaussians(self) -> int | None:
-        """Number of Gaussians; None: the scene has none."""
+        """Number of Gaussians; None: a scene without Gaussians."""
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
-        """Render `state` as the recorded `camera` observes it; `labels`: with label channels, where the scene has
-        any."""
+        """Render `state` from the recorded `camera`; `labels`: with label channels, if the scene has any."""
 
     def motion(self) -> ArticulatedMotion | None:
-        """Return the articulation where it determines all motion; None otherwise."""
+        """Return the articulation if it determines all motion, else None."""
 
     def torch_threads(self) -> AbstractContextManager[None]:
         """Use the number of torch's threads that renders the scene fastest."""
@@ -196,7 +194,7 @@ class DrawableScene(Protocol):
         """The method's own settings."""
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return (tensors, JSON-able fields) that a file needs in addition to the state of its modules."""
+        """Return (tensors, JSON-able fields) to store in addition to its modules' state."""
 
     def named_parameters(self) -> Any: ...
     def named_buffers(self) -> Any: ...

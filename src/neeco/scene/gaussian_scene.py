@@ -27,7 +27,7 @@ from neeco.scene.method import Stored
 from neeco.scene.state_corrections import StateCorrections
 from neeco.scene.visibility import VISIBILITY, measure_visibility, unobserved_share
 
-MAX_LAMPS = 3  # as many as a laparoscope has light guides
+MAX_LAMPS = 3  # a laparoscope has up to three light guides
 INITIAL_SHADOW_WIDTH = 0.01  # slope
 CANONICAL_SHAPES = {  # of one Gaussian
     "means": (3,),
@@ -40,16 +40,15 @@ CANONICAL_SHAPES = {  # of one Gaussian
 
 
 class GaussianScene(nn.Module):
-    """A learned scene of Gaussians: `at` poses them in a state, whatever the method; `render` renders them.
+    """A learned scene of Gaussians: `at` poses them in a state, for any method; `render` renders them.
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
-    in mm, log scale about `center`), applied to every instrument pose; zero unless refined.
-    `base_corrections` [I, 6] correct each instrument's poses before that (rotation vector in rad about `center`,
-    translation in mm): the error of its robot's base, zero unless found from the images. Before both,
-    `state_corrections` correct poses and readings by what depends on the state.
-    `falloff` (tissue, instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`,
-    `shadow_strengths` (0: no such lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`).
-    `background` in [0, 1] is the grey behind everything.
+    in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `base_corrections` [I, 6]
+    correct each instrument's poses before that (rotation vector in rad about `center`, translation in mm): the error of
+    its robot's base, zero unless estimated from the images. Before both, `state_corrections` apply state-dependent
+    corrections of poses and readings. `falloff` (tissue, instruments) and `vignette` are the headlight (see
+    `Headlight`), `shadow_offsets`, `shadow_strengths` (0: unused lamp) and `shadow_width` the instruments' shadows on
+    the tissue (see `Shadow`). `background` in [0, 1] is the grey behind everything.
     """
 
     has_gaussians = True
@@ -151,16 +150,16 @@ class GaussianScene(nn.Module):
         )
 
     def visibility(self) -> Tensor:
-        """Return the visibility [N, 12] of each Gaussian in the training frames (see `neeco.scene.visibility`),
-        measured at the end of training, or else here once."""
+        """Return the visibility [N, 12] of each Gaussian in the training frames (see `neeco.scene.visibility`), as
+        measured at the end of training, or computed once here."""
         if VISIBILITY not in self.canonical.extras:
             measured = measure_visibility(self.canonical, self.recorded, self.at)
             self.canonical = self.canonical.with_extras(**{VISIBILITY: measured})
         return self.canonical.extras[VISIBILITY]
 
     def unobserved(self, posed: Gaussians, camera: Camera) -> Tensor:
-        """Return the share [N] in [0, 1] by which each posed Gaussian, viewed by `camera`, is unobserved: by any
-        training frame, or from a similar direction."""
+        """Return the share [N] in [0, 1] of each posed Gaussian, viewed by `camera`, that no training frame observed
+        from a similar direction."""
         return unobserved_share(self.visibility(), posed, camera)
 
     @property
@@ -199,13 +198,12 @@ class GaussianScene(nn.Module):
         return dataclasses.replace(state, instruments=moved)
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
-        """Render `state` as the recorded `camera` observes it, differentiable; `labels`: with label channels, if
-        any."""
+        """Render `state` from the recorded `camera`, differentiable; `labels`: with label channels, if any."""
         channels = self.label_channels() if labels and self.label_names else None
         return rasterize(self.at(state), camera, channels=channels)
 
     def motion(self) -> ArticulatedMotion | None:
-        """Return the articulation where it determines all motion; None otherwise."""
+        """Return the articulation if it determines all motion, else None."""
         return self.deformation.motion(self.canonical)
 
     def torch_threads(self) -> AbstractContextManager[None]:
@@ -240,8 +238,8 @@ class GaussianScene(nn.Module):
 
 
 def _moved_about(center: Tensor, pose: Tensor, vector: Tensor, scale: Tensor | None = None) -> Tensor:
-    """Return a pose [4, 4] moved by `vector` [6] (rotation vector in rad about `center` [3], translation in mm), after
-    its distance from there was multiplied by `scale`."""
+    """Return a pose [4, 4] scaled about `center` [3] by `scale`, then moved by `vector` [6] (rotation vector in rad
+    about `center`, translation in mm)."""
     correction = rigid_from_vector(vector)
     arm = pose[:3, 3] - center
     arm = arm if scale is None else arm * scale
@@ -256,8 +254,8 @@ def is_gaussian(scene: DrawableScene) -> TypeGuard[GaussianScene]:
 
 
 def require_gaussians(scene: DrawableScene, asked_by: str) -> GaussianScene:
-    """Return `scene`, which must consist of Gaussians. Raises NeecoError, in the words of the option or verb
-    `asked_by`, for a radiance field."""
+    """Return `scene`, which must consist of Gaussians. Raises NeecoError, naming the option or verb `asked_by`, for a
+    radiance field."""
     if not is_gaussian(scene):
         raise NeecoError(
             f"{asked_by}: method {scene.method} has no Gaussians to pose or label; use a run of another method, "
@@ -267,7 +265,7 @@ def require_gaussians(scene: DrawableScene, asked_by: str) -> GaussianScene:
 
 
 def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:
-    """Return the number of Gaussians per body. Raises ValueError where they do not fit; without instruments all do."""
+    """Return the number of Gaussians per body. Raises ValueError if invalid; without instruments, all are tissue."""
     fits = instruments == 0 or len(counts) in (1, 1 + instruments)
     if not fits or not all(isinstance(count, int) and count >= 0 for count in counts):
         raise ValueError(f"counts of {len(counts)} bodies do not fit {instruments} instruments")
@@ -275,7 +273,7 @@ def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:
 
 
 def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
-    """Return the Gaussians. Raises ValueError for shapes, types and numbers that do not fit."""
+    """Return the Gaussians. Raises ValueError for wrong shapes, types or numbers."""
     if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
         raise ValueError(f"{missing[0]} is missing")
     for name, tensor in tensors.items():

@@ -29,15 +29,15 @@ from neeco.scene.method import Stored
 from neeco.scene.method_registry import current_name, method_class, method_settings, without_removed
 
 SCHEMA = "neeco-scene/2"
-INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height", "near")  # of a recorded camera, in the order of the file
-ADDED_SINCE = {"base_corrections", "anchors", "weights", "lengths"}  # that files of SCHEMA may lack: zero
-FORMER_ERROR_SCALE = "scale_of_state_errors"  # where diagnostics of version 0.3 have what is `error_scale` now
-MAX_REASON = 200  # characters of an error's message
+INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height", "near")  # of a recorded camera, in file order
+ADDED_SINCE = {"base_corrections", "anchors", "weights", "lengths"}  # may be absent in files of SCHEMA: zero
+FORMER_ERROR_SCALE = "scale_of_state_errors"  # name of `error_scale` in diagnostics of version 0.3
+MAX_REASON = 200  # characters of an error message
 MAX_PIXELS = 2**26  # of a recorded image
-MAX_NUMBER = 1e10  # mm, rad, s (of Unix time, too) or px: larger numbers are damage
+MAX_NUMBER = 1e10  # mm, rad, s (including Unix time) or px: larger numbers indicate damage
 # what stands for unknown in a tensor of that name: not every shaft has a known end
 UNKNOWN = {"wrist_start": -math.inf, "radius": math.inf, "closed": math.nan, "tips": math.nan}
-# errors that reading a damaged file raises; endless nesting is a RuntimeError
+# errors raised for damaged files; endless nesting is a RuntimeError
 DAMAGED = (SafetensorError, OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
 HEADER = {  # fields of every scene's header, whatever its method
     "method": str,
@@ -95,8 +95,8 @@ def load_scene(path: Path) -> DrawableScene:
 
 
 def load_gaussians(path: Path, asked_by: str, device: torch.device | None = None) -> GaussianScene:
-    """Read a scene of Gaussians onto `device` (None: the CPU). Raises NeecoError as `load_scene` does and, in the words
-    of the option or verb `asked_by`, for a radiance field."""
+    """Read a scene of Gaussians onto `device` (None: the CPU). Raises NeecoError as `load_scene` does and, naming the
+    option or verb `asked_by`, for a radiance field."""
     scene = require_gaussians(load_scene(path), asked_by)
     return scene if device is None else scene.to(device)
 
@@ -168,7 +168,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Drawable
 
 
 def require_numbers(tensors: Mapping[str, Tensor]) -> None:
-    """Raise ValueError for a tensor that holds a number that cannot be learned, other than its UNKNOWN."""
+    """Raise ValueError for a tensor with a number that cannot be learned, except its UNKNOWN value."""
     for name, tensor in tensors.items():
         if tensor.is_floating_point():
             unknown = UNKNOWN.get(name.rpartition(".")[2])

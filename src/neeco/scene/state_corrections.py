@@ -47,8 +47,8 @@ class StateCorrections(nn.Module):
         super().__init__()
         self.names = tuple(item.name for item in instruments)
         self.readings = tuple(recorded_readings(item) for item in instruments)
-        units = [[CORRECTIONS.slide_mm if item.slides(reading) else CORRECTIONS.angle_rad for reading in readings]
-                 for item, readings in zip(instruments, self.readings, strict=True)]  # fmt: skip
+        slide, angle = CORRECTIONS.slide_mm, CORRECTIONS.angle_rad
+        units = [[slide if item.slides(name) else angle for name in recorded_readings(item)] for item in instruments]
         self._units = units
         most = max(map(len, self.readings), default=0)
         zeros = partial(torch.zeros, device=device)
@@ -60,8 +60,8 @@ class StateCorrections(nn.Module):
     def features(self, index: int, state: InstrumentState) -> Tensor:
         """Return the features [F] of a state of instrument `index`, differences of which are compared by kernels."""
         pose = state.pose.detach().to(self.anchors)
-        joints = [float(torch.as_tensor(state.joints[reading]).detach()) / unit
-                  for reading, unit in zip(self.readings[index], self._units[index], strict=True)]  # fmt: skip
+        readings = [float(torch.as_tensor(state.joints[reading]).detach()) for reading in self.readings[index]]
+        joints = [reading / unit for reading, unit in zip(readings, self._units[index], strict=True)]
         joints += [0.0] * (self.anchors.shape[2] - N_POSE_FEATURES - len(joints))
         rotation = pose[:3, :3].flatten() / (2**0.5 * CORRECTIONS.angle_rad)
         return torch.cat([pose[:3, 3] / CORRECTIONS.position_mm, rotation, pose.new_tensor(joints)])

@@ -43,31 +43,31 @@ DIRECTIONS = tuple(  # the corners of an icosahedron, unit
 
 @dataclass(frozen=True, kw_only=True)
 class VisibilitySettings:
-    """Settings of what counts as observed, and of tissue extrapolated beyond it."""
+    """Thresholds of observation, and settings of extrapolated tissue."""
 
-    sharpness: int = 4  # power of the cosine by which a view counts for a direction: half at 33 degrees
-    half_visibility: float = 0.002  # share of the average Gaussian's visibility at which one is half unobserved
-    min_pixels: float = 1e-6  # visibility of the average Gaussian, at least
-    max_frames: int = 128  # evenly spaced and reduced to REFERENCE_PIXELS; neighbouring frames observe the same
+    sharpness: int = 4  # power of the cosine that weights a view for a direction: half at 33 degrees
+    half_visibility: float = 0.002  # share of the mean visibility at which a Gaussian is half unobserved
+    min_pixels: float = 1e-6  # minimum of the mean visibility
+    max_frames: int = 128  # evenly spaced, reduced to REFERENCE_PIXELS; adjacent frames observe the same
     # extrapolation
     cell: float = 1 / 40  # spacing of extrapolated Gaussians, in image widths
-    max_distance: float = 0.4  # of extrapolated tissue from the recorded border, in image widths
-    grid_margin: float = 1.5  # of the grid to each side of the middle camera's image, in its size
-    depth_factor: float = 1.1  # of extrapolated depths, so that observed tissue stays in front
+    max_distance: float = 0.4  # from the observed border, in image widths
+    grid_margin: float = 1.5  # margin on each side of the middle camera's image, relative to its size
+    depth_factor: float = 1.1  # factor on extrapolated depths, so that observed tissue stays in front
     cell_sd: float = 0.7  # standard deviation of an extrapolated Gaussian, in cells
     opacity: float = 0.98  # of an extrapolated Gaussian
-    min_frame_share: float = 0.05  # of the frames, that must observe the source tissue
+    min_frame_share: float = 0.05  # minimum share of frames that observe the source tissue
     # standard deviations, tried until `min_known_share` is reached
     smoothing_cells: tuple[float, ...] = (1.5, 3.0, 6.0, 12.0, 24.0)
-    min_known_share: float = 0.05  # of the cells around one, that must be known
+    min_known_share: float = 0.05  # minimum share of known cells in a neighbourhood
 
 
 SETTINGS = VisibilitySettings()
 
 
 def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Callable[[State], Gaussians]) -> Tensor:
-    """Measure the pixels [N, 12] by which the recorded frames observed each Gaussian, posed by `at`, from each of
-    `DIRECTIONS`, relative to the average Gaussian; zero for extrapolated tissue."""
+    """Return the pixels [N, 12] by which the recorded frames observed each Gaussian, posed by `at`, from each of
+    `DIRECTIONS`, relative to the mean Gaussian; zero for extrapolated tissue."""
     pixels = canonical.means.new_zeros((), dtype=torch.float64)
     visibility = canonical.means.new_zeros(len(canonical), len(DIRECTIONS))
     for index in evenly_spaced(len(recorded.cameras), SETTINGS.max_frames):
@@ -79,15 +79,14 @@ def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Ca
         pixels += observed.sum()
         visibility += observed[:, None] * toward
     visibility = visibility / max(float(pixels) / len(visibility), SETTINGS.min_pixels)
-    if EXTRAPOLATED in canonical.extras:  # its border reaches into recorded images
+    if EXTRAPOLATED in canonical.extras:  # its border extends into recorded images
         visibility *= 1 - canonical.extras[EXTRAPOLATED][:, None]
     return visibility
 
 
 def unobserved_share(visibility: Tensor, posed: Gaussians, camera: Camera) -> Tensor:
-    """Return the share [N] in [0, 1] by which each posed Gaussian, viewed by `camera`, is unobserved: 1 where no frame
-    observed it from a similar direction. `visibility`: by `measure_visibility`. float32 on the CPU takes the native
-    kernel."""
+    """Return the unobserved share [N] in [0, 1] of each posed Gaussian, viewed by `camera`: 1 if no frame observed it
+    from a similar direction. `visibility`: by `measure_visibility`. float32 on the CPU uses the native kernel."""
     if all_run_native(visibility, posed.means) and not torch.is_grad_enabled():
         frames = None if posed.sh_frames is None else posed.sh_frames.contiguous()
         centre = camera.world_from_camera[:3, 3].cpu().float()
@@ -118,8 +117,7 @@ def _directions(device: torch.device | str) -> Tensor:
 
 
 def visible_pixels(posed: Gaussians, camera: Camera) -> Tensor:
-    """Return the number [N] of the camera's pixels that every posed Gaussian covers: the gradient of a rendered channel
-    of 1."""
+    """Return the number [N] of pixels that every posed Gaussian covers: the gradient of a rendered channel of ones."""
     channel = torch.ones_like(posed.opacities)[:, None].requires_grad_()
     with torch.enable_grad():
         unlit = replace(posed, sh=posed.sh[:, :1], headlight=None)
@@ -139,11 +137,11 @@ def count_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 def outside_all_views(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
     """Return which points [P, 3] mm of the world project into none of the images, [P] bool."""
-    left = torch.arange(len(points), device=points.device)
+    unseen = torch.arange(len(points), device=points.device)
     for camera in cameras:
-        left = left[~in_image(points[left], camera)]
+        unseen = unseen[~in_image(points[unseen], camera)]
     outside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    outside[left] = True
+    outside[unseen] = True
     return outside
 
 
@@ -200,15 +198,15 @@ def _middle_camera(cameras: Sequence[Camera]) -> Camera:
 
 def _filled(sums: np.ndarray) -> np.ndarray:
     """Return means [rows, columns, V] of the known cells around every cell, from sums [rows, columns, 1 + V]: over the
-    smallest neighbourhood with enough of them, then smoothed."""
+    smallest sufficient neighbourhood, then smoothed."""
     means = np.zeros((*sums.shape[:2], sums.shape[2] - 1))
-    left = np.ones(sums.shape[:2], dtype=bool)
+    unfilled = np.ones(sums.shape[:2], dtype=bool)
     is_known = (sums[..., 0] > 0).astype(float)
     for sigma in SETTINGS.smoothing_cells:
         blurred = gaussian_filter(sums, (sigma, sigma, 0), mode="constant")
-        here = left & (gaussian_filter(is_known, sigma, mode="constant") > SETTINGS.min_known_share)
-        means[here] = blurred[here][:, 1:] / blurred[here][:, :1]
-        left &= ~here
+        fillable = unfilled & (gaussian_filter(is_known, sigma, mode="constant") > SETTINGS.min_known_share)
+        means[fillable] = blurred[fillable][:, 1:] / blurred[fillable][:, :1]
+        unfilled &= ~fillable
     mean = sums.sum((0, 1))
-    means[left] = mean[1:] / mean[0]
+    means[unfilled] = mean[1:] / mean[0]
     return gaussian_filter(means, (2.0, 2.0, 0), mode="nearest")

@@ -1,8 +1,8 @@
-"""Aligned scoring: instrument state and camera pose of one frame fitted to its recorded image, the scene frozen.
+"""Aligned scoring: instrument state and camera pose of one frame fitted to its recorded image, with a frozen scene.
 
-Trackers are off by about 1 mm, which moves the rendered instrument by pixels whatever the model does. Fitting the pose
-separates what the scene learned from the tracker's error. The fit runs coarse to fine and takes no gradient of the
-scene, so that every method is aligned in the same way.
+Tracker errors of about 1 mm shift the rendered instrument by pixels, whatever the model does. Fitting the pose
+separates the model's error from the tracker's. The fit is coarse to fine and uses no gradient of the scene, so that all
+methods are aligned in the same way.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class AlignConfig:
-    """Priors and effort of an alignment. Increments are rotation vector (rad) and translation (mm)."""
+    """Priors and effort of an alignment. Increments are rotation vectors (rad) and translations (mm)."""
 
     sigma_instrument_mm: float = 1.0
     sigma_instrument_deg: float = 0.5
-    sigma_joint_deg: float = 1.5  # of joints in stated kinematics: play and noise of encoders
-    sigma_joint_mm: float = 0.5  # of prismatic ones
+    sigma_joint_deg: float = 1.5  # joints in stated kinematics: backlash and encoder noise
+    sigma_joint_mm: float = 0.5  # prismatic joints
     sigma_camera_mm: float = 1.5
     sigma_camera_deg: float = 0.3
-    levels: tuple[float, ...] = (0.25, 0.5, 1.0)  # sizes of the images compared, coarse to fine
-    max_pixels: int = CROPS.max_pixels  # of the largest of them, to which larger images are reduced
-    steps: tuple[int, ...] = (3, 2, 2)  # Levenberg-Marquardt iterations at each
-    huber: float = 0.05  # colour residual beyond which the cost is linear: highlights and unobserved tissue
-    correlation_px: float = 100.0  # pixels that count as one observation, since residuals of neighbours correlate
-    step_mm: float = 0.1  # finite difference at the last level, larger at coarse ones
+    levels: tuple[float, ...] = (0.25, 0.5, 1.0)  # scales of the compared images, coarse to fine
+    max_pixels: int = CROPS.max_pixels  # maximum size of compared images; larger ones are reduced
+    steps: tuple[int, ...] = (3, 2, 2)  # Levenberg-Marquardt iterations per level
+    huber: float = 0.05  # colour residual beyond which the cost is linear (highlights, unobserved tissue)
+    correlation_px: float = 100.0  # pixels per independent observation, as neighbouring residuals are correlated
+    step_mm: float = 0.1  # finite-difference step at the last level, larger at coarse ones
     step_deg: float = 0.1
 
 
-# for states whose errors are larger than a tracker's: priors as wide, and steps enough to come from as far
+# for states with errors larger than a tracker's: wide priors, and enough steps for the distance
 WIDE = AlignConfig(
     sigma_instrument_mm=1.5, sigma_instrument_deg=3.0, sigma_joint_deg=4.0, sigma_joint_mm=1.5, steps=(10, 6, 4)
 )
@@ -56,7 +56,7 @@ WIDE = AlignConfig(
 
 @dataclass(frozen=True)
 class AlignedFrame:
-    """A frame's fitted state and camera, and the increments that led to them."""
+    """Fitted state and camera of a frame, and the increments from the recorded ones."""
 
     state: State
     camera: Camera
@@ -69,11 +69,11 @@ def align_frame(
 ) -> AlignedFrame:
     """Fit the state and camera of `frame` to its recorded `image` [H, W, 3].
 
-    Corrects every instrument's pose, the camera, and every joint in stated kinematics, with Gaussian priors at zero;
-    other joints and intrinsics stay. Pixels outside the frame's loss mask do not count. `start`: increments of a
-    neighbouring frame, from which the fit begins where they explain the image better than none. config: by default of
-    a tracker's errors, or WIDE where the scene's recording has larger ones. Takes about 7 * (6 * instruments + joints +
-    8) small renderings (WIDE: three times as many).
+    Corrects the camera, every instrument's pose and every joint in stated kinematics, with zero-mean Gaussian priors;
+    other joints and the intrinsics are fixed. Pixels outside the frame's loss mask are ignored. `start`: increments of
+    a neighbouring frame, used as the initial value if they explain the image better than zero. config: by default for a
+    tracker's errors, or WIDE if the scene's recording has larger ones. Costs about 7 * (6 * instruments + joints + 8)
+    small renderings (WIDE: three times as many).
     """
     config = config or (WIDE if scene.recorded.error_scale else AlignConfig())
     instruments = [item for item in scene.instruments if item.name in frame.state.instruments]
@@ -102,7 +102,7 @@ def align_frame(
 def _rendering(
     scene: GaussianScene, state: State, camera: Camera, parameters: StateParameters, steps: list[float]
 ) -> tuple[Render[Gaussians], Differences[Gaussians]]:
-    """Return `render` and `differences` of `minimise` for images of a `camera` of the recorded pose, with these finite
+    """Return `render` and `differences` of `minimise` for images of a `camera` with the recorded pose and these finite
     differences [P]."""
 
     def gaussians(at: Tensor) -> Gaussians:
@@ -116,7 +116,7 @@ def _rendering(
         return posed, image(posed, at)
 
     def differences(at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
-        # shadows, which move as little as what casts them, are rendered once for all differences
+        # shadows are rendered once for all differences, as they move as little as the casters
         still = shadowed(posed, _camera_at(camera, at), depth_maps)
         for index, step in enumerate(steps):
             moved = at.clone()
@@ -128,7 +128,7 @@ def _rendering(
 
 
 def _camera_at(camera: Camera, at: Tensor) -> Camera:
-    """Return the camera moved by the last six parameters, its pose as precise as before."""
+    """Return the camera moved by the last six parameters, at the precision of its pose."""
     moved = moved_camera(camera, at[-6:])
     return replace(moved, world_from_camera=moved.world_from_camera.to(camera.world_from_camera))
 
@@ -151,7 +151,7 @@ def _deviations(parameters: StateParameters, instruments: list[Instrument], conf
 
 
 def pose_changes(frame: Frame, state: State, camera: Camera) -> dict[str, dict[str, float]]:
-    """Return how far a fit moved every instrument, by name, and the `camera` (see `pose_change`)."""
+    """Return the motion of every instrument by a fit, by name, and of the `camera` (see `pose_change`)."""
     moved = {
         name: pose_change(start.pose, state.instruments[name].pose) for name, start in frame.state.instruments.items()
     }

@@ -1,8 +1,8 @@
-"""Single wrong states (mirrored, another moment's), found by what they leave unexplained of their image.
+"""Single wrong states (mirrored, or of another moment), detected by their large residuals.
 
-Outliers are found at once. Others may be wrong, too, though they are explained as well as right ones: a mirrored state
-looks alike, and the scene has learned from it. What seems wrong early may be a fault of the scene. So once the others'
-states are fitted, all that contradict them, or may be wrong, are judged again.
+Outliers are detected directly. Other states may be wrong although they fit as well: a mirrored state looks similar, and
+the scene has learned from it. Conversely, an early outlier may be an error of the scene. So once the remaining states
+are fitted, all contradicting or ambiguous ones are judged again.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ JUDGE = ContradictionSettings()
 
 @dataclass(frozen=True)
 class Misfits:
-    """Misfits of training frames in their present states, of several cameras the first one's; infinite where no
-    instrument is in the image. Above `limit` a state is an outlier, above `rejection_limit` a frame that no other state
-    explains is left out, above `suspect_limit` a state may be wrong."""
+    """Misfits of training frames in their present states (first camera of several); infinite where no instrument is in
+    the image. A state is an outlier above `limit`, may be wrong above `suspect_limit`, and a frame that no other state
+    explains is excluded above `rejection_limit`."""
 
     of_frame: dict[int, float]
     limit: float
@@ -64,7 +64,7 @@ class Misfits:
 
     @classmethod
     def of(cls, search: StateSearch) -> Misfits:
-        """Measure them. With few frames, or where half of them would be, there are no outliers."""
+        """Measure the misfits. Without outliers if there are few frames, or if half of them would be outliers."""
         firsts = [frames[0] for frames in search.refinement.frames_of_instant]
         misfits = {index: search.misfit(index, search.state(index)) for index in firsts}
         valid = torch.tensor([misfit for misfit in misfits.values() if math.isfinite(misfit)])
@@ -78,21 +78,21 @@ class Misfits:
 
     @property
     def outliers(self) -> list[int]:
-        """Frames whose states leave much more unexplained than those of the others."""
+        """Return the frames whose states have much larger misfits than the others."""
         return [index for index, misfit in self.of_frame.items() if self.limit < misfit < math.inf]
 
 
 def _limit(misfits: Tensor, many: float) -> float:
-    """Return the misfit that lies `many` robust standard deviations of the log misfits [F] above their median."""
+    """Return the misfit `many` robust standard deviations of the log misfits [F] above their median."""
     logs = misfits.clamp(1e-3, 1e3).log()
     spread = max(1.4826 * float((logs - logs.median()).abs().median()), JUDGE.min_spread)
     return math.exp(float(logs.median()) + many * spread)
 
 
 def refitted(search: StateSearch, index: int, fits: Sequence[StateFit]) -> tuple[StateFit, Tensor]:
-    """Return the best of a frame's `fits`, and, with stated links, of fits about the best one turned by half a turn
-    about its shaft, which has a similar outline; and standard deviations [P] that include the spread of those that it
-    does not refute."""
+    """Return the best of a frame's `fits`, including, with stated links, fits about the best one half turned about its
+    shaft, which has a similar outline; and standard deviations [P] that include the spread of the fits that it does not
+    refute."""
     precision, best = search.precision(index, JUDGE.start_scale), _best(fits)
     if search.linked:
         fits = [*fits, *_fits_near(search, index, half_turned_state(search, best.state))]
@@ -104,32 +104,32 @@ def refitted(search: StateSearch, index: int, fits: Sequence[StateFit]) -> tuple
 
 @torch.no_grad()
 def refit_outliers(search: StateSearch, scale: float, misfits: Misfits) -> None:
-    """Fit states that are outliers from other starts, or exclude them.
+    """Refit outlying states from other initial states, or exclude their frames.
 
     scale: of the errors of all states (see `StateSearch.fitted`).
     """
-    others = _states_of(search, [index for index, misfit in misfits.of_frame.items() if misfit <= misfits.limit])
+    good = _states_of(search, [index for index, misfit in misfits.of_frame.items() if misfit <= misfits.limit])
     for index in misfits.outliers:
         if search.refinement.verdict(index) is Verdict.ACCEPTED:
             recorded_fit = _own_fit(search, index, scale)
             if recorded_fit is None or recorded_fit.misfit > misfits.limit:
-                fits = _fits_from(search, index, _other_starts(search, index, others))
+                fits = _fits_from(search, index, _other_starts(search, index, good))
                 _judge(search, index, scale, recorded_fit, fits, misfits)
 
 
 @torch.no_grad()
 def judge_again(search: StateSearch) -> None:
-    """Compare states once more, when the states of the others are fitted: those that contradict the others, which are
-    used again as recorded where they no longer do, and those that may be wrong. None is left out by its misfit alone:
-    the limit sinks as all others are explained better."""
+    """Judge states again once the other states are fitted: those that contradict the others, which are accepted as
+    recorded if they no longer do, and those that may be wrong. No frame is excluded by its misfit alone, as the limit
+    decreases while all others improve."""
     refinement, recorded = search.refinement, search.scene.recorded
     misfits = replace(Misfits.of(search), rejection_limit=math.inf)
     suspects = _suspects(search, misfits)
-    others = _states_of(search, [index for index in range(len(recorded.names)) if refinement.counts(index)])
+    good = _states_of(search, [index for index in range(len(recorded.names)) if refinement.counts(index)])
     for index in misfits.of_frame:
         contradicts = refinement.verdict(index) is not Verdict.ACCEPTED
         if contradicts or index in suspects:
-            starts, recorded_fit = _other_starts(search, index, others), _own_fit(search, index, 1.0)
+            starts, recorded_fit = _other_starts(search, index, good), _own_fit(search, index, 1.0)
             if search.linked:
                 starts.append(mirrored_state(search, index, recorded.states[index]))
             if contradicts:
@@ -139,14 +139,14 @@ def judge_again(search: StateSearch) -> None:
 
 @torch.no_grad()
 def fitted_anew(search: StateSearch, index: int) -> tuple[StateFit, Tensor] | None:
-    """Return the fit of a frame whose recorded state is wrong, about its present one, as `refitted` does; None if it
+    """Return the fit of a frame with a wrong recorded state about its present one, as `refitted` does; None if it
     leaves the image."""
     fits = _fits_from(search, index, [search.state(index)])
     return refitted(search, index, fits) if fits else None
 
 
 def leave_out_unexplained(search: StateSearch, misfits: Mapping[int, float]) -> None:
-    """Exclude frames that were fitted anew and are outliers after the last fits: their states remain unknown.
+    """Exclude frames that were refitted and are outliers after the last fits: their states remain unknown.
 
     misfits: by frame index, of all frames that count.
     """
@@ -166,17 +166,16 @@ def _judge(
     others: Sequence[StateFit],
     misfits: Misfits,
 ) -> None:
-    """Refit the state of frame `index` where another explains its image much better, or exclude the frame where none
-    does. A frame judged so before is accepted again if no other state explains more of its image.
+    """Refit the state of frame `index` if another state explains its image much better, or exclude the frame if none
+    does. A frame with such a verdict is accepted again if no other state explains its image better.
 
-    fit: the best fit about the recorded state; None where it leaves the image, and its gain is 0. others: fits of other
-    states.
+    fit: the best fit about the recorded state; None if it leaves the image (gain 0). others: fits about other states.
     """
     refinement, recorded = search.refinement, search.scene.recorded.states[index]
     misfit, gain = (misfits.of_frame[index], 0.0) if fit is None else (fit.misfit, max(fit.gain, 0.0))
     best = _best(others) if others else None
     verdict = Verdict.ACCEPTED
-    # an instrument that is hardly in the image has a low misfit, too
+    # an instrument that is hardly in the image has a low misfit as well
     if best is not None and best.misfit < JUDGE.better * misfit and best.gain > gain:
         if _distance(search, index, recorded, best.state, scale) > JUDGE.min_distance:
             verdict = Verdict.REFITTED if best.misfit < misfits.limit else Verdict.EXCLUDED
@@ -194,8 +193,8 @@ def _judge(
 
 
 def _own_fit(search: StateSearch, index: int, scale: float) -> StateFit | None:
-    """Return the best fit of a frame with the prior about its recorded state, from several starts: a single fit may end
-    in a local minimum. None where all leave the image."""
+    """Return the best fit of a frame with the prior about its recorded state, from several initial states, as a single
+    fit may end in a local minimum. None if all leave the image."""
     recorded, precision = search.scene.recorded.states[index], search.precision(index, scale)
     starts = [recorded, search.state(index), *_sampled(search, index, recorded, precision, JUDGE.n_own)]
     return max(_fits(search, index, starts, precision, recorded), key=lambda fit: fit.gain, default=None)
@@ -210,8 +209,8 @@ def _sampled(search: StateSearch, index: int, state: State, precision: Tensor, c
 
 
 def _suspects(search: StateSearch, misfits: Misfits) -> list[int]:
-    """Return frames of instruments with stated links whose states may be wrong though they are no outliers: explained
-    worse than most, or not much better than the mirrored state, which is another one."""
+    """Return frames of instruments with stated links whose states may be wrong though they are no outliers: whose
+    misfit is high, or close to that of the (distinct) mirrored state."""
     if not (math.isfinite(misfits.limit) and search.linked):
         return []
     scores: dict[int, float] = {}
@@ -233,19 +232,19 @@ def _states_of(search: StateSearch, frames: Sequence[int]) -> list[State]:
 
 
 def _distance(search: StateSearch, index: int, recorded: State, state: State, scale: float) -> float:
-    """Return the root mean square of a correction of frame `index` in standard deviations of the prior."""
+    """Return the RMS of a correction of frame `index` in standard deviations of the prior."""
     apart = search.refinement.layout.increments_between(recorded, state)
     return math.sqrt(float((apart @ search.precision(index, scale) @ apart) / len(apart)))
 
 
 def mirrored_state(search: StateSearch, index: int, state: State) -> State:
-    """Return the state that looks alike from afar in frame `index`, of instruments with stated links."""
+    """Return the state with a similar appearance from afar in frame `index`, for instruments with stated links."""
     camera_from_world = search.scene.recorded.cameras[index].world_from_camera.inverse().cpu().double().numpy()
     return _changed(search, state, lambda tree, shaft, *pose: mirrored(tree, shaft, camera_from_world, *pose))
 
 
 def half_turned_state(search: StateSearch, state: State) -> State:
-    """Return the state with every instrument, of stated links, turned by half a turn about its shaft."""
+    """Return the state with every instrument of stated links rotated by 180 degrees about its shaft."""
     return _changed(search, state, half_turned)
 
 
@@ -254,7 +253,7 @@ def _changed(
     state: State,
     change: Callable[[KinematicTree, np.ndarray, np.ndarray, dict[str, float]], tuple[np.ndarray, dict[str, float]]],
 ) -> State:
-    """Return the state with pose and readings of each instrument by `change` of (tree, shaft, pose, readings)."""
+    """Return the state with each instrument's pose and readings by `change` of (tree, shaft, pose, readings)."""
     changed: dict[str, InstrumentState] = {}
     for item, shaft in zip(search.scene.instruments, search.shafts, strict=True):
         previous = state.instruments[item.name]
@@ -266,8 +265,7 @@ def _changed(
 
 
 def describe_contradictions(refinement: Refinement, names: Sequence[str]) -> str:
-    """Return a line on training states that contradict the others and what became of them; empty without any. names:
-    of all frames."""
+    """Return a line on contradicting training states and their verdicts; empty without any. names: of all frames."""
     firsts = [frames[0] for frames in refinement.frames_of_instant]
     outcomes = {
         Verdict.REFITTED: "fitted to their images from other states",
@@ -283,7 +281,7 @@ def describe_contradictions(refinement: Refinement, names: Sequence[str]) -> str
 
 
 def _other_starts(search: StateSearch, index: int, others: Sequence[State]) -> list[State]:
-    """Return states from which a frame is fitted: those of others, and its own with joints bent the other way."""
+    """Return candidate initial states of a frame: those of other frames, and its own with mirrored joints."""
     recorded, layout = search.scene.recorded.states[index], search.fitter.parameters
     bent = [[-2 * recorded.instruments[p.name].joints[joint] for joint in p.joints] for p in layout.instruments]
     still = [torch.zeros(6, dtype=torch.float64)] * len(bent)
@@ -294,14 +292,14 @@ def _other_starts(search: StateSearch, index: int, others: Sequence[State]) -> l
 
 
 def _fits_from(search: StateSearch, index: int, starts: Sequence[State]) -> list[StateFit]:
-    """Return fits of a frame from the most promising starts, and from states about the best of these; none where all
-    leave the image."""
+    """Return fits of a frame from the most promising initial states, and from states about the best of these; empty if
+    all leave the image."""
     fits = _fits(search, index, starts, search.precision(index, JUDGE.start_scale))
     return [*fits, *_fits_near(search, index, _best(fits).state)] if fits else []
 
 
 def _fits_near(search: StateSearch, index: int, state: State) -> list[StateFit]:
-    """Return fits of a frame from states about `state`, and about its mirrored one."""
+    """Return fits of a frame from states about `state` and about its mirrored state."""
     precision = search.precision(index, JUDGE.start_scale)
     about = [state, *([mirrored_state(search, index, state)] if search.linked else [])]
     near = [
@@ -317,8 +315,8 @@ def _best(fits: Sequence[StateFit]) -> StateFit:
 def _fits(
     search: StateSearch, index: int, starts: Sequence[State], precision: Tensor, about: State | None = None
 ) -> list[StateFit]:
-    """Return fits of a frame from the `n_tried` most promising starts, with a prior of such precision [P, P] about each
-    (or `about` one state)."""
+    """Return fits of a frame from the `n_tried` most promising initial states, with a prior of precision [P, P] about
+    each (or about the single state `about`)."""
     view = search.view(index, None)
     fits = (
         search.fitter.fit(view, about or start, precision, start, levels=SEARCH.levels, steps=SEARCH.steps)

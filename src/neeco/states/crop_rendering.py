@@ -1,4 +1,4 @@
-"""Instruments rendered alone, in a crop, over tissue that was rendered once: cheap enough to fit states by."""
+"""Instruments rendered alone, in a crop, over tissue rendered once: a fast renderer for state fits."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 class CropSettings:
     """Settings of views and their colours."""
 
-    # images are trimmed and crops rounded to multiples of it, so that they can be halved three times exactly
+    # image sizes are trimmed and crops rounded to multiples of it, so that they can be halved three times exactly
     block_px: int = 8
-    max_pixels: int = 160_000  # maximum pixels of an image worked on; larger ones are reduced
-    min_opacity: float = 0.2  # minimum opacity of Gaussians that bound the instrument
-    margin_quantile: float = 0.002  # share of these Gaussians that a crop may leave out at each side
+    max_pixels: int = 160_000  # maximum number of pixels; larger images are reduced
+    min_opacity: float = 0.2  # minimum opacity of the Gaussians that define the crop
+    margin_quantile: float = 0.002  # quantile of these Gaussians cut off at each side
     n_posed: int = 8  # number of states whose posed Gaussians are cached
-    n_trimmings: int = 5  # trimmings of pixels that a linear colour map does not explain (instruments, foreground)
-    same_color: float = 0.02  # mean difference of colours in [0, 1] below which they are left as they are
+    n_trimmings: int = 5  # iterations of excluding pixels that a linear colour map does not explain
+    same_color: float = 0.02  # mean difference of colours in [0, 1] below which no map is applied
     max_unexplained: float = 0.5  # ratio of the mean unexplained colour difference to the colours' standard deviation
-    gain_range: tuple[float, float] = (0.2, 3.0)  # plausible gains of a colour's light
+    gain_range: tuple[float, float] = (0.2, 3.0)  # plausible gains of a colour channel
 
 
 CROPS = CropSettings()
@@ -45,17 +45,17 @@ Box = tuple[int, int, int, int]  # px: left, top, right, bottom
 
 @dataclass(frozen=True, kw_only=True)
 class FrameView:
-    """A frame's image, reduced or cropped, its counted pixels, and the tissue behind the instruments."""
+    """A frame's image, reduced or cropped, its pixel weights, and the tissue behind the instruments."""
 
     camera: Camera
     image: Tensor  # [h, w, 3]
-    weight: Tensor  # [h, w], 0 where pixels do not count
+    weight: Tensor  # [h, w], 0 for ignored pixels
     tissue: Tensor  # [h, w, 3]
-    shadow_of: State | None  # whose instruments' shadow falls on it; None: no shadow
-    diagonal: float  # px, of the image that it is cropped from
+    shadow_of: State | None  # the state whose shadow is rendered; None: no shadow
+    diagonal: float  # px, of the uncropped image
 
     def crop(self, box: Box) -> FrameView:
-        """Return the part in a box."""
+        """Return the crop to a box."""
         left, top, right, bottom = box
         camera = self.camera
         camera = replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=right - left, height=bottom - top)
@@ -65,8 +65,8 @@ class FrameView:
 
 
 def working_size(camera: Camera, recorded: Recorded) -> Camera:
-    """Return the camera of the size worked on: no larger than `max_pixels` nor than the training images, trimmed to
-    multiples of `block_px`."""
+    """Return the working camera: at most `max_pixels` and the training images' size, trimmed to multiples of
+    `block_px`."""
     learned = recorded.scale * max(other.fx for other in recorded.cameras)
     factor = min(1.0, math.sqrt(CROPS.max_pixels / (camera.width * camera.height)), learned / camera.fx)
     scaled = camera if factor == 1 else camera.scaled(factor)
@@ -77,7 +77,7 @@ def working_size(camera: Camera, recorded: Recorded) -> Camera:
 
 
 def view_of(frame: Frame, camera: Camera, tissue: TissueRenderer, state: State | None) -> FrameView:
-    """Return a frame at the size of `camera` (see `working_size`), over the tissue with the shadow of instruments in
+    """Return a frame at the size of `camera` (see `working_size`), over the tissue with the instruments' shadow in
     `state`. Raises NeecoError when its image cannot be read."""
     image, mask, full = frame.load_image(), frame.load_mask(), frame.camera
     counted = torch.ones(full.height, full.width) if mask is None else mask.float()
@@ -99,10 +99,10 @@ def view_of(frame: Frame, camera: Camera, tissue: TissueRenderer, state: State |
 
 
 def color_matched(image: Tensor, tissue: Tensor, weight: Tensor) -> Tensor:
-    """Return an image [h, w, 3] in the colours of the scene, without the effects of smoke, exposure and white balance.
+    """Return an image [h, w, 3] in the scene's colours, compensating smoke, exposure and white balance.
 
-    These are a linear map of each channel's light, fitted robustly to the tissue. The image itself is returned where
-    its colours agree, or no map explains them.
+    The compensation is a linear map per channel in linear light, fitted robustly to the tissue. The image is returned
+    unchanged if its colours agree already, or no map explains them.
     """
     small = (downsampled(each, 1 / CROPS.block_px).flatten(0, 1) for each in (image, tissue, weight[..., None]))
     observed, rendered, counted = (each.clamp(0, 1) ** GAMMA for each in small)
@@ -110,9 +110,9 @@ def color_matched(image: Tensor, tissue: Tensor, weight: Tensor) -> Tensor:
     for _ in range(CROPS.n_trimmings):
         if int(used.sum()) < 8:
             return image
-        (some, others), spread = (each[used] for each in (observed, rendered)), rendered[used].var(0)
-        gain = ((some - some.mean(0)) * (others - others.mean(0))).mean(0) / spread.clamp_min(1e-6)
-        offset = some.mean(0) - gain * others.mean(0)
+        (target, model), spread = (each[used] for each in (observed, rendered)), rendered[used].var(0)
+        gain = ((target - target.mean(0)) * (model - model.mean(0))).mean(0) / spread.clamp_min(1e-6)
+        offset = target.mean(0) - gain * model.mean(0)
         off = (observed - gain * rendered - offset).abs().amax(1)
         used = (off <= 2 * off[counted[:, 0] > 0.99].median()) & (counted[:, 0] > 0.99)
     changed = ((gain - 1) * rendered[used] + offset).abs().mean()
@@ -132,15 +132,15 @@ def composite(color: Tensor, alpha: Tensor, tissue: Tensor) -> Tensor:
 
 
 def repeated(plane: np.ndarray) -> np.ndarray:
-    """Return a plane [h, w] once for every colour, [h, w, 3]: arrays of one shape are multiplied five times as fast."""
+    """Return a plane [h, w] repeated for every colour, [h, w, 3]: products of equal shapes are five times as fast."""
     return cv2.merge([plane, plane, plane])
 
 
 def downsampled(image: Tensor, size: float) -> Tensor:
-    """Return an image [h, w, C] at `size` times its size.
+    """Return an image [h, w, C] scaled by `size`.
 
-    Renderings are made at full size and then reduced, too: rendered small, every Gaussian is widened by as many of the
-    larger pixels, and a fit would place the instrument too far away.
+    Renderings are made at full size and then reduced as well: at a small size the low-pass filter would widen every
+    Gaussian by as many larger pixels, and a fit would place the instrument too far away.
     """
     if size == 1:
         return image
@@ -151,7 +151,7 @@ def downsampled(image: Tensor, size: float) -> Tensor:
 
 
 class InstrumentRenderer:
-    """Renders a scene's instruments without its tissue; images are on the CPU whatever device renders."""
+    """Renders a scene's instruments without its tissue; images are on the CPU, on whatever device it renders."""
 
     def __init__(self, scene: GaussianScene) -> None:
         self.scene = scene
@@ -162,12 +162,12 @@ class InstrumentRenderer:
         self._latest: deque[tuple[State, State, Gaussians]] = deque(maxlen=CROPS.n_posed)
 
     def pose(self, state: State) -> Gaussians:
-        """Return the instruments' Gaussians in `state`. Do not modify: the latest are kept, by the state's identity."""
+        """Return the instruments' Gaussians in `state`. Do not modify: the latest are cached by identity."""
         return self._posed(state)[1]
 
     @torch.no_grad()
     def _posed(self, state: State) -> tuple[State, Gaussians]:
-        """Return `state` as registered, and the Gaussians in it."""
+        """Return `state` as registered, and its Gaussians."""
         for cached, registered, posed in self._latest:
             if cached is state:
                 return registered, posed
@@ -191,8 +191,8 @@ class InstrumentRenderer:
         return composite(*self._rendered(posed, view.camera), view.tissue)
 
     def moved(self, posed: Gaussians, state: State, other: State, view: FrameView) -> Tensor:
-        """Return `composed` of `other`, which differs from the `state` of `posed` by the pose of the only instrument:
-        the camera is moved instead, and nothing need be posed again."""
+        """Return `composed` of `other`, which differs from the `state` of `posed` only by the pose of the single
+        instrument: the camera is moved instead, so that nothing is posed again."""
         (name,) = other.instruments
         registered = self._posed(state)[0], self.alone.registered(other)
         was, now = (each.instruments[name].pose.cpu().double().numpy() for each in registered)
@@ -207,7 +207,7 @@ class InstrumentRenderer:
 
     @torch.no_grad()
     def box(self, state: State, camera: Camera, margin: float) -> Box | None:
-        """Return the box of the instruments in the image, `margin` px wider; None where they are outside of it."""
+        """Return the bounding box of the instruments plus `margin` px; None if they are outside the image."""
         posed = self.pose(state)
         pixels, depth = (each.cpu().numpy() for each in project_world(posed.means, camera))
         x, y = pixels.T
@@ -249,20 +249,20 @@ class TissueRenderer:
         return rasterize(tissue, camera).color.clamp(0, 1).cpu()
 
     def _at(self, state: State) -> Gaussians:
-        """Return the tissue at the time of `state`; it depends on nothing else of it."""
+        """Return the tissue at the time of `state`, its only dependence on it."""
         if self._posed is None or self._posed[0] != state.time:
             self._posed = state.time, self.scene.at(state).select(slice(0, self.scene.canonical.counts[0]))
         return self._posed[1]
 
 
 def _without_tissue(scene: GaussianScene) -> GaussianScene:
-    """Return a scene of the instruments alone: the same modules, Gaussians of its own."""
-    tissue, *others = scene.canonical.counts
+    """Return a scene of the instruments alone: shared modules, but Gaussians of its own."""
+    tissue, *counts = scene.canonical.counts
     tensors = {name: tensor[tissue:].detach().contiguous() for name, tensor in scene.canonical.tensors().items()}
-    gaussians = CanonicalGaussians.from_tensors(tensors, (0, *others))
+    gaussians = CanonicalGaussians.from_tensors(tensors, (0, *counts))
     alone = GaussianScene(scene.method, gaussians, scene.deformation, scene.instruments, scene.recorded, scene.center)
     alone.load_state_dict(scene.state_dict())
     alone.sh_degree = scene.sh_degree
-    for parameter in alone.parameters(recurse=False):  # the modules are the scene's, which may be training
+    for parameter in alone.parameters(recurse=False):  # the modules are shared with the scene, which may be training
         parameter.requires_grad_(False)
     return alone

@@ -1,5 +1,4 @@
-"""The states of a scene's instruments fitted to one frame, from a state nearby: instruments over tissue, coarse to
-fine."""
+"""Fits of a scene's instrument states to one frame, from a nearby state: instruments over tissue, coarse to fine."""
 
 from __future__ import annotations
 
@@ -35,19 +34,19 @@ class FitterSettings:
     """Settings of fits by rendering."""
 
     huber: float = 0.05  # colour residual beyond which the cost of a pixel is linear
-    # pixels of the full size that count as one observation, since residuals of neighbours correlate
+    # pixels of the full size per independent observation, as neighbouring residuals are correlated
     correlation_px: float = 25.0
     # finite differences at full size: deg, mm, deg and mm of joints
     steps: tuple[float, float, float, float] = (0.2, 0.1, 0.5, 0.1)
-    small_step: tuple[float, float, float, float] = (0.05, 0.05, 0.1, 0.05)  # the same: steps of a converged fit
-    steps_at_once: int = 2  # steps between new differences and shadows; more would attract the fit to where it was
+    small_step: tuple[float, float, float, float] = (0.05, 0.05, 0.1, 0.05)  # same units: a smaller step ends the fit
+    steps_at_once: int = 2  # steps per linearisation and shadow; more would bias the fit to where it started
     neighbourhood: float = 0.015  # share of the image's diagonal: distance within which pixels count in a misfit
     # minimum width, as a share of the diagonal, of areas that neither instrument nor tissue explains: foreground
     foreground_width: float = 0.02
-    foreground_error: float = 3 * huber * (0.1 - huber / 2)  # Huber error of a pixel whose colours are off by 0.1
-    foreground_rim_px: int = 5  # side of the square by which such areas are widened
-    max_hidden: float = 0.3  # maximum share of an instrument behind the foreground
-    margin_px: int = 28  # margin of a fit's crop about the instruments
+    foreground_error: float = 3 * huber * (0.1 - huber / 2)  # Huber error of a pixel with a colour error of 0.1
+    foreground_rim_px: int = 5  # side of the square that dilates such areas
+    max_hidden: float = 0.3  # maximum occluded share of an instrument
+    margin_px: int = 28  # margin of a fit's crop around the instruments
 
 
 FIT = FitterSettings()
@@ -58,29 +57,29 @@ P = TypeVar("P", bound=StateParameters, covariant=True)
 
 @dataclass(frozen=True, kw_only=True)
 class StateFit:
-    """A state, and how well it explains a frame."""
+    """A fitted state and its quality of fit."""
 
     state: State
-    cost: float  # of pixels and prior, -log probability
-    gain: float  # by how much pixels cost less than with the tissue alone; comparable between crops
-    # Huber error on and close by the instrument, without foreground, per pixel of instrument; 1: of residuals of huber
+    cost: float  # -log probability of pixels and prior
+    gain: float  # cost of the pixels with the tissue alone minus that with the state; comparable between crops
+    # Huber error on and near the instrument, without foreground, per instrument pixel; 1: residuals of size huber
     misfit: float
-    observations: float  # independent ones that the information takes the instrument's pixels for
+    observations: float  # number of independent observations assumed by the information
     information: Tensor  # [P, P] of the pixels on the parameters
     view: FrameView  # the crop about the instruments, with the shadow of `state`
 
     def deviations(self, precision: Tensor) -> Tensor:
-        """Return the standard deviations [P] of the state, with a prior of such `precision` [P, P].
+        """Return the standard deviations [P] of the state, with a prior of `precision` [P, P].
 
-        Errors of a learned shape move all residuals of an instrument at once, however many pixels it covers: the frame
-        counts as one observation, of its residuals' own variance, and never for more than the fit took it for.
+        Errors of a learned shape affect all residuals of an instrument at once: the frame counts as one observation,
+        with the variance of its own residuals, and never for more than the fit assumed.
         """
         share = 1 / max(1.0, self.observations * self.misfit)
         return torch.linalg.inv(share * self.information + precision).diagonal().sqrt()
 
 
 class MovedStates:
-    """States moved from an expected one by increments [P], of which the latest are kept, by the tensors' identity."""
+    """Expected state moved by increments [P]; the latest results are cached by the tensors' identity."""
 
     def __init__(self, parameters: StateParameters, expected: State) -> None:
         self.parameters, self.expected = parameters, expected
@@ -103,10 +102,10 @@ class Fitter(Generic[P]):
     instruments: InstrumentRenderer
     parameters: P
     tissue: TissueRenderer
-    correlation_px: float = FIT.correlation_px  # more where the scene's own errors correlate, too
+    correlation_px: float = FIT.correlation_px  # larger where the scene's own errors are correlated as well
 
     def view(self, frame: Frame, state: State | None) -> FrameView:
-        """Return a frame at the size worked on, over tissue with the shadow of instruments in `state` (None: none)."""
+        """Return a frame at the working size, over tissue with the instruments' shadow in `state` (None: no shadow)."""
         return view_of(frame, working_size(frame.camera, self.instruments.scene.recorded), self.tissue, state)
 
     def fit(
@@ -119,10 +118,10 @@ class Fitter(Generic[P]):
         levels: tuple[float, ...] = (0.5, 1.0),
         steps: tuple[int, ...] = (3, 3),
     ) -> StateFit | None:
-        """Return the state that explains `view` best; None where the fit leads out of the image.
+        """Return the state that explains `view` best; None if the fit leaves the image.
 
-        precision [P, P]: of the prior about `expected`. start: where the fit begins; None: at `expected`. levels: sizes
-        of the images compared, as shares of the view's; steps: at each.
+        precision [P, P]: of the prior about `expected`. start: initial state; None: `expected`. levels: scales of the
+        compared images relative to the view's; steps: per level.
         """
         parameters = self.parameters
         increments = torch.zeros(parameters.size, dtype=torch.float64)
@@ -170,7 +169,7 @@ class Fitter(Generic[P]):
     def _rendering(
         self, view: FrameView, size: float, moved: MovedStates
     ) -> tuple[Render[Gaussians], Differences[Gaussians]]:
-        """Return `render` and `differences` of `minimise` before a view's tissue as it is, images reduced to `size`."""
+        """Return `render` and `differences` of `minimise` for a view with fixed tissue, images reduced to `size`."""
         parameters, instruments = self.parameters, self.instruments
 
         def rendered(state: State) -> tuple[Gaussians, Tensor]:
@@ -193,7 +192,7 @@ class Fitter(Generic[P]):
         return (lambda at: rendered(moved.at(at))), differences
 
     def ranked(self, view: FrameView, states: Iterable[State], size: float) -> list[State]:
-        """Return states, the best first, by how well they explain a view reduced to `size`."""
+        """Return the states ordered by how well they explain a view reduced to `size`, best first."""
         residual, renderer = residual_of(view, size), self.instruments
         scored = [
             (float(residual.errors(downsampled(renderer.composed(renderer.pose(state), view), size)).sum()), k, state)
@@ -202,13 +201,13 @@ class Fitter(Generic[P]):
         return [state for _, _, state in sorted(scored, key=lambda item: item[:2])]
 
     def crop_around(self, view: FrameView, state: State, margin: float = FIT.margin_px) -> FrameView | None:
-        """Return the crop of a view about the instruments in `state`; None where they are outside."""
+        """Return the crop of a view around the instruments in `state`; None if they are outside."""
         box = self.instruments.box(state, view.camera, margin)
         return None if box is None else view.crop(box)
 
     def with_shadow(self, view: FrameView, state: State) -> FrameView:
-        """Return the view with the shadow of instruments in `state`, or of a state that differs from it by less than
-        two finite differences."""
+        """Return the view with the instruments' shadow in `state`, or in one that differs from it by less than two
+        finite differences."""
         if not self.tissue.shaded:
             return view
         if view.shadow_of is not None:
@@ -218,8 +217,8 @@ class Fitter(Generic[P]):
         return replace(view, tissue=self.tissue.render(view.camera, state), shadow_of=state)
 
     def _explained(self, view: FrameView, state: State) -> tuple[float, float, float]:
-        """Return `gain` and `misfit` (see `StateFit`) of a state before a view that holds all of the instruments, and
-        the pixels of instrument that count."""
+        """Return `gain` and `misfit` (see `StateFit`) of a state in a view that contains all instruments, and the
+        instrument pixels that count."""
         color, alpha = self.instruments.render(state, view.camera)
         residual = residual_of(view, 1.0, self.correlation_px)
         with_it, without = (
@@ -240,20 +239,20 @@ class Fitter(Generic[P]):
 
 
 def widened(mask: Tensor, pixels: int) -> Tensor:
-    """Return a mask bool [h, w], wider by so many pixels on each side."""
+    """Return a mask bool [h, w] dilated by this many pixels on each side."""
     square = np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)
     return torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), square) > 0)
 
 
 def residual_of(view: FrameView, size: float, correlation_px: float = FIT.correlation_px) -> ImageResidual:
-    """Return the residual of a view reduced to `size` times its size, of the same weight at any size.
+    """Return the residual of a view scaled by `size`, of the same total weight at any size.
 
-    correlation_px: pixels of the full size that count as one observation."""
+    correlation_px: pixels of the full size per independent observation."""
     scale = size**-2 / (FIT.huber**2 * correlation_px * 3)
     weight = torch.where(downsampled(view.weight[..., None], size)[..., 0] > 0.99, 1.0, 0.0)
     return ImageResidual(downsampled(view.image, size), weight, FIT.huber, scale)
 
 
 def loose_prior(parameters: StateParameters, degrees: float, millimetres: float, joint_degrees: float) -> Tensor:
-    """Return the precision [P, P] of a prior with such standard deviations; of prismatic joints 0.25 mm per degree."""
+    """Return the precision [P, P] of a prior of these deviations; 0.25 mm per degree for prismatic joints."""
     return precision_of(parameters.vector_from_degrees(degrees, millimetres, joint_degrees, joint_degrees / 4))

@@ -1,7 +1,7 @@
 """Levenberg-Marquardt on the difference between a rendering and an image.
 
-Residuals have Huber weights. Columns of the Jacobian are finite differences of renderings, so that no scene needs to
-be differentiable. `alignment` fits poses to recorded frames with it, `fitter` the instruments of footage.
+Residuals have Huber weights. The Jacobian consists of finite differences of renderings, so that no scene needs to be
+differentiable. `alignment` uses it to fit poses to recorded frames, `fitter` to fit instruments in footage.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Posed = TypeVar("Posed")  # what is rendered
 Render = Callable[[Tensor], tuple[Posed, Tensor]]
 Differences = Callable[[Tensor, Posed], Iterable[tuple[Tensor, float]]]
 BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
-MAX_TRIALS = 3  # steps tried from one linearisation, each damped ten times more
+MAX_TRIALS = 3  # maximum trial steps per linearisation, each with ten times more damping
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class ImageResidual:
     """The difference between a rendering and an image, and its weight against the prior."""
 
     target: Tensor  # [h, w, 3]
-    weight: Tensor  # [h, w], 0 where pixels do not count
+    weight: Tensor  # [h, w], 0 for ignored pixels
     huber: float  # colour residual beyond which the cost of a pixel is linear
-    scale: float  # of a squared residual against the prior
+    scale: float  # weight of a squared residual relative to the prior
 
     def of(self, image: Tensor) -> Tensor:
         """Return the residual [h, w, 3] of a rendering, weighted and blurred."""
@@ -44,20 +44,20 @@ class ImageResidual:
     def errors(self, image: Tensor) -> Tensor:
         """Return the Huber error [h, w, 3] of every value of a rendering."""
         residual = self.of(image).abs_()
-        squared = residual.clamp_max(self.huber)  # what costs its square; the rest costs linearly
+        squared = residual.clamp_max(self.huber)  # quadratic part of the cost; the rest is linear
         return residual.sub_(squared, alpha=0.5).mul_(squared)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Minimum(Generic[Posed]):
-    """The end of a descent."""
+    """Result of a minimisation."""
 
     parameters: Tensor  # [P] float64
-    cost: float  # of image and prior
+    cost: float  # image plus prior
     posed: Posed
     image: Tensor  # [h, w, 3]
     information: Tensor | None  # [P, P] of the image alone, at the last linearisation; None: no step was taken
-    settled: bool  # no step from fresh differences lowers the cost, or the last one was small
+    settled: bool  # whether no step from a fresh linearisation lowers the cost, or the last step was small
 
 
 def minimise(
@@ -73,9 +73,8 @@ def minimise(
 ) -> Minimum[Posed]:
     """Take Levenberg-Marquardt steps from the best of `starts` (each [P] float64); every accepted one lowers the cost.
 
-    precision [P, P]: of the prior, whose mean is zero.
-    small [P]: a step of which every entry is smaller is the last. linearised_for: steps taken with the differences of
-    one state.
+    precision [P, P]: of the zero-mean prior. small [P]: a step with all entries smaller is the last. linearised_for:
+    steps per linearisation.
     """
 
     def evaluated(at: Tensor) -> tuple[float, Tensor, Posed, Tensor]:
@@ -90,7 +89,7 @@ def minimise(
             columns = np.empty((len(parameters), *image.shape), np.float32)
             for row, (moved, change) in enumerate(differences(parameters, posed)):
                 columns[row] = weighted_blur((moved - image).div_(change), residual.weight)
-            touched = np.flatnonzero(columns.any(0))  # values that no parameter changes have no derivative
+            touched = np.flatnonzero(columns.any(0))  # other values have zero derivatives
             jacobian = torch.from_numpy(columns.reshape(len(parameters), -1).take(touched, 1))  # [P, values]
         off = torch.from_numpy(off.numpy().take(touched))
         weighted = jacobian * (residual.scale / (off.abs() / residual.huber).clamp_min(1.0))
@@ -116,7 +115,7 @@ def minimise(
 
 
 def weighted_blur(difference: Tensor, weight: Tensor) -> Tensor:
-    """Return a difference [h, w, 3] times its weight [h, w], blurred (3x3 binomial): an edge's residual stays linear
-    over a larger shift."""
+    """Return a difference [h, w, 3] times its weight [h, w], blurred (3x3 binomial), so that an edge's residual is
+    linear over a larger shift."""
     counted = difference.numpy() * cv2.merge([weight.numpy()] * 3)
     return torch.from_numpy(cv2.sepFilter2D(counted, -1, BINOMIAL, BINOMIAL, borderType=cv2.BORDER_CONSTANT))

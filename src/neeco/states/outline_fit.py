@@ -1,9 +1,10 @@
-"""States of an instrument with stated links, fitted to where its colours are: a bundle adjustment before any Gaussian.
+"""States of an instrument with stated links, fitted to its image regions by colour: bundle adjustment before any
+Gaussian.
 
-Tissue, shaft and what lies beyond it have colours of their own; pixels say by these how likely the instrument covers
-them (region-based tracking: Prisacariu, Reid, IJCV 2012). Unknown are the shape that all states share (radii, lengths,
-errors of the stated links, a rigid error of the base) and each state's own error: pose and joints. Each state's block
-is eliminated, so that the cost grows linearly with their number.
+Tissue, shaft and distal links have distinct colour distributions, which yield each pixel's likelihood of being
+instrument (region-based tracking: Prisacariu, Reid, IJCV 2012). Unknown are the shared shape (radii, lengths, errors of
+the stated links, a rigid error of the base) and each state's own error: pose and joints. Each state's block is
+eliminated, so that the cost is linear in their number.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class OutlineFitSettings:
     common: float = 0.05  # share of pixels whose colour carries no information
     block_px: int = 8  # side of blocks of cells that are selected together
     grid_px: int = 4  # spacing of the grid on which colours are attributed
-    # pixels that count as one: errors of outlines and of the model are correlated along them
+    # pixels per independent one, as errors of outlines and model are correlated
     correlated_px: float = 12.0
     max_ratio: float = 3.0  # maximum log likelihood ratio that counts in a misfit
     min_blocks: float = 40.0  # minimum weight of an instrument in a misfit, in blocks of the largest ratio
@@ -57,7 +58,7 @@ OUTLINES = OutlineFitSettings()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinkViews:
-    """V images of an instrument in S states, and what was recorded of these."""
+    """V images of an instrument in S states, and the recorded states."""
 
     tree: KinematicTree
     images: np.ndarray  # uint8 [V, H, W, 3]
@@ -69,7 +70,7 @@ class LinkViews:
     readings: np.ndarray  # [S, R] rad or mm
 
     def take(self, rows: np.ndarray, state_of_view: np.ndarray, poses: np.ndarray, readings: np.ndarray) -> LinkViews:
-        """Return the views `rows`, of these states."""
+        """Return the views `rows` of these states."""
         images = ("images", "usable", "camera_from_world", "intrinsics")
         views = replace(self, **{name: getattr(self, name)[rows] for name in images})
         return replace(views, state_of_view=state_of_view, poses=poses, readings=readings)
@@ -85,7 +86,7 @@ class StatesFit:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells [V, N] of the images near outlines: middles px, log likelihood ratios of the instrument to the tissue, and
+    """Cells [V, N] of the images near outlines: centres px, log likelihood ratios of instrument to tissue, and
     weights."""
 
     points: np.ndarray  # [V, N, 2]
@@ -98,7 +99,7 @@ class StatesProblem:
     """Bundle adjustment of states; `sds` [S, 6 + R]: standard deviations of the priors on their corrections."""
 
     def __init__(self, views: LinkViews, sds: np.ndarray, like: StatesProblem | None = None) -> None:
-        """like: the problem of other states, whose shape and base are meant."""
+        """Set up the problem; like: a problem of other states with the same shape and base."""
         self.views, self.sds = views, sds
         if like is None:
             self.model = ArticulatedModel(views.tree, views.poses)
@@ -118,25 +119,25 @@ class StatesProblem:
         self.root_from_camera = turns.transpose(0, 2, 1)  # [S, 3, 3]
 
     def start(self) -> StatesFit:
-        """The states as recorded, and the shape expected."""
+        """Return the recorded states and the expected shape."""
         return StatesFit(self.shared_means.copy(), np.zeros_like(self.sds))
 
     @property
     def to_root(self) -> np.ndarray:
-        """Transforms [S, 6 + R, 6 + R] of corrections to rotation vectors (rad) and shifts (mm) in the root's frame
-        and changes of readings."""
+        """Return transforms [S, 6 + R, 6 + R] from corrections to rotation vectors (rad) and shifts (mm) in the root's
+        frame and changes of readings."""
         turns = np.tile(np.eye(self.sds.shape[1]), (len(self.sds), 1, 1))
         turns[:, :3, :3], turns[:, 3:POSE, 3:POSE] = self.basis, self.root_from_camera
         return turns
 
     def corrected(self, fit: StatesFit) -> tuple[np.ndarray, np.ndarray]:
-        """Poses [S, 4, 4] and readings [S, R] with their corrections, without the base's."""
+        """Return the corrected poses [S, 4, 4] and readings [S, R], without the base's correction."""
         steps = (self.to_root @ fit.own[..., None])[..., 0]
         moved = rigid(Rotation.from_rotvec(steps[:, :3]).as_matrix(), steps[:, 3:POSE])
         return self.views.poses @ moved, self.views.readings + steps[:, POSE:]
 
     def outlines(self, fit: StatesFit) -> Outlines:
-        """Outlines of all cones in every view."""
+        """Return the outlines of all cones in every view."""
         views = self.views
         poses, readings = self.corrected(fit)
         base = fit.shared[-6:]
@@ -149,14 +150,14 @@ class StatesProblem:
         return self.model.outlines(fit.shared[:-6], values[states], views.camera_from_world @ poses[states], intrinsics)
 
     def _distances(self, fit: StatesFit, cell: int, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Middles [N, 2] px of so many rows and columns of cells, and their signed distances [V, C, N] px to the cones'
-        outlines."""
+        """Return centres [N, 2] px of this many rows and columns of cells, and their signed distances [V, C, N] px to
+        the cones' outlines."""
         grid = _grid(rows * cell, columns * cell, cell)
         return grid, self.outlines(fit).distances(np.broadcast_to(grid, (len(self.views.images), *grid.shape)))[0]
 
     def learn_colors(self, fit: StatesFit, softness: float) -> np.ndarray:
-        """Log likelihood ratios float32 [V, H, W] of the instrument to the tissue, by the colours of both where a fit
-        has them."""
+        """Return log likelihood ratios float32 [V, H, W] of instrument to tissue, from the colours of both regions
+        under a fit."""
         images = self.views.images
         count, height, width, _ = images.shape
         apart = fit.shared.copy()
@@ -182,7 +183,7 @@ class StatesProblem:
         return np.asarray(ratio.astype(np.float32).ravel()[index])
 
     def cells(self, fit: StatesFit, ratios: np.ndarray, cell: int, softness: float) -> Cells:
-        """Cells of `cell` px in the blocks near a fit's outlines; ratios [V, H, W] as `learn_colors` returns them."""
+        """Return cells of `cell` px in blocks near a fit's outlines; ratios [V, H, W] as from `learn_colors`."""
         count, height, width = ratios.shape
         rows, columns, inner = height // OUTLINES.block_px, width // OUTLINES.block_px, OUTLINES.block_px // cell
         grid, distances = self._distances(fit, OUTLINES.block_px, rows, columns)
@@ -207,12 +208,12 @@ class StatesProblem:
         )
 
     def losses(self, fit: StatesFit, cells: Cells) -> np.ndarray:
-        """Negative log likelihoods [V] of the views' cells."""
+        """Return negative log likelihoods [V] of the views' cells."""
         inside = expit(self.outlines(fit).distances(cells.points)[0].max(1) / cells.softness)
         return np.asarray(_losses(inside, cells))
 
     def misfits(self, fit: StatesFit, ratios: np.ndarray) -> np.ndarray:
-        """Misfit [V] of each view: likelihood ratios on the wrong side of the outline, by those on its right side."""
+        """Return the misfit [V] of each view: likelihood ratios on the outline's wrong side over the right one's."""
         count, height, width = ratios.shape
         rows, columns = height // OUTLINES.block_px, width // OUTLINES.block_px
         _, distances = self._distances(fit, OUTLINES.block_px, rows, columns)
@@ -226,7 +227,7 @@ class StatesProblem:
         return np.asarray(wrong / ((inside * for_it).sum(1) + OUTLINES.max_ratio * OUTLINES.min_blocks))
 
     def turned_to_shaft(self, fit: StatesFit) -> StatesFit:
-        """The same fit with tilts and roll counted about the shaft's axis as fitted, from now on."""
+        """Return the same fit with tilts and roll redefined about the fitted axis of the shaft."""
         basis = frame_about(self.model.shaft_axis(fit.shared))
         corrections = fit.own.copy()
         corrections[:, :3] = corrections[:, :3] @ (self.basis.T @ basis)
@@ -234,12 +235,12 @@ class StatesProblem:
         return StatesFit(fit.shared, corrections)
 
     def prior_cost(self, fit: StatesFit) -> float:
-        """Half the sum of squares of all parameters, in standard deviations of their priors."""
+        """Return half the sum of squares of all parameters in standard deviations of their priors."""
         shared = (fit.shared - self.shared_means) / self.shared_sds
         return 0.5 * float((shared**2).sum() + ((fit.own / self.sds) ** 2).sum())
 
     def blocks_with_priors(self, fit: StatesFit, cells: Cells, shared: bool) -> Blocks:
-        """`blocks`, with those of the priors."""
+        """Return `blocks` including the priors."""
         b = self.blocks(fit, cells, shared)
         state_blocks = b.own + np.eye(self.sds.shape[1]) / self.sds[..., None] ** 2
         b = replace(b, own=state_blocks, own_gradient=b.own_gradient + fit.own / self.sds**2)
@@ -249,7 +250,8 @@ class StatesProblem:
         return replace(b, shared=b.shared + np.diag(self.shared_sds**-2), shared_gradient=gradient)
 
     def blocks(self, fit: StatesFit, cells: Cells, shared: bool = True) -> Blocks:
-        """Gradient and information of the cells' likelihood, without priors; `shared`: of shared parameters, too."""
+        """Return gradient and information of the cells' likelihood, without priors; `shared`: also of shared
+        parameters."""
         outlines = self.outlines(fit)
         distances, places, ways = outlines.distances(cells.points)
         nearest = distances.argmax(1)
@@ -259,7 +261,7 @@ class StatesProblem:
         odds = inside * np.exp(cells.ratios)
         posterior = odds / (odds + 1 - inside)
         spread = inside * (1 - inside)
-        # information of labels less what colours leave open (Louis, JRSS B 1982)
+        # information of the labels minus that missing because colours are ambiguous (Louis, JRSS B 1982)
         label_information = np.clip(spread - posterior * (1 - posterior), 0, None) * cells.weights / cells.softness**2
         slope = (inside - posterior) * cells.weights / cells.softness
         share = np.stack([1 - place, place], -1)
@@ -290,11 +292,11 @@ class StatesProblem:
         return out
 
     def _slopes(self, fit: StatesFit, outlines: Outlines, shared: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of the cones' images [V, 6 C] by each state's parameters [6 + R] and by shared ones [P + 6]."""
-        here = _flat(outlines)
+        """Return derivatives of the cones' images [V, 6 C] by each state's [6 + R] and shared parameters [P + 6]."""
+        base = _flat(outlines)
 
         def by(other: StatesFit, step: float) -> np.ndarray:
-            return (_flat(self.outlines(other)) - here) / step
+            return (_flat(self.outlines(other)) - base) / step
 
         columns = []
         for index in range(fit.own.shape[1]):
@@ -307,7 +309,7 @@ class StatesProblem:
             moved = fit.shared.copy()
             moved[index] += (step := OUTLINES.parameter_step * self.shared_sds[index])
             common.append(by(StatesFit(moved, fit.own), step))
-        empty = np.zeros((*here.shape, 0))
+        empty = np.zeros((*base.shape, 0))
         return np.stack(columns, -1), np.stack(common, -1) if shared else empty
 
 
@@ -335,16 +337,17 @@ class _Arrow(Linearisation[StatesFit]):
         solved = np.linalg.solve(damped, np.concatenate([b.cross, b.own_gradient[..., None]], 2))
         p = len(b.shared)
         if p:
-            left = b.shared + damping * np.diag(np.diag(b.shared)) - np.einsum("sdp,sdq->pq", b.cross, solved[..., :p])
+            shared_block = b.shared + damping * np.diag(np.diag(b.shared))
+            schur = shared_block - np.einsum("sdp,sdq->pq", b.cross, solved[..., :p])
             right = b.shared_gradient - np.einsum("sdp,sd->p", b.cross, solved[..., p])
-            shared = np.linalg.solve(left, -right)
+            shared = np.linalg.solve(schur, -right)
         else:
             shared = np.zeros(0)
         return np.concatenate([shared, (-solved[..., p] - solved[..., :p] @ shared).ravel()])
 
 
 def adjust(problem: StatesProblem, fit: StatesFit, cells: Cells, max_steps: int, *, shared: bool = True) -> StatesFit:
-    """Minimise over all states and, with `shared`, what they share."""
+    """Minimise over all states and, with `shared`, the shared parameters."""
     sds, shared_sds = problem.sds, problem.shared_sds
 
     def linearise(fit: StatesFit) -> Linearisation[StatesFit]:
@@ -367,28 +370,28 @@ def adjust(problem: StatesProblem, fit: StatesFit, cells: Cells, max_steps: int,
 
 
 def _flat(outlines: Outlines) -> np.ndarray:
-    """Numbers [V, 6 C] of the cones' images: both ends px, then half the widths there."""
+    """Return the numbers [V, 6 C] of the cones' images: both ends px, then the half widths there."""
     both = np.concatenate([outlines.ends.reshape(*outlines.ends.shape[:2], 4), outlines.widths], -1)
     return both.reshape(len(both), -1)
 
 
 def _losses(inside: np.ndarray, cells: Cells) -> np.ndarray:
-    """Negative log likelihoods [V] of cells that the instrument covers by `inside` [V, N], relative to tissue."""
+    """Return negative log likelihoods [V] of cells covered by `inside` [V, N], relative to tissue."""
     return -(np.log(inside * np.exp(cells.ratios) + 1 - inside + 1e-9) * cells.weights).sum(1)
 
 
 def _grid(height: int, width: int, cell: int) -> np.ndarray:
-    """Middles [N, 2] px of cells."""
+    """Return centres [N, 2] px of cells."""
     y, x = np.meshgrid(np.arange(0, height, cell) + cell / 2, np.arange(0, width, cell) + cell / 2, indexing="ij")
     return np.stack([x, y], -1).reshape(-1, 2)
 
 
 def posterior(problem: StatesProblem, fit: StatesFit, cells: Cells, *, shared: bool = True) -> np.ndarray:
-    """Covariances [S, 6 + R, 6 + R] of the corrections at a minimum; `shared`: what is shared was fitted, too."""
+    """Return covariances [S, 6 + R, 6 + R] of corrections at a minimum; `shared`: shared ones were fitted too."""
     b = problem.blocks_with_priors(fit, cells, shared)
     inverse = np.linalg.inv(b.own)
     if not shared:
         return np.asarray(inverse)
     carried = inverse @ b.cross  # [S, d, p]
-    left = b.shared - np.einsum("sdp,sdq->pq", b.cross, carried)
-    return np.asarray(inverse + carried @ np.linalg.inv(left) @ carried.transpose(0, 2, 1))
+    schur = b.shared - np.einsum("sdp,sdq->pq", b.cross, carried)
+    return np.asarray(inverse + carried @ np.linalg.inv(schur) @ carried.transpose(0, 2, 1))

@@ -21,7 +21,7 @@ from neeco.geometry.trocar import line_through_trocar
 
 @dataclass(frozen=True, kw_only=True)
 class OutlineModelSettings:
-    """Priors of an instrument's shape and of what is stated of its links."""
+    """Priors of an instrument's shape and of its stated links."""
 
     tube_mm: float = 150.0  # length of the root link that is modelled
     nearest_mm: float = 8.0  # depth at which cones are cut off
@@ -33,8 +33,8 @@ class OutlineModelSettings:
     slide_sd_mm: float = 1.0  # standard deviation of the offset of a prismatic joint
     play_sd_rad: float = 0.012  # standard deviation of the play by which readings lag or lead with the sign of motion
     play_sd_mm: float = 0.3  # the same, of prismatic joints
-    motion_steps: int = 2  # number of moments before and after, between which the sign of motion is taken
-    tilt_sd_rad: float = 0.03  # standard deviation of the tube's axis about its first guess
+    motion_steps: int = 2  # number of instants before and after, from which the sign of motion is computed
+    tilt_sd_rad: float = 0.03  # standard deviation of the tube's axis about its initial estimate
     aside_sd_mm: float = 0.7  # standard deviation of the distance of the tube's axis from the first pivot
     log_radius_sd: float = 0.4  # standard deviation of the logarithm of the tube's radius
     ratio_sd: float = 0.3  # standard deviation of the log ratio of a link's radius to its parent's
@@ -44,15 +44,15 @@ class OutlineModelSettings:
     length_mm: float = 13.0  # length of outermost links
     length_sd_mm: float = 5.0  # standard deviation of that length
     unequal_sd_mm: float = 1.5  # standard deviation of the difference between the lengths of outermost links
-    tube_radius_mm: float = 3.8  # first guess of the tube's radius
-    taper: float = 0.5  # first guess of the ratio of the radii of outermost links
+    tube_radius_mm: float = 3.8  # initial radius of the tube
+    taper: float = 0.5  # initial ratio of the end radii of outermost links
     min_radius_mm: float = 0.2  # minimum radius of a cone
     min_length_mm: float = 2.0  # minimum length of an outermost link
     max_bend_mm: float = 1.5  # maximum RMS distance of logged poses' axes from the trocar
     min_pivot_mm: float = 5.0  # minimum distance of the first pivot from the root's origin, for a direction
-    max_along: float = 0.9  # cosine between a joint's axis and the shaft, above which it turns the shaft about itself
-    min_motion: float = 0.02  # standard deviation of a joint's value, rad, from which it bends
-    min_slide_mm: float = 0.5  # standard deviation of a prismatic joint's value, from which it moves
+    max_along: float = 0.9  # cosine between a joint's axis and the shaft, above which it is a roll joint
+    min_motion: float = 0.02  # standard deviation of a joint's value, rad, above which it counts as moving
+    min_slide_mm: float = 0.5  # the same, of a prismatic joint
     # of outline points, from the tube's end
     tube_stations_mm: tuple[int, ...] = (1, 3, 6, 9, 13, 18, 24, 31, 40, 50, 62, 75, 90)
 
@@ -77,16 +77,16 @@ class Cone:
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """Cones [C] as images [F] show them: middles of both ends [F, C, 2, 2] px, half the widths there [F, C, 2] px, and
-    whether they are before the camera [F, C]."""
+    """Images of cones [C] in F frames: centres of both ends [F, C, 2, 2] px, half widths there [F, C, 2] px, and
+    whether they are in front of the camera [F, C]."""
 
     ends: np.ndarray
     widths: np.ndarray
     valid: np.ndarray
 
     def distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Signed distances [F, C, N] px of points [F, N, 2] to every cone's outline, inside positive; where along the
-        cones they are nearest [F, C, N]; and unit directions [F, C, N, 2] from there."""
+        """Return signed distances [F, C, N] px of points [F, N, 2] to every cone's outline, positive inside; the
+        nearest position along the cones [F, C, N]; and unit directions [F, C, N, 2] from there."""
         start, along = self.ends[:, :, None, 0], (self.ends[:, :, 1] - self.ends[:, :, 0])[:, :, None]
         square = np.maximum((along**2).sum(-1), 1e-6)
         off = points[:, None] - start
@@ -98,10 +98,10 @@ class Outlines:
 
 
 class ArticulatedModel:
-    """Cones, parameters [P] and their priors (`means`, `sds`) of an instrument whose tree states joints.
+    """Cones, parameters [P] and their priors (`means`, `sds`) of an instrument with a stated kinematic tree.
 
-    poses [F, 4, 4] base_from_root and values [F, L] of all links' joints serve to guess the tube's axis and to tell
-    which joints move.
+    poses [F, 4, 4] base_from_root and values [F, L] of all links' joints serve to estimate the tube's axis and to
+    detect which joints move.
     """
 
     def __init__(self, tree: KinematicTree, poses: np.ndarray) -> None:
@@ -135,7 +135,7 @@ class ArticulatedModel:
         return start
 
     def _hinges(self) -> None:
-        """Parameters of pivots and axes, which links at the same place share, and of offsets."""
+        """Return the parameters of pivots and axes, shared by links at the same place, and of offsets."""
         self.pivots: list[int | None] = []
         self.offsets: list[int | None] = []
         self.plays: list[int] = []
@@ -188,8 +188,8 @@ class ArticulatedModel:
                 self.cones.append(Cone(index, None, radii, length, heading))
 
     def link_poses(self, parameters: np.ndarray, values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """root_from_link rotations [F, 3, 3] and translations [F, 3] mm of all links; values [F, L] of joints, or
-        [F, 2 L] with the signs of their motion (`with_motion`), by which their play acts."""
+        """Return root_from_link rotations [F, 3, 3] and translations [F, 3] mm of all links; values [F, L] of joints,
+        or [F, 2 L] with the signs of their motion (`with_motion`), to which backlash is proportional."""
         count, links = len(values), len(self.tree.links)
         turns, shifts = [np.tile(np.eye(3), (count, 1, 1))], [np.zeros((count, 3))]
         turns[0], shifts[0] = turns[0] @ self.tree.links[0].origin[:3, :3], shifts[0] + self.tree.links[0].origin[:3, 3]
@@ -216,8 +216,8 @@ class ArticulatedModel:
         return turns, shifts
 
     def cones_at(self, parameters: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Ends [F, C, 2, 3] mm of all cones in the root's frame, their radii [C, 2] mm and flatness [C, 2], and across
-        [F, C, 3], the direction that flatness is against. The first two cones are the tube and its end."""
+        """Return ends [F, C, 2, 3] mm of all cones in the root's frame, their radii [C, 2] mm and flatness [C, 2], and
+        `across` [F, C, 3], the reference direction of flatness. The first two cones are the tube and its end."""
         turns, shifts = self.link_poses(parameters, values)
         basis = frame_about(self.axis)
         tilt = parameters[self.tilt : self.tilt + 4]
@@ -257,7 +257,7 @@ class ArticulatedModel:
         camera_from_root: np.ndarray,
         intrinsics: tuple[float, float, float, float],
     ) -> Outlines:
-        """Project all cones; camera_from_root [F, 4, 4]."""
+        """Return the projections of all cones; camera_from_root [F, 4, 4]."""
         ends, radii, flat, sideways = self.cones_at(parameters, values)
         turn = camera_from_root[:, None, :3, :3]
         a = (turn @ ends[:, :, 0, :, None])[..., 0] + camera_from_root[:, None, :3, 3]
@@ -271,7 +271,7 @@ class ArticulatedModel:
         normal = unit(np.cross(a, b) + 1e-9)  # of the plane through the camera and the cone's axis
         facing = np.cross(normal, axis)
         facing = facing * -np.sign((facing * b).sum(-1, keepdims=True))
-        # flatness: a radius as an angle's function, about the axis, of where the outline is
+        # flatness: the radius depends on the angle about the axis at which the outline lies
         other = np.cross(axis, sideways)
         angle = np.arctan2((normal * other).sum(-1), (normal * sideways).sum(-1))
         factor = np.exp(flat[:, 0] * np.cos(2 * angle) + flat[:, 1] * np.sin(2 * angle))
@@ -299,7 +299,7 @@ class ArticulatedModel:
         return Outlines(images, widths, valid)
 
     def outline_points(self, outlines: Outlines) -> np.ndarray:
-        """Points [F, N, 2] px of all cones' outlines, of the cone `owner` [N] each."""
+        """Return points [F, N, 2] px of all cones' outlines, of the cone `owner` [N] each."""
         start, end = outlines.ends[:, self.owner, 0], outlines.ends[:, self.owner, 1]
         ahead = end - start
         unit_ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-6)
@@ -310,7 +310,7 @@ class ArticulatedModel:
         return np.asarray(start + self.places[:, None] * ahead + width * way)
 
     def _outline(self) -> None:
-        """The cone of every outline point, its place along the cone, and its angle from the cone's direction."""
+        """Return every outline point's cone, position along it, and angle from the cone's direction."""
         owners, places, angles = [], [], []
         for cone in range(2 + len(self.cones)):
             stations = STATIONS if cone else TUBE_STATIONS
@@ -322,7 +322,7 @@ class ArticulatedModel:
 
 
 def joint_values(tree: KinematicTree, readings: dict[str, np.ndarray]) -> np.ndarray:
-    """Values [..., L] of all links' joints, rad or mm, at readings [...]; 0 for fixed ones."""
+    """Return values [..., L] of all links' joints, rad or mm, at readings [...]; 0 for fixed ones."""
     shape = next(iter(readings.values())).shape
     columns = []
     for link in tree.links:
@@ -334,8 +334,8 @@ def joint_values(tree: KinematicTree, readings: dict[str, np.ndarray]) -> np.nda
 
 
 def with_motion(values: np.ndarray) -> np.ndarray:
-    """Values [S, F, 2 L]: those [S, F, L] of all links' joints at evenly spaced moments S about those of the frames,
-    and the signs of their motion then, rounded where they turn."""
+    """Return values [S, F, 2 L]: those [S, F, L] of all links' joints at evenly spaced instants S around those of the
+    frames, and the signs of their motion, smoothed at reversals."""
     last = len(values) - 1
     near = np.arange(len(values))
     speed = values[np.minimum(near + MODEL.motion_steps, last)] - values[np.maximum(near - MODEL.motion_steps, 0)]
@@ -344,7 +344,7 @@ def with_motion(values: np.ndarray) -> np.ndarray:
 
 
 def bends(tree: KinematicTree, values: np.ndarray) -> bool:
-    """Whether joints move the links in a recording, values [F, L]."""
+    """Return whether joints move the links in a recording, values [F, L]."""
     kinds = [link.type for link in tree.links]
     least = np.array(
         [np.inf if kind == FIXED else MODEL.min_slide_mm if kind == PRISMATIC else MODEL.min_motion for kind in kinds]
@@ -360,23 +360,23 @@ def mirrored(
     readings: Mapping[str, float],
 ) -> tuple[np.ndarray, dict[str, float]]:
     """Return the state with nearly the same silhouette as (pose [4, 4] world_from_root, readings): mirrored in depth
-    about the first joint across the shaft and, in its own frame, along that joint's axis; what bends across it then
-    bends the other way. axis [3]: the shaft's, unit, in the root's frame."""
+    about the first joint across the shaft and, in its own frame, along that joint's axis; joints across it are negated.
+    axis [3]: the shaft's, unit, in the root's frame."""
     pivot, direction, across = _first_joint_across(tree, axis)
-    here = camera_from_world @ pose
-    center = here[:3, :3] @ pivot + here[:3, 3]
-    here[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ here[:3, :3] @ (np.eye(3) - 2 * np.outer(direction, direction))
-    here[:3, 3] = center - here[:3, :3] @ pivot
+    moved = camera_from_world @ pose
+    center = moved[:3, :3] @ pivot + moved[:3, 3]
+    moved[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ moved[:3, :3] @ (np.eye(3) - 2 * np.outer(direction, direction))
+    moved[:3, 3] = center - moved[:3, :3] @ pivot
     values = _bent_back(readings, [link for link, joint_axis in across if abs(joint_axis @ direction) < 0.5])
-    return np.linalg.inv(camera_from_world) @ here, values
+    return np.linalg.inv(camera_from_world) @ moved, values
 
 
 def half_turned(
     tree: KinematicTree, axis: np.ndarray, pose: np.ndarray, readings: Mapping[str, float]
 ) -> tuple[np.ndarray, dict[str, float]]:
-    """Return the state (pose [4, 4] world_from_root, readings) turned by 180 degrees about the shaft, with nearly the
-    same silhouette: joints across the shaft are bent the other way, and jaws change places. axis [3]: the shaft's,
-    unit, in the root's frame."""
+    """Return the state (pose [4, 4] world_from_root, readings) rotated by 180 degrees about the shaft, with nearly the
+    same silhouette: joints across the shaft are negated, and jaws change places. axis [3]: the shaft's, unit, in the
+    root's frame."""
     pivot, _, across = _first_joint_across(tree, axis)
     turn = np.eye(4)
     turn[:3, :3] = 2 * np.outer(axis, axis) - np.eye(3)
@@ -387,9 +387,9 @@ def half_turned(
 def _first_joint_across(
     tree: KinematicTree, axis: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[Link, np.ndarray]]]:
-    """Return a point [3] (mm) and the direction [3] of the first joint that does not turn about the shaft's `axis` [3],
-    and every such joint with its direction, innermost first; directions are across the shaft, in the root's frame, at
-    rest. Without one: the root's origin and any direction across."""
+    """Return a point [3] (mm) and the direction [3] of the first joint that does not rotate about the shaft's `axis`
+    [3], and every such joint with its direction, innermost first; directions are across the shaft, in the root's frame,
+    at rest. Without one: the root's origin and any direction across."""
     points, axes = (part[::-1] for part in tree.axes_at_rest)
     joints = zip(tree.joints[::-1], points, axes, strict=True)
     across = [(link, point, u - (u @ axis) * axis) for link, point, u in joints if abs(u @ axis) < MODEL.max_along]
@@ -399,7 +399,7 @@ def _first_joint_across(
 
 
 def _bent_back(readings: Mapping[str, float], links: Sequence[Link]) -> dict[str, float]:
-    """Return `readings`, negated where they bend the joints of `links`; those that open jaws remain."""
+    """Return `readings`, negated where they move the joints of `links`; those that open jaws are unchanged."""
     values = dict(readings)
     for reading in {name for link in links for name in link.value}:
         gains = [link.value[reading] for link in links if reading in link.value]
@@ -409,8 +409,8 @@ def _bent_back(readings: Mapping[str, float], links: Sequence[Link]) -> dict[str
 
 
 def _tube_axis(tree: KinematicTree, pivot: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """First guess [3] of the tube's direction in the root's frame: through the trocar, as the log has it; else from the
-    root's origin to the first pivot; else the root's z."""
+    """Return an initial direction [3] of the tube in the root's frame: through the trocar estimated from the log; else
+    from the root's origin to the first pivot; else the root's z axis."""
     line = line_through_trocar(poses, MODEL.max_bend_mm)
     if line is not None:
         return line.axis

@@ -1,8 +1,8 @@
-"""Sizes of the errors of recorded states, and states that are wrong altogether, from where images show an instrument.
+"""Sizes of recorded states' errors, and wrong states, estimated from the image regions of an instrument.
 
-Fits of all states (`outline_fit`) say how far each is off and how well that is known. The standard deviations under
-which these corrections are most likely (restricted maximum likelihood of variance components: Patterson, Thompson,
-Biometrika 1971) replace those that were expected where they are clearly larger.
+Fits of all states (`outline_fit`) yield each correction and its uncertainty. The standard deviations under which these
+corrections are most likely (restricted maximum likelihood of variance components: Patterson, Thompson, Biometrika 1971)
+replace the expected ones if they are clearly larger.
 """
 
 from __future__ import annotations
@@ -26,27 +26,28 @@ from neeco.states.refinement import Refinement, Verdict
 class OutlineStatesSettings:
     """Settings of the search by outlines."""
 
-    # standard deviations of errors that are tried: tilts, roll (rad), across, depth (mm), joints (rad, or mm of slides)
+    # candidate standard deviations of errors: tilts, roll (rad), across, depth (mm), joints (rad, or mm of prismatic
+    # ones)
     tried: tuple[float, ...] = (2 * DEG, 6 * DEG, 0.4, 1.5, 4 * DEG, 1.5)
-    # of a state that is wrong altogether, about each of its starts
+    # of a wrong state, about each of its initial states
     wrong: tuple[float, ...] = (12 * DEG, 30 * DEG, 4.0, 8.0, 20 * DEG, 8.0)
     # maximum standard deviations of a refitted state that counts
     settled: tuple[float, ...] = (6 * DEG, 15 * DEG, 1.5, 4.0, 15 * DEG, 4.0)
-    # sizes that errors of the model alone may cause: no cone is a wrist
+    # sizes that model errors alone may cause, as no wrist is a cone
     feigned: tuple[float, ...] = (0.35 * DEG, 2.3 * DEG, 0.3, 0.6, 3 * DEG, 1.0)
     # minimum share of the sizes tried that any parameter gets where those of another are large
     min_share: float = 0.5
-    min_factor: float = 2.0  # factor on the sizes above, from which an error counts as large
-    em_steps: int = 200  # steps of expectation maximisation
-    max_estimated: int = 30  # maximum number of states from which sizes are estimated
+    min_factor: float = 2.0  # factor on the sizes above, beyond which an error counts as large
+    em_steps: int = 200  # iterations of expectation maximisation
+    max_estimated: int = 30  # maximum number of states for estimating sizes
     bad_mads: float = 6.0  # median absolute deviations above the median, from which a misfit is bad
     bad_misfit: float = 0.08  # minimum difference from the median, from which a misfit is bad
-    bad_weight: float = 0.02  # weight of bad states in the fit of what all states share
-    large_sds: float = 1.8  # root mean square of a correction in standard deviations
-    max_usual_misfit: float = 0.25  # median misfit above which colours do not show the instrument
-    max_misfit: float = 0.4  # misfit from which a state is wrong even where nothing explains it better
-    better: float = 0.75  # ratio of another start's misfit to a state's, below which that start is right
-    n_others: int = 4  # number of states of other moments that are tried
+    bad_weight: float = 0.02  # weight of bad states in the fit of shared parameters
+    large_sds: float = 1.8  # RMS of a correction in standard deviations, above which it is large
+    max_usual_misfit: float = 0.25  # median misfit above which colours do not discriminate the instrument
+    max_misfit: float = 0.4  # misfit above which a state is wrong even if no other explains the image better
+    better: float = 0.75  # ratio of another initial state's misfit to a state's, below which that one is right
+    n_others: int = 4  # number of states of other instants that are tried
     width_px: int = 320  # width of the images compared
     min_states: int = 8  # minimum number of states; with fewer, none is judged
 
@@ -58,17 +59,17 @@ STATES = OutlineStatesSettings()
 class FoundStates:
     """Result of the search over S states."""
 
-    large: bool  # whether the errors of all are larger than expected, not only those of inconsistent ones
+    large: bool  # whether all errors are larger than expected, not only those of inconsistent states
     sds: np.ndarray  # [6 + R] of the recorded states' errors: two tilts, roll, across, across, depth, readings
     poses: np.ndarray  # [S, 4, 4] world_from_root
     readings: np.ndarray  # [S, R]
     covariances: np.ndarray  # [S, 6 + R, 6 + R] of pose (rad, mm, the root's frame) and readings
-    inconsistent: np.ndarray  # bool [S], whose states contradict the others
-    refitted: np.ndarray  # bool [S], of those: explained from another start
+    inconsistent: np.ndarray  # bool [S], states that contradict the others
+    refitted: np.ndarray  # bool [S], inconsistent states explained from another initial state
 
 
 def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> FoundStates | None:
-    """Return the states and the sizes of their errors, or None where nothing is found beyond what is expected.
+    """Return the states and the sizes of their errors, or None if they are as expected.
 
     expected [6 + R]: standard deviations of the recorded states; slides [R]: which readings are of prismatic joints.
     """
@@ -85,7 +86,7 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
     if not large and not _bad(first).any():
         return None
     sds = expected
-    if large:  # parameters that make up for each other must not hold each other
+    if large:  # so that correlated parameters do not constrain each other
         sds = np.maximum(np.maximum(sizes, STATES.min_share * sds_of(STATES.tried, slides)), expected)
     states = _with_inconsistent(_fit(views, sds, first), sds, slides, large=large)
     return states if large or states.inconsistent.any() else None
@@ -94,8 +95,8 @@ def find_states(views: LinkViews, expected: np.ndarray, slides: np.ndarray) -> F
 def register_states(views: TrainingViews, refinement: Refinement, instrument: Instrument) -> bool:
     """Refit the states of training frames that contradict the others, or exclude them; return whether there are any.
 
-    `instrument` is the only one. Without stated links, with unrecorded readings, or before other cameras than pinholes
-    of one size, nothing is done.
+    `instrument` is the only one. Does nothing without stated links, with unrecorded readings, or unless cameras are
+    pinholes of one size.
     """
     frames, tree = views.frames, instrument.kinematics
     sizes = {(frame.camera.width, frame.camera.height) for frame in frames}
@@ -125,7 +126,7 @@ def register_states(views: TrainingViews, refinement: Refinement, instrument: In
     tilt, roll, across, depth = usual[:3].min(), usual[:3].max(), usual[3:6].min(), usual[3:6].max()
     expected = np.append([tilt, tilt, roll, across, across, depth], usual[6:])
     states = find_states(recorded, expected, slides)
-    if states is None or not states.inconsistent.any():  # errors of all states are refined while training
+    if states is None or not states.inconsistent.any():  # errors of all states are refined during training
         return False
     for row, (first, *_) in enumerate(refinement.frames_of_instant):
         if states.inconsistent[row] and not states.refitted[row]:
@@ -151,14 +152,14 @@ class _Fitted:
 
     @property
     def worst(self) -> np.ndarray:
-        """Largest misfit [S] of each state's views."""
+        """Return the largest misfit [S] over each state's views."""
         worst = np.zeros(len(self.problem.views.poses))
         np.maximum.at(worst, self.problem.views.state_of_view, self.misfits)
         return worst
 
 
 def _fit(views: LinkViews, sds: np.ndarray, start: _Fitted | None = None) -> _Fitted:
-    """Fit all states from those recorded; start: a fit of some of them, whose shape and base are where it begins."""
+    """Fit all states from the recorded ones; start: a fit of some, with the initial shape and base."""
     problem = StatesProblem(views, np.tile(sds, (len(views.poses), 1)))
     fit, softness, stages = problem.start(), OUTLINES.first_softness, OUTLINES.stages
     if start is not None:
@@ -169,7 +170,7 @@ def _fit(views: LinkViews, sds: np.ndarray, start: _Fitted | None = None) -> _Fi
     for cell, next_softness, steps in stages:
         ratios = problem.learn_colors(fit, softness)
         cells = problem.cells(fit, ratios, cell, next_softness)
-        if softness < OUTLINES.first_softness:  # wrong states do not count in the shape and the base
+        if softness < OUTLINES.first_softness:  # wrong states do not count in shape and base
             bad = _bad(_Fitted(problem, fit, ratios, cells, problem.misfits(fit, ratios)))
             weights = np.where(bad, STATES.bad_weight, 1.0)[views.state_of_view, None]
             cells = replace(cells, weights=cells.weights * weights)
@@ -179,13 +180,13 @@ def _fit(views: LinkViews, sds: np.ndarray, start: _Fitted | None = None) -> _Fi
 
 
 def error_sizes(fitted: _Fitted, sds: np.ndarray) -> np.ndarray:
-    """Most likely standard deviations [6 + R] of the states' errors, from `sds` [6 + R] on (EM)."""
+    """Return the most likely standard deviations [6 + R] of the states' errors, starting at `sds` [6 + R] (EM)."""
     problem, fit = fitted.problem, fitted.fit
     b = problem.blocks(fit, fitted.cells, shared=False)
     use = ~_bad(fitted)
     information = b.own[use]
     linear = np.einsum("sij,sj->si", information, fit.own[use]) - b.own_gradient[use]
-    # without a constant error, which the shape takes up
+    # without a constant error, which the shape absorbs
     constant = np.linalg.lstsq(information.sum(0), linear.sum(0), rcond=1e-3)[0]
     linear = linear - np.einsum("sij,j->si", information, constant)
     groups = [np.array(rows) for rows in ((0, 1), (2,), (3, 4), (5,), *((k,) for k in range(POSE, len(sds))))]
@@ -201,25 +202,25 @@ def error_sizes(fitted: _Fitted, sds: np.ndarray) -> np.ndarray:
 
 
 def _bad(fitted: _Fitted) -> np.ndarray:
-    """bool [S]: states that a fit explains far worse than most, or that it moves far."""
+    """Return bool [S]: states with a far larger misfit than most, or a large correction."""
     return np.asarray((fitted.worst > _worst_usual(fitted.worst)) | _far(fitted))
 
 
 def _worst_usual(misfits: np.ndarray) -> float:
-    """Misfit above which a state's is bad, by those of others."""
+    """Return the misfit above which a state's is bad, relative to the others'."""
     usual = float(np.median(misfits))
     deviation = 1.48 * float(np.median(np.abs(misfits - usual)))
     return usual + max(STATES.bad_mads * deviation, STATES.bad_misfit)
 
 
 def _far(fitted: _Fitted) -> np.ndarray:
-    """bool [S]: states that a fit moves far, in standard deviations of their priors."""
+    """Return bool [S]: states with a large correction, in standard deviations of their priors."""
     size = np.sqrt(((fitted.fit.own / fitted.problem.sds) ** 2).mean(1))
     return np.asarray(size > STATES.large_sds * max(1.0, 1.5 * float(np.median(size))))
 
 
 def _with_inconsistent(fitted: _Fitted, sds: np.ndarray, slides: np.ndarray, *, large: bool) -> FoundStates:
-    """The states of a fit; those that are badly explained, from other starts."""
+    """Return the states of a fit; badly explained ones are refitted from other initial states."""
     problem, fit = fitted.problem, fitted.fit
     poses, readings = problem.corrected(fit)
     covariances = problem.to_root @ posterior(problem, fit, fitted.cells) @ problem.to_root.transpose(0, 2, 1)
@@ -231,7 +232,7 @@ def _with_inconsistent(fitted: _Fitted, sds: np.ndarray, slides: np.ndarray, *, 
     for state in np.flatnonzero(inconsistent).tolist():
         trial = _from_starts(fitted, state, good, slides)
         best = trial.misfits.argmin()
-        if trial.misfits[best] > STATES.better * worst[state]:  # nothing explains it much better
+        if trial.misfits[best] > STATES.better * worst[state]:  # no other state explains it much better
             inconsistent[state] = worst[state] > STATES.max_misfit or far[state]
             continue
         trial_poses, values = trial.problem.corrected(trial.fit)
@@ -253,7 +254,7 @@ def _with_inconsistent(fitted: _Fitted, sds: np.ndarray, slides: np.ndarray, *, 
 
 
 def _from_starts(fits: _Fitted, state: int, good: np.ndarray, slides: np.ndarray) -> _Fitted:
-    """Fits of one state from several starts, each as a state of its own, in its first view."""
+    """Return fits of one state from several initial states, as separate states, in its first view."""
     problem, views = fits.problem, fits.problem.views
     view = int(np.flatnonzero(views.state_of_view == state)[0])
     pose, readings = views.poses[state], views.readings[state]
@@ -262,14 +263,14 @@ def _from_starts(fits: _Fitted, state: int, good: np.ndarray, slides: np.ndarray
     quarters = Rotation.from_rotvec(np.outer((np.pi / 2, np.pi, -np.pi / 2), axis)).as_matrix()
     starts += [(pose @ rigid(turn, np.zeros(3)), readings) for turn in quarters]
     names = views.tree.readings
-    there, bent = mirrored(
+    flipped, bent = mirrored(
         views.tree, axis, views.camera_from_world[view], pose, dict(zip(names, readings.tolist(), strict=True))
     )
-    starts.append((there, np.array([bent[name] for name in names])))
+    starts.append((flipped, np.array([bent[name] for name in names])))
     own_poses, own_readings = problem.corrected(fits.fit)
-    others = _subproblem(fits, view, own_poses[good], own_readings[good], sds_of(STATES.wrong, slides))
+    rivals = _subproblem(fits, view, own_poses[good], own_readings[good], sds_of(STATES.wrong, slides))
     ratios = np.broadcast_to(fits.ratios[view], (len(good), *fits.ratios.shape[1:]))
-    near = np.argsort(others.misfits(StatesFit(fits.fit.shared, np.zeros_like(others.sds)), ratios))[: STATES.n_others]
+    near = np.argsort(rivals.misfits(StatesFit(fits.fit.shared, np.zeros_like(rivals.sds)), ratios))[: STATES.n_others]
     starts += [(own_poses[good[k]], own_readings[good[k]]) for k in near]
     poses, values = (np.stack(part) for part in zip(*starts, strict=True))
     trial = _subproblem(fits, view, poses, values, sds_of(STATES.wrong, slides))
@@ -282,7 +283,7 @@ def _from_starts(fits: _Fitted, state: int, good: np.ndarray, slides: np.ndarray
 
 
 def _subproblem(fitted: _Fitted, view: int, poses: np.ndarray, readings: np.ndarray, sds: np.ndarray) -> StatesProblem:
-    """The problem of one view at several states, with the shape as found."""
+    """Return the problem of one view with several states, for the fitted shape."""
     count = len(poses)
     repeated = fitted.problem.views.take(np.full(count, view), np.arange(count), poses, readings)
     return StatesProblem(repeated, np.tile(sds, (count, 1)), like=fitted.problem)

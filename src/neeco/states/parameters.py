@@ -1,7 +1,6 @@
-"""The parameters by which states and cameras are corrected, and priors on them.
+"""Parameters that correct states and cameras, and their priors.
 
-Every fit uses them: Levenberg-Marquardt on one image (`alignment`, `fitter`) and Adam during training
-(`refinement`).
+Used by all fits: Levenberg-Marquardt on one image (`alignment`, `fitter`) and Adam during training (`refinement`).
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ def moved_pose(pose: Tensor, increment: Tensor, pivot: Tensor | None = None) -> 
 
 
 def _moved_array(pose: Tensor, increment: Tensor, pivot: Tensor | None) -> Tensor:
-    """`moved_pose` without gradients, float64, in a tenth of the time."""
+    """Return `moved_pose` without gradients in float64, ten times as fast."""
     vector, step = increment.detach().cpu().numpy(), np.eye(4)
     rotation = Rotation.from_rotvec(vector[:3]).as_matrix()
     step[:3, :3], step[:3, 3] = rotation, vector[3:]
@@ -59,21 +58,21 @@ def precision_of(deviations: Tensor) -> Tensor:
 
 
 def sds_of(sizes: tuple[float, ...], slides: Sequence[bool] | np.ndarray) -> np.ndarray:
-    """Return the standard deviations [6 + J] of an instrument's two tilts and roll (rad), shifts across the view twice
-    and in depth (mm), and joints, of which `slides` [J] are prismatic; sizes: tilt, roll, across, depth, joint (rad),
-    prismatic joint (mm)."""
+    """Return the standard deviations [6 + J] of an instrument's two tilts and roll (rad), two shifts across the view
+    and one in depth (mm), and joints, of which `slides` [J] are prismatic; sizes: tilt, roll, across, depth, joint
+    (rad), prismatic joint (mm)."""
     tilt, roll, across, depth, turn, slide = sizes
     return np.append([tilt, tilt, roll, across, across, depth], np.where(slides, slide, turn))
 
 
 @dataclass(frozen=True, kw_only=True)
 class InstrumentParameters:
-    """The parameters of one instrument: six of its pose (see `moved_pose`), then one per joint (rad or mm)."""
+    """Parameters of one instrument: six of its pose (see `moved_pose`), then one per joint (rad or mm)."""
 
     name: str
     joints: tuple[str, ...]
     slides: tuple[bool, ...]  # which joints are prismatic
-    pivot: Tensor | None = None  # [3] mm, instrument frame, about which rotations turn; None: the origin
+    pivot: Tensor | None = None  # [3] mm, instrument frame, centre of rotations; None: the origin
     low: Tensor | None = None  # [J] rad or mm, bounds of the joints' values; None: unbounded
     high: Tensor | None = None
 
@@ -86,7 +85,7 @@ class InstrumentParameters:
 
 @dataclass(frozen=True)
 class StateParameters:
-    """A vector of P parameters that correct a state: those of every instrument, then six of the camera."""
+    """Vector of P parameters that correct a state: those of every instrument, then six of the camera."""
 
     instruments: tuple[InstrumentParameters, ...]
     joints_last: bool = False  # the joints of all instruments follow all poses; else each instrument's follow its pose
@@ -94,7 +93,7 @@ class StateParameters:
 
     @cached_property
     def rows(self) -> tuple[tuple[slice, slice], ...]:
-        """Places in the vector of each instrument's pose and joints."""
+        """Return the slices of each instrument's pose and joints in the vector."""
         places, joints_before = [], 0
         for index, item in enumerate(self.instruments):
             pose = 6 * index + (0 if self.joints_last else joints_before)
@@ -105,14 +104,14 @@ class StateParameters:
 
     @cached_property
     def size(self) -> int:
-        """P."""
+        """Return P."""
         return sum(6 + len(item.joints) for item in self.instruments) + 6 * self.camera
 
     def vector(
         self, radians: float, millimetres: float, joints: tuple[float, float], camera: tuple[float, float] = (0.0, 0.0)
     ) -> Tensor:
-        """Return [P] float64 with one number for rotations, translations, joints (revolute rad, prismatic mm), and the
-        camera's rotation and translation."""
+        """Return [P] float64 with one number each for rotations, translations, joints (revolute rad, prismatic mm), and
+        the camera's rotation and translation."""
         values = torch.empty(self.size, dtype=torch.float64)
         for item, (pose, rows) in zip(self.instruments, self.rows, strict=True):
             values[pose] = torch.tensor([radians] * 3 + [millimetres] * 3, dtype=torch.float64)
@@ -124,12 +123,12 @@ class StateParameters:
     def vector_from_degrees(
         self, degrees: float, millimetres: float, joint_degrees: float, joint_millimetres: float
     ) -> Tensor:
-        """Return the `vector` [P] of numbers given in degrees and mm."""
+        """Return the `vector` [P] of numbers in degrees and mm."""
         return self.vector(degrees * DEG, millimetres, (joint_degrees * DEG, joint_millimetres))
 
     def moved_by_parts(self, state: State, poses: Sequence[Tensor], joints: Sequence[Sequence[Any]] | None) -> State:
-        """Return `state` with every instrument's pose moved by [6] of `poses`, its joints by [J] of `joints`, within
-        their bounds (None: joints stay); differentiable where these are tensors."""
+        """Return `state` with every instrument's pose moved by [6] of `poses` and its joints by [J] of `joints`, within
+        their bounds (None: joints stay); differentiable if these are tensors."""
         instruments = dict(state.instruments)
         for number, (item, increment) in enumerate(zip(self.instruments, poses, strict=True)):
             before = instruments[item.name]
@@ -166,7 +165,7 @@ class StateParameters:
         return delta
 
     def step_sign(self, state: State, index: int, step: float) -> int:
-        """Return 1, or -1 where parameter `index` is a joint that `step` upwards would move beyond its bounds."""
+        """Return 1, or -1 if `step` upwards would move joint parameter `index` beyond its bounds."""
         for item, (_, joints) in zip(self.instruments, self.rows, strict=True):
             if joints.start <= index < joints.stop:
                 value = state.instruments[item.name].joints[item.joints[index - joints.start]] + step

@@ -1,8 +1,7 @@
 """Prediction of the errors of new states from those of the training states.
 
-The calibration of a robot is off by what depends on its joints; a tracker drifts with time. Corrections that training
-found are interpolated between the states (a Gaussian process), and that is used only where stretches of the recording
-that were left out are predicted from the others.
+A robot's calibration error depends on its joints; a tracker drifts with time. Learned corrections are interpolated
+between states (a Gaussian process), but only if they predict held-out intervals of the recording.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ from neeco.states.refinement import Refinement
 class PredictionSettings:
     """Settings of the prediction."""
 
-    n_blocks: int = 6  # stretches of the recording, left out one after the other
+    n_blocks: int = 6  # contiguous intervals of the recording for cross-validation
     min_instants: int = 12  # with fewer, nothing is predicted
-    min_explained: float = 0.1  # share of the corrections' variance: independent errors reach 0.06 by chance
+    min_explained: float = 0.1  # minimum share of the corrections' variance; independent errors reach 0.06 by chance
     lengths: tuple[float, float, float, float] = (0.5, 1.0, 2.0, 4.0)  # of the kernel, in units of features
-    # variance of a single instant's correction over the kernel's
+    # ratio of a single instant's noise variance to the kernel's
     noises: tuple[float, float, float, float] = (0.1, 0.3, 1.0, 3.0)
     jitter: float = 1e-6  # added to the kernel's diagonal
-    # median absolute deviations of the corrections of states that were not wrong altogether
+    # median absolute deviations of the corrections, without wrong states
     max_deviations: float = 8.0
 
 
@@ -40,16 +39,16 @@ PREDICTION = PredictionSettings()
 class Prediction:
     """Verdict on the prediction of an instrument's pose corrections, or of those of a reading."""
 
-    explained: float  # share of the variance of left-out corrections
-    applied: bool  # to new states
+    explained: float  # share of variance explained on held-out instants
+    applied: bool  # whether new states are corrected
 
 
 @torch.no_grad()
 def predict_corrections(
     corrections: StateCorrections, refinement: Refinement, frames: Sequence[Frame]
 ) -> dict[str, Prediction]:
-    """Estimate `corrections` from those that training found for its frames, where states predict them, and take these
-    out of the training frames' own.
+    """Fit `corrections` to the learned corrections of training frames, if states predict them, and subtract them from
+    the training frames' own.
 
     Returns the verdict on each instrument's pose, under its name, and on its readings, under NAME.READING.
     """
@@ -68,7 +67,7 @@ def predict_corrections(
         rows = torch.cat([refinement.poses[order, index], refinement.joints[order][:, columns]], 1).double().cpu()
         sigma = torch.cat([refinement.pose_sd[:, index].mean(0), refinement.joint_sd[:, columns].mean(0)])
         usual_rows = torch.ones(len(rows), dtype=torch.bool)
-        if bool(refinement.fitted.any()):  # without those of states that were wrong altogether
+        if bool(refinement.fitted.any()):  # excluding wrong states
             off = (rows - rows.median(0).values).abs()
             usual_rows = (off <= PREDICTION.max_deviations * off.median(0).values.clamp_min(1e-9)).all(1)
         parts = {name: slice(0, 6)} | {f"{name}.{reading}": slice(6 + k, 7 + k) for k, reading in enumerate(readings)}
@@ -93,16 +92,16 @@ def predict_corrections(
 
 
 def _best(features: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, float, float]:
-    """Return what leaving out stretches of `rows` [n, K] gives: sums [K] of squares of their residuals from the
-    prediction and from the mean, and the kernel's length and noise of the best prediction."""
+    """Return the cross-validation of `rows` [n, K]: sums [K] of squared residuals of the prediction and of the mean,
+    and the kernel's length and noise of the best prediction."""
     block = torch.arange(len(rows)) * PREDICTION.n_blocks // len(rows)
-    left = [(block == number, block != number) for number in range(PREDICTION.n_blocks)]
-    usual = torch.stack([(rows[out] - rows[rest].mean(0)).square().sum(0) for out, rest in left]).sum(0)
+    folds = [(block == number, block != number) for number in range(PREDICTION.n_blocks)]
+    usual = torch.stack([(rows[out] - rows[rest].mean(0)).square().sum(0) for out, rest in folds]).sum(0)
     tried = []
     for length in PREDICTION.lengths:
         for noise in PREDICTION.noises:
             error = torch.zeros_like(usual)
-            for out, rest in left:
+            for out, rest in folds:
                 mean = rows[rest].mean(0)
                 anchors = features[rest][evenly_spaced(int(rest.sum()), CORRECTIONS.max_anchors)]
                 weights = _weights(features[rest], rows[rest] - mean, anchors, length, noise)
@@ -113,7 +112,7 @@ def _best(features: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, float, float]
 
 
 def _weights(features: Tensor, rows: Tensor, anchors: Tensor, length: float, noise: float) -> Tensor:
-    """Return the weights [A, K] of kernels at `anchors` [A, F] that explain `rows` [n, K] (subset of regressors)."""
+    """Return the weights [A, K] of kernels at `anchors` [A, F] fitted to `rows` [n, K] (subset of regressors)."""
     gram, across = kernel(anchors, anchors, length), kernel(anchors, features, length)
     return torch.linalg.solve(
         across @ across.T + noise * gram + PREDICTION.jitter * torch.eye(len(gram)).to(gram), across @ rows

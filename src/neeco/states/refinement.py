@@ -1,6 +1,6 @@
-"""Corrections of the recorded geometry that training learns: poses and joints per frame, one latency, cameras.
+"""Corrections of the recorded geometry learned in training: poses and joints per frame, one latency, cameras.
 
-The constant tracker-to-world correction is the scene's own (`GaussianScene.registration`): new states need it too.
+The constant tracker-to-world correction belongs to the scene (`GaussianScene.registration`): new states need it too.
 """
 
 from __future__ import annotations
@@ -38,32 +38,32 @@ ON_CPU = ("frame_steps", "fitted", "verdicts", "error_scale")  # read in every s
 
 @dataclass(frozen=True, kw_only=True)
 class RefinementLimits:
-    """Limits of corrections and of what is taken from neighbours in time."""
+    """Limits of corrections and of the use of temporal neighbours."""
 
     max_speedup: float = 10.0  # maximum factor on the learning rates of poses that are less certain than usual
     min_deviation: float = 1e-4  # rad, mm: minimum standard deviation; with 0 a pose would never move
     mean_decay: float = 0.4  # mean decay of the learning rates over a run
-    min_share: float = 0.05  # minimum share of a prior's standard deviations that a state keeps
+    min_share: float = 0.05  # minimum remaining share of a prior's standard deviations
     uncorrected: float = 1.2  # ratio of the remaining error to the RMS of the learned corrections
-    max_neighbour_s: float = 1.0  # maximum time between instants whose unrecorded joints are similar
-    max_velocity_s: float = 0.5  # maximum time between frames that velocities are taken from
-    mm_per_rad: float = 20.0  # motion of a prismatic joint that counts as much as 1 rad of a revolute one
+    max_neighbour_s: float = 1.0  # maximum time between instants with similar unrecorded joints
+    max_velocity_s: float = 0.5  # maximum time between frames for computing velocities
+    mm_per_rad: float = 20.0  # motion of a prismatic joint equivalent to 1 rad of a revolute one
 
 
 LIMITS = RefinementLimits()
 
 
 class Verdict(IntEnum):
-    """Outcome for the recorded state of an instant."""
+    """Verdict on the recorded state of an instant."""
 
-    ACCEPTED = 0  # as recorded, but for corrections that training learns
-    REFITTED = 1  # it contradicts the others; fitted to its image from other starts
-    EXCLUDED = 2  # it contradicts the others and no state explains its image, which does not count in the loss
+    ACCEPTED = 0  # as recorded, up to learned corrections
+    REFITTED = 1  # contradicts the others; fitted to its image from other initial states
+    EXCLUDED = 2  # contradicts the others, and no state explains its image, which is ignored in the loss
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefineConfig:
-    """Corrections of the recorded geometry while training; each is switched on by itself."""
+    """Corrections of the recorded geometry during training; each has its own switch."""
 
     registration: bool = False  # one constant tracker-to-world correction (rigid + scale)
     latency: bool = False  # one clock offset between images and poses
@@ -73,15 +73,15 @@ class RefineConfig:
     start: int = 400  # iteration
     rotation_rate: float = 6e-4  # rad, Adam's learning rate of frame_poses
     translation_rate: float = 4e-2  # mm
-    camera_rate: float = 0.2  # times the rates of poses: SfM cameras are better than tracked instruments
+    camera_rate: float = 0.2  # factor on the rates of poses: SfM cameras are more accurate than tracked instruments
     joint_rate: float = 2e-3  # rad; of a prismatic joint, this and its priors are arcs at 20 mm from a pivot
-    unrecorded_rate: float = 2e-2  # of joints that nobody recorded
+    unrecorded_rate: float = 2e-2  # of unrecorded joints
     latency_rate: float = 2e-5  # s
     prior_weight: float = 2e-5
     prior_rotation: float = 4.4e-3  # rad, standard deviation of the prior: a tracker's 0.25 deg
     prior_translation: float = 0.3  # mm
-    prior_joint: float = 1.5e-2  # rad: play and noise of encoders
-    prior_unrecorded: float = 0.1  # rad by which an unrecorded joint departs from its neighbours in time
+    prior_joint: float = 1.5e-2  # rad: backlash and encoder noise
+    prior_unrecorded: float = 0.1  # rad by which an unrecorded joint differs from its temporal neighbours
     registration_rotation_rate: float = 1e-4  # rad
     registration_translation_rate: float = 1e-2  # mm
     registration_scale_rate: float = 1e-4  # of the log scale
@@ -91,13 +91,12 @@ class Refinement:
     """Corrections as 6-vectors (rotation rad, translation mm, in the instrument's or camera's own frame), joints and a
     latency in s.
 
-    Readings of joints in stated kinematics are corrected in rad or mm. Those that nobody recorded start half way
-    between their limits and are smooth in time. A state is corrected once for all frames of one instant, as several
-    cameras observe it: errors of single cameras are not what differs between instants. Tensors: `poses` [P, I, 6] of P
-    instants, `joints` [P, R], `cameras` [F, 6], `latency` [1]; of the priors on the first two `pose_mean`, `pose_sd`,
-    `joint_mean`, `joint_sd`; `fitted` [F] bool: frames whose state was set (`set_state`); `verdicts` [P] on recorded
-    states; `error_scale` [1]: of their errors, in units of a robot's usual ones, where they are larger than a tracker's
-    (else 0).
+    Readings of joints in stated kinematics are corrected in rad or mm. Unrecorded ones start half way between their
+    limits and are smooth in time. All frames of one instant (several cameras) share a correction, as errors of single
+    cameras do not vary between instants. Tensors: `poses` [P, I, 6] of P instants, `joints` [P, R], `cameras` [F, 6],
+    `latency` [1]; priors of the first two: `pose_mean`, `pose_sd`, `joint_mean`, `joint_sd`; `fitted` [F] bool: frames
+    whose state was set (`set_state`); `verdicts` [P] on recorded states; `error_scale` [1]: of their errors, in units
+    of a robot's usual ones, if larger than a tracker's (else 0).
     """
 
     def __init__(
@@ -160,7 +159,7 @@ class Refinement:
                     self.joint_sd[instant, column] = max(sd, LIMITS.min_deviation)
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
-            # multiplied where states are less certain than usual
+            # increased where states are less certain than usual
             "poses": rates.to(device),
             "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
             "cameras": (rates * config.camera_rate).to(device),
@@ -201,7 +200,7 @@ class Refinement:
 
     @torch.no_grad()
     def state(self, index: int, recorded: State) -> State:
-        """Return the recorded state `recorded` of frame `index` as corrected so far, at any iteration."""
+        """Return the recorded state `recorded` of frame `index` with its current correction, at any iteration."""
         instant = self.instants[index]
         offset = self.poses[instant] + self.velocities[instant] * self.latency
         parts = self._of_instruments(self.joints[instant]) if self.readings else None
@@ -215,10 +214,10 @@ class Refinement:
 
     @torch.no_grad()
     def set_state(self, index: int, recorded: State, state: State, deviations: Tensor) -> None:
-        """Correct the recorded state `recorded` of frame `index`, and of all frames of its instant, to `state`, from
-        iteration 0 on.
+        """Correct the recorded state `recorded` of frame `index`, and of its whole instant, to `state`, from iteration
+        0 on.
 
-        deviations [S] of `layout` (rad, mm): standard deviations of `state`, about which the prior is from now on.
+        deviations [S] of `layout` (rad, mm): standard deviations of `state`, the new centre of the prior.
         """
         instant = self.instants[index]
         pose, joints = self._parts(self.layout.increments_between(recorded, state))
@@ -228,7 +227,7 @@ class Refinement:
             self.joints[instant] = self.joint_mean[instant] = joints
         self.set_deviations(index, deviations)
         for name in ("poses", "joints"):
-            for order in ("first", "second"):  # gradients at the former state
+            for order in ("first", "second"):  # Adam's moments are of the former state
                 self.moments[f"{order}.{name}"][instant] = 0
         self.fitted[self.frames_of_instant[instant]] = True
 
@@ -255,12 +254,12 @@ class Refinement:
 
     @torch.no_grad()
     def prior_shares(self) -> Tensor:
-        """Return how large errors of states that were not fitted are [3], as shares of the priors' standard deviations:
-        of turns, shifts and readings.
+        """Return the size [3] of errors of states that were not fitted, as shares of the priors' standard deviations:
+        of rotations, translations and readings.
 
-        Exact states are corrected only by as much as corrections are wrong; of the errors of others most is corrected.
-        Corrections tell that only of states whose steps can amount to a tracker's errors. Where most states were
-        fitted, the shares are 1: images of the others hardly show an instrument, and corrections tell nothing.
+        Corrections of exact states are as large as the corrections' own errors; for inaccurate states most of the error
+        is corrected. Corrections are informative only for states whose steps can reach a tracker's errors. If most
+        states were fitted, the shares are 1: images of the others hardly show an instrument.
         """
         steps = torch.stack([self.frame_steps[frames].sum() for frames in self.frames_of_instant])
         fitted = torch.stack([self.fitted[frames[0]] for frames in self.frames_of_instant])
@@ -299,27 +298,27 @@ class Refinement:
         return deviations
 
     def _parts(self, vector: Tensor) -> tuple[Tensor, Tensor]:
-        """Return poses [I, 6] and joints [R] of a vector [S] of `layout`."""
+        """Return poses [I, 6] and joints [R] from a vector [S] of `layout`."""
         poses, joints = zip(*self.layout.rows, strict=True)
         both = torch.stack([vector[rows] for rows in poses]), torch.cat([vector[rows] for rows in joints])
         return both[0].to(self.poses), both[1].to(self.poses)
 
     def _of_instruments(self, joints: Tensor) -> list[tuple[Tensor, ...]]:
-        """Return joints [R] as those of every instrument."""
+        """Return joints [R] split by instrument."""
         return [tuple(changes) for changes in joints.split([len(item.joints) for item in self.layout.instruments])]
 
     def _leaf(self, name: str, values: Tensor) -> Tensor:
-        """Return a copy of learned values that takes a gradient."""
+        """Return a leaf copy of learned values for autograd."""
         self._leaves[name] = values.clone().requires_grad_()
         return self._leaves[name]
 
     def _prior(self, correction: Tensor, sigma: Tensor) -> Tensor:
-        """Return the penalty [] on a correction [..., 6] or [R] of such standard deviations."""
+        """Return the penalty [] on a correction [..., 6] or [R] with these standard deviations."""
         return self.config.prior_weight * (correction / sigma).square().mean()
 
     @torch.no_grad()
     def step(self, index: int, progress: float) -> None:
-        """Take a step of Adam on the corrections that `apply` used for this frame."""
+        """Take an Adam step on the corrections that `apply` used for this frame."""
         if not self._leaves:
             return
         self.frame_steps[index] += 1
@@ -349,8 +348,8 @@ class Refinement:
 
     @torch.no_grad()
     def center(self) -> None:
-        """Subtract the mean correction: a constant one belongs to the instrument's shape (and to
-        `GaussianScene.registration`). The median where states were fitted, single ones of which were wrong."""
+        """Subtract the mean correction, as a constant one belongs to the instrument's shape (and to
+        `GaussianScene.registration`); the median if states were fitted, since single ones were wrong."""
         used = (self.frame_steps > 0).nonzero()[:, 0]
         if len(used):
             instants = torch.tensor(sorted({self.instants[k] for k in used.tolist()}), device=self.poses.device)
@@ -364,8 +363,8 @@ class Refinement:
         return corrections.median(0).values if bool(self.fitted.any()) else corrections.mean(0)
 
     def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
-        """Return the recording with unrecorded joints as estimated, within their limits, fitted states as such, and how
-        large the errors of its states were."""
+        """Return the recording with unrecorded joints as estimated, within their limits, with the fitted states and the
+        size of all state errors."""
         recorded = replace(recorded, error_scale=float(self.error_scale))
         if not bool(self.unrecorded.any() | self.fitted.any()):
             return recorded
@@ -387,8 +386,8 @@ class Refinement:
 
     def to_json(self, recorded: Recorded) -> dict[str, Any]:
         """Return the corrected state of every training frame, with its standard deviations as `uncertainty`, and
-        whether it was fitted to the image (`fitted`; else the deviations are the prior's) or left out (`left_out`: it
-        contradicts the others, and no deviations are stated)."""
+        whether it was fitted to the image (`fitted`; else the deviations are the prior's) or excluded (`left_out`: it
+        contradicts the others, and has no deviations)."""
         entries: dict[str, Any] = {}
         for index, (name, recorded_state, camera) in enumerate(
             zip(recorded.names, recorded.states, recorded.cameras, strict=True)
@@ -399,8 +398,8 @@ class Refinement:
                 item_state = state.instruments[item.name]
                 turn = camera.world_from_camera[:3, :3].cpu().double().T @ item_state.pose[:3, :3].cpu().double()
                 shifts = (turn.square() @ deviations[pose][3:].square()).sqrt()  # along the camera's axes
-                units = [value if slides else math.degrees(value)
-                         for value, slides in zip(deviations[joints].tolist(), item.slides, strict=True)]  # fmt: skip
+                joint_sds = zip(deviations[joints].tolist(), item.slides, strict=True)
+                units = [value if slides else math.degrees(value) for value, slides in joint_sds]
                 instruments[item.name] = {
                     "pose": item_state.pose.cpu().double().tolist(),
                     "joints": {joint: float(value) for joint, value in item_state.joints.items()},
@@ -419,7 +418,7 @@ class Refinement:
         return entries
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return everything that changes, for a checkpoint."""
+        """Return all mutable tensors, for a checkpoint."""
         return {name: getattr(self, name) for name in STATE} | self.moments
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
@@ -435,8 +434,8 @@ class Refinement:
 def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[list[int], list[list[int]]]:
     """Return (instant of each frame, neighbours of each instant).
 
-    Frames of one time and one set of poses show one instant. Its neighbours follow or precede it in the recording
-    within `max_neighbour_s`; without any it is its own.
+    Frames with equal time and poses show one instant. Its neighbours are the adjacent instants of the recording within
+    `max_neighbour_s`; without any, it is its own.
     """
     numbers: dict[tuple[object, ...], int] = {}
     instants: list[int] = []
@@ -446,8 +445,8 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
         number = numbers.setdefault((frame.state.time, *poses), len(numbers))
         times += [frame.state.time] if number == len(times) else []
         instants.append(number)
-    near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and abs(times[k] - t) < LIMITS.max_neighbour_s] or [i]
-            for i, t in enumerate(times)]  # fmt: skip
+    pairs = [[k for k in (i - 1, i + 1) if 0 <= k < len(times)] for i in range(len(times))]
+    near = [[k for k in ks if abs(times[k] - times[i]) < LIMITS.max_neighbour_s] or [i] for i, ks in enumerate(pairs)]
     return instants, near
 
 
@@ -481,7 +480,7 @@ def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tens
         for k, name in enumerate(instruments):
             earlier, later = before.state.instruments[name].pose.double(), after.state.instruments[name].pose.double()
             rotation = vector_from_rotation(earlier[:3, :3].T @ later[:3, :3])
-            here = frames[index].state.instruments[name].pose.double()
-            translation = here[:3, :3].T @ (later[:3, 3] - earlier[:3, 3])
+            pose = frames[index].state.instruments[name].pose.double()
+            translation = pose[:3, :3].T @ (later[:3, 3] - earlier[:3, 3])
             velocity[index, k] = (torch.cat([rotation, translation]) / elapsed).float()
     return velocity

@@ -1,6 +1,6 @@
-"""Fits of training frames' states to their images, against the scene as learned so far, and how large their errors are.
+"""Fits of training frames' states to their images, with the scene learned so far, and the size of the states' errors.
 
-The fitter is that of tracking. What differs is the prior: errors of recorded states, along the shaft and the view.
+The fitter is that of tracking; the prior differs: errors of recorded states, along the shaft and the view.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from neeco.states.refinement import LIMITS, Refinement
 class SearchSettings:
     """Settings of fits of training frames, and sizes of errors."""
 
-    # standard deviations of states by a robot's log and a rough base: of the shaft's tilt and roll (degrees), of the
+    # standard deviations of states from a robot's log with a rough base: of the shaft's tilt and roll (degrees), of the
     # origin across the view and in depth (mm), of joints (degrees)
     tilt: float = 2.0  # degrees
     roll: float = 6.0  # degrees
     across: float = 0.4  # mm
     depth: float = 1.5  # mm
     joint: float = 4.0  # degrees
-    largest: float = 1.5  # factor on these, of the largest errors that are searched for
-    usual: float = 0.15  # factor on these, of a tracker's errors
-    # classes of errors that tell: a tracker's across the view are as large as a robot's
+    largest: float = 1.5  # factor on these of the largest errors searched for
+    usual: float = 0.15  # factor on these of a tracker's errors
+    # informative classes of errors: a tracker's errors across the view are as large as a robot's
     compared: tuple[int, int, int, int] = (0, 1, 3, 4)
     n_iterations: int = 40  # of expectation maximisation
-    kept_share: float = 0.85  # share of squared corrections that count; the largest do not
-    correlation_px: float = 100.0  # pixels that count as one observation, as the scene is still learned
+    kept_share: float = 0.85  # share of squared corrections that count; the largest are trimmed
+    correlation_px: float = 100.0  # pixels per independent observation, while the scene is still being learned
     beyond_limits: float = 0.5  # share of a joint's range by which readings may exceed its limits
     levels: tuple[float, float, float] = (0.25, 0.5, 1.0)  # sizes of the images compared, as shares of the view's
     steps: tuple[int, int, int] = (4, 4, 4)  # Levenberg-Marquardt steps at each level
     n_sampled: int = 16  # number of frames from which errors are sized
-    large: float = 0.22  # ratio to a robot's usual errors, from which errors are larger than a tracker's
-    scale: float = 1.0  # of the prior where they are: scenes that wrong states taught hide how large errors are
+    large: float = 0.22  # ratio to a robot's usual errors, above which errors are larger than a tracker's
+    scale: float = 1.0  # factor on the prior in that case: scenes learned from wrong states hide the size of errors
 
 
 SEARCH = SearchSettings()
@@ -52,7 +52,7 @@ SEARCH = SearchSettings()
 
 @dataclass(frozen=True)
 class StateSearch:
-    """Fits of training frames against the scene as learned so far."""
+    """Fits of training frames with the scene learned so far."""
 
     scene: GaussianScene
     refinement: Refinement
@@ -64,7 +64,7 @@ class StateSearch:
     def of(
         cls, scene: GaussianScene, refinement: Refinement, frames: Sequence[Frame], shafts: Sequence[Tensor]
     ) -> StateSearch:
-        """Return the search against `scene` as it is now."""
+        """Return the search with the present `scene`."""
         bounded = StateParameters(
             tuple(_bounded(p, item) for p, item in zip(refinement.layout.instruments, scene.instruments, strict=True))
         )
@@ -73,23 +73,23 @@ class StateSearch:
 
     @property
     def linked(self) -> bool:
-        """Whether the links of all instruments are stated."""
+        """Return whether the links of all instruments are stated."""
         return all(item.kinematics is not None for item in self.scene.instruments)
 
     def state(self, index: int) -> State:
-        """Return the state of training frame `index` as corrected so far."""
+        """Return the state of training frame `index` with its current correction."""
         return self.refinement.state(index, self.scene.recorded.states[index])
 
     def view(self, index: int, state: State | None) -> FrameView:
-        """Return frame `index` over tissue with the shadow of instruments in `state` (None: none)."""
+        """Return frame `index` over tissue with the instruments' shadow in `state` (None: no shadow)."""
         return self.fitter.view(self.frames[index], state)
 
     def fitted(
         self, index: int, scale: float, about: State | None = None, start: State | None = None
     ) -> tuple[StateFit, Tensor] | None:
         """Return the state, with its standard deviations [P], of frame `index` fitted from its present one (or another
-        `start`), with a prior about that recorded (or `about` another) of errors `scale` times as large as usual ones
-        of a robot, or as stated; None where the fit leads out of the image."""
+        `start`), with a prior about the recorded one (or `about` another) with errors `scale` times a robot's usual
+        ones, or as stated; None if the fit leaves the image."""
         recorded, precision = self.scene.recorded.states[index], self.precision(index, scale)
         start = start or self.state(index)
         fit = self.fitter.fit(
@@ -98,7 +98,7 @@ class StateSearch:
         return None if fit is None else (fit, fit.deviations(precision))
 
     def misfit(self, index: int, state: State) -> float:
-        """Return the misfit of a frame's instruments in `state` (see `StateFit`); infinite outside of the image."""
+        """Return the misfit of a frame's instruments in `state` (see `StateFit`); infinite outside the image."""
         precision = self.precision(index, 1.0)
         fit = self.fitter.fit(self.view(index, state), state, precision, levels=(), steps=())
         return math.inf if fit is None else fit.misfit
@@ -114,7 +114,7 @@ class StateSearch:
 
     def _deviations(self, index: int, scale: float) -> Tensor:
         """Return standard deviations [P] (rad, mm) of errors along `_axes`: stated ones, else `scale` times usual ones;
-        of an unrecorded joint a quarter of its limits."""
+        for an unrecorded joint a quarter of its range."""
         deviations: list[float] = []
         layout = self.refinement.layout
         for item, parameters, shaft in zip(self.scene.instruments, layout.instruments, self.shafts, strict=True):
@@ -136,7 +136,7 @@ class StateSearch:
         return torch.tensor(deviations, dtype=torch.float64).clamp(min=LIMITS.min_deviation)
 
     def _axes(self, index: int) -> Tensor:
-        """Return the rows [P, P] that take corrections to the axes of errors: tilt, tilt, roll, across, across, depth,
+        """Return the rows [P, P] that map corrections to the axes of errors: tilt, tilt, roll, across, across, depth,
         joints of every instrument."""
         layout = self.refinement.layout
         state, camera = self.scene.recorded.states[index], self.scene.recorded.cameras[index]
@@ -150,8 +150,8 @@ class StateSearch:
         return rows
 
     def size_errors(self, outliers: Sequence[int]) -> bool:
-        """Return whether states have larger errors than a tracker's, which the recording states, or images show of all
-        states but `outliers`, and set that: their corrections have a prior of such errors from then on."""
+        """Return whether states have larger errors than a tracker's, according to the recording, or to the images of
+        all states but `outliers`; if so, set the prior of corrections accordingly."""
         stated, refinement = self.stated_scale(), self.refinement
         scale = stated if stated > SEARCH.large else self._size_of_errors(outliers)
         if scale <= SEARCH.large:
@@ -162,25 +162,25 @@ class StateSearch:
         return True
 
     def _size_of_errors(self, outliers: Sequence[int]) -> float:
-        """Return how large the errors of a sample of states are, times the usual ones of a robot; without `outliers`,
-        which may be wrong altogether."""
+        """Return the size of the errors of a sample of states, relative to a robot's usual ones; without `outliers`,
+        which may be wrong."""
         fits: list[tuple[int, StateFit, Tensor]] = []
         usual = [index for index in range(len(self.frames)) if index not in outliers]
         for index in (usual[place] for place in evenly_spaced(len(usual), SEARCH.n_sampled)):
-            # states that were fitted before training are judged by what is left of their errors
+            # states that were fitted before training are judged by their remaining errors
             about = self.state(index) if self.refinement.fitted[index] else None
-            if (found := self.fitted(index, SEARCH.largest, about)) is not None:
+            if (fit := self.fitted(index, SEARCH.largest, about)) is not None:
                 expected = about or self.scene.recorded.states[index]
-                fits.append((index, found[0], self.refinement.layout.increments_between(expected, found[0].state)))
+                fits.append((index, fit[0], self.refinement.layout.increments_between(expected, fit[0].state)))
         return self.scale_of(fits) if len(fits) > 2 else 0.0
 
     def scale_of(self, fits: Sequence[tuple[int, StateFit, Tensor]]) -> float:
-        """Return how large errors are, times the usual ones of a robot, by fits of frames (index, fit, correction [P])
-        with a prior `largest` times as wide: the median over the classes of errors of
-        variance components by expectation maximisation, about the median correction, which belongs to the shape."""
+        """Return the size of errors relative to a robot's usual ones, from fits of frames (index, fit, correction [P])
+        with a prior `largest` times as wide: the median over the classes of errors of variance components by
+        expectation maximisation, about the median correction, which belongs to the shape."""
         kinds = self._kinds()
         kind = torch.tensor(kinds)
-        observed = []  # information on corrections in units of usual errors, and it times the most likely ones
+        observed = []  # information on corrections in units of usual errors, and its product with the most likely ones
         for index, fit, correction in fits:
             back = torch.linalg.inv(self._axes(index)) * self._usual()
             weighed = (fit.information + self.precision(index, SEARCH.largest)) @ correction
@@ -195,13 +195,13 @@ class StateSearch:
                 each = squares[:, kind == number].flatten().sort().values
                 if len(each):
                     variances[number] = each[: math.ceil(SEARCH.kept_share * len(each))].mean()
-        # without stated links, roll, depth and joints follow the errors of a hinge that is still rough
+        # without stated links, roll, depth and joints reflect the errors of a still inaccurate hinge
         counted = SEARCH.compared if self.linked else (0,)
         return float(variances[[number for number in counted if number in kinds]].sqrt().median())
 
     def stated_scale(self) -> float:
-        """Return how large errors are by the recording's own statement, times the usual ones of a robot: the median
-        over tilt, roll, depth and joints; 0 where less than half of the states say so."""
+        """Return the size of errors stated by the recording, relative to a robot's usual ones: the median over tilt,
+        roll, depth and joints; 0 if less than half of the states have them."""
         names = [item.name for item in self.scene.instruments]
         states = [frame.state.instruments for frame in self.frames]
         stated = [k for k, of in enumerate(states) if all(of[name].uncertainty is not None for name in names)]
@@ -229,7 +229,7 @@ class StateSearch:
 
 
 def _bounded(parameters: InstrumentParameters, instrument: Instrument) -> InstrumentParameters:
-    """Return the parameters with bounds of the joints: their limits, and half their range beyond."""
+    """Return the parameters with bounds of the joints: their limits, extended by half their range."""
     ends = []
     for joint in parameters.joints:
         low, high = instrument.joints[joint] or (-math.inf, math.inf)
@@ -240,5 +240,5 @@ def _bounded(parameters: InstrumentParameters, instrument: Instrument) -> Instru
 
 
 def _about(shaft: Tensor) -> Tensor:
-    """Return the rows [3, 3]: two directions across a shaft, and its own."""
+    """Return the rows [3, 3]: two directions across a shaft, and the shaft's own."""
     return torch.linalg.svd(shaft[None])[2][[1, 2, 0]]

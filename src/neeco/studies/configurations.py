@@ -105,7 +105,7 @@ class TableRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Configurations in comparison. `reference`: the one that differences are taken to."""
+    """Configurations to compare. `reference`: the one from which differences are computed."""
 
     title: str = ""
     text: str = ""
@@ -116,7 +116,7 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """Configurations x seeds. Every run is as long as `iterations`, `minutes` or `cpu_minutes` says, one of them."""
+    """Configurations x seeds. All runs have one length: `iterations`, `minutes` or `cpu_minutes`."""
 
     title: str = "Sweep"
     configurations: dict[str, Configuration] = field(default_factory=dict)
@@ -194,8 +194,7 @@ class Study:
         return single_length({key: getattr(self, key) for key in LENGTHS}, "")
 
     def only(self, tables: Iterable[str]) -> Study:
-        """Return the study with these tables and the configurations that stand in them. Raises NeecoError for a name
-        that is unknown."""
+        """Return the study with these tables and their configurations. Raises NeecoError for an unknown name."""
         for name in tables:
             require_known("--tables", name, self.tables)
         chosen = {name: self.tables[name] for name in tables}
@@ -225,8 +224,8 @@ def single_length(lengths: Mapping[str, float | None], place: str) -> tuple[str,
     naming it behind `place` where nothing can be trained so long."""
     values = {key: value for key, value in lengths.items() if value is not None}
     if len(values) != 1:
-        what = f"{' and '.join(values)} are given" if values else "no length of the runs is given"
-        raise NeecoError(f"{what}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
+        problem = f"{' and '.join(values)} are given" if values else "no length of the runs is given"
+        raise NeecoError(f"{problem}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
     ((key, value),) = values.items()
     if not 0 < value < math.inf:
         field = f"--{key.replace('_', '-')}" if place == "--" else f"{place}{key}:"

@@ -112,9 +112,9 @@ def run_jobs(
     results_so_far = dict(finished)
 
     def report(index: int, stage: str, share: float, text: str, result: Result | None = None) -> None:
-        what: dict[str, Any] = {"stage": stage, "share": share, "text": text, "result": result}
+        details: dict[str, Any] = {"stage": stage, "share": share, "text": text, "result": result}
         if progress:
-            progress(JobEvent(index=index, total=len(jobs), job=jobs[index], **what))
+            progress(JobEvent(index=index, total=len(jobs), job=jobs[index], **details))
 
     def finish(index: int, result: Result) -> None:
         results_so_far[index] = result
@@ -191,7 +191,7 @@ def _run_in_workers(
     this one lacks, each worker is given a GPU unless the jobs ask for the CPU.
     """
     folders = [job.folder.absolute().parent for job in jobs]
-    how = Workers(
+    pool = Workers(
         count=workers,
         threads=None if address() else threads_per_worker(workers),
         fresh=not light,
@@ -204,7 +204,7 @@ def _run_in_workers(
     results: dict[int, Result] = {}
     running: set[int] = set()
     try:
-        with contextlib.closing(run_tasks(_run_in_worker, None, jobs, how)) as events:
+        with contextlib.closing(run_tasks(_run_in_worker, None, jobs, pool)) as events:
             for event in events:
                 index, reason = event.index, event.value
                 running.add(index)

@@ -166,8 +166,8 @@ def config_of(request: SweepRequest, study: Study, name: str, place: str, method
             if field in SHARED:
                 raise NeecoError(f"{origin}{field}: give {SHARED[field]}, which all runs share")
             if of_all and not any(_has(method, field) for method in methods.values()):
-                known = ", ".join(dict.fromkeys(methods.values()))
-                raise NeecoError(f"{origin}{field}: no such field in the methods {known}")
+                method_names = ", ".join(dict.fromkeys(methods.values()))
+                raise NeecoError(f"{origin}{field}: no such field in the methods {method_names}")
             if not of_all or _has(methods[name], field):
                 settings.append(setting)
                 given_in[field] = origin

@@ -1,8 +1,8 @@
-"""`neeco annotate`: recorded frames, labelled by the scene, each with how far to trust its label.
+"""`neeco annotate`: recorded frames labelled by the scene, with the trust in each label.
 
-Trust is the smaller of two estimates of the label's overlap (IoU) with the instrument: by what the rendering leaves
-unexplained (`neeco.evaluation.trust`), where something covers the instrument; and by which pixels show an instrument
-(`neeco.evidence.label_quality`), where the scene has learned another shape.
+Trust is the minimum of two estimates of the label's overlap (IoU) with the instrument: from the residual of the
+rendering (`neeco.evaluation.trust`), which detects occlusion of the instrument; and from the pixels that show an
+instrument (`neeco.evidence.label_quality`), which detects a wrongly learned shape.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ from neeco.synthesis.writers.folder import Record, encoded_sample, skipped_sampl
 from neeco.training.run import GaussianRun
 
 N_REFERENCE_FRAMES = 16  # training frames from which the usual errors are estimated
-FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # the start is near: no coarse search
+FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # the start is close: no coarse level
 NOT_TRUSTED = "not trusted"
-MAX_UNRECORDED_SHARE = 0.01  # of a pixel: more than this outside the recorded image, and it is ignored
+MAX_UNRECORDED_SHARE = 0.01  # share of a pixel outside the recorded image, above which the pixel is ignored
 
 
 @dataclass(frozen=True)
 class Annotated:
-    """The records of all frames; those of frames that are not trusted have no image."""
+    """The records of all frames; frames that are not trusted have no image."""
 
     output: Path
     capture: Capture
-    records: list[Record]  # in the order of its frames
+    records: list[Record]  # in the order of the capture's frames
 
     @property
     def written(self) -> int:
@@ -70,15 +70,15 @@ def annotate_capture(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Annotated:
     """Label every frame of `capture`, a recording of the run's instruments over its tissue (None: the run's own), and
-    write those that can be trusted as a data set: the recorded images with the labels that the scene renders at poses
-    fitted to them, about the recorded ones or, where training fitted a frame's state, about that. Both are resized and
-    distorted by the recording's lens as `images` request; what the recorded image does not show of the lens's field,
-    since undistorting left it out, is black and ignored.
+    write the trusted ones as a data set: recorded images with labels rendered at poses fitted to them, starting from
+    the recorded pose or from the one fitted in training. Both are resized and distorted by the recording's lens as
+    `images` requests; parts of the lens's field that the recorded image lacks, since undistortion cropped them, are
+    black and ignored.
 
     Frame k of the capture is image k of the data set, whichever are written. Interrupted (Ctrl-C) or failing, it keeps
-    what is done, for `resume`. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError for
-    a scene without labels, a capture of other instruments, a share that is none, and an `output` that is not empty
-    (without `resume`) or was made otherwise.
+    completed work for `resume`. The caller sets the number of torch threads (`open_run`). Raises NeecoError for a scene
+    without labels, a capture of other instruments, an invalid share, and an `output` that is not empty (without
+    `resume`) or was made otherwise.
     """
     if not 0 <= min_trust <= 1:
         raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
@@ -116,13 +116,13 @@ def annotate_capture(
         train, drawings = trained_on.split("train"), []
         for k in range(min(N_REFERENCE_FRAMES, len(train))):
             frame = train[round(k * (len(train) - 1) / (N_REFERENCE_FRAMES - 1))]
-            shown = frame.load_image()
-            drawings.append((fitted(scene, labeller, frame, shown, None)[1], shown, frame.load_mask()))
+            image = frame.load_image()
+            drawings.append((fitted(scene, labeller, frame, image, None)[1], image, frame.load_mask()))
         typical = typical_errors_of(drawings)
         foreground = learned_foreground(scene, train)
         info["usual_errors"] = asdict(typical)
         annotator = _Annotator(folder, typical, foreground, min_trust, images, cameras)
-        start: Tensor | None = None  # each fit starts from that of the frame before it in time
+        start: Tensor | None = None  # each fit starts from that of the previous frame in time
         in_time = sorted(range(len(capture.frames)), key=lambda k: capture.frames[k].state.time)
         for done, index in enumerate(in_time, 1):
             if index not in records:
@@ -139,7 +139,7 @@ def annotate_capture(
 
 @dataclass(frozen=True)
 class _Annotator:
-    """Fits, renders, judges and writes frames."""
+    """Fits, renders, evaluates and writes frames."""
 
     folder: DataSetFolder
     typical: TypicalErrors
@@ -149,8 +149,8 @@ class _Annotator:
     cameras: DrawnCameras
 
     def annotate(self, index: int, frame: Frame, recorded: State, start: Tensor | None) -> Record:
-        """Write frame `index`, or that it is not trusted; `recorded`: its state where that of `frame` was fitted to the
-        image in training; `start`: a neighbour's increments."""
+        """Write frame `index`, or a record that it is not trusted; `recorded`: its recorded state, if that of `frame`
+        was fitted to the image in training; `start`: a neighbour's increments."""
         image = frame.load_image()
         fit, drawing, trust = self._fitted(frame, image, start)
         if start is not None and trust.value < self.min_trust:  # the neighbour's start may have misled the fit
@@ -169,7 +169,7 @@ class _Annotator:
             return skipped_sample(index, {NOT_TRUSTED: 1}, facts).write(output)
         drawing, missing = self._as_written(drawing, image)
         labels = annotate(scene, drawing, names)
-        if missing is not None:  # no keypoint is in pixels that show nothing
+        if missing is not None:  # no keypoints in pixels without image content
             for k, label in enumerate(labels):
                 points = {
                     name: Keypoint(0.0, 0.0, OUTSIDE) if p.visibility and missing[int(p.y), int(p.x)] else p
@@ -180,8 +180,8 @@ class _Annotator:
         return encoded_sample(index, drawing, plain, facts=facts, quality=quality).write(output)
 
     def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> tuple[LayeredDrawing, Tensor | None]:
-        """The recorded `image` with the labels of `drawing`, at the requested size and lens, and where it shows nothing
-        of a lens's field, bool [H, W]."""
+        """Return the recorded `image` with the labels of `drawing`, at the requested size and lens, and the pixels of
+        the lens's field without image content, bool [H, W]."""
         recorded = drawing.camera
         wanted = self.cameras(recorded)
         if wanted is recorded:
@@ -223,8 +223,8 @@ class _Annotator:
 def fitted(
     scene: GaussianScene, labeller: Labeller, frame: Frame, image: Tensor, start: Tensor | None
 ) -> tuple[AlignedFrame, LayeredDrawing]:
-    """The poses of `frame` fitted to its image [H, W, 3], and what the scene renders there; `start`: a neighbour's
-    increments, without which the search starts coarse."""
-    near = start is not None and not scene.recorded.error_scale  # errors as large differ between neighbours
+    """Return the state of `frame` fitted to its image [H, W, 3], and the scene's rendering there; `start`: a
+    neighbour's increments, without which the search starts coarse."""
+    near = start is not None and not scene.recorded.error_scale  # with larger errors, neighbours differ too much
     fit = align_frame(scene, frame, image, start, FROM_NEIGHBOUR if near else None)
     return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.min_component, tissue_image=True)

@@ -1,4 +1,4 @@
-"""Strong augmentation of a batch: other geometry, light, colours, sharpness and noise, and a part cut out.
+"""Strong augmentation of a batch: geometry, light, colours, sharpness, noise, and cut-out.
 
 The usual recipe of segmentation (Isensee et al., "nnU-Net", 2021), with cut-out (DeVries and Taylor, 2017).
 """
@@ -18,22 +18,22 @@ from torch.nn import functional
 
 @dataclass(frozen=True, kw_only=True)
 class AugmentationSettings:
-    """Largest changes of an image, and how often it is changed."""
+    """Maximum changes of an image, and their probabilities."""
 
     turn: float = 0.5  # rad
-    zoom: float = 1.4  # larger or smaller
+    zoom: float = 1.4  # maximum factor, enlarging or reducing
     shift: float = 0.15  # of a side
     exposure: float = 0.7  # octaves
     gamma: float = 0.6  # octaves
     tint: float = 0.2  # of each colour channel
     saturation: float = 0.5
-    slope: float = 0.4  # of the brightness from one border to the other: lamps elsewhere
+    slope: float = 0.4  # of the brightness between opposite borders, as with other lamps
     blur: float = 1.5  # px
     blur_radius: int = 3  # px
     noise: float = 0.06
     cut: float = 0.35  # of a side
-    placed: float = 0.5  # of the images: turned, zoomed and shifted
-    relit: float = 0.7  # of the images: with other light and colours
+    placed: float = 0.5  # share of images with geometric changes
+    relit: float = 0.7  # share of images with changed light and colours
 
 
 CHANGES = AugmentationSettings()
@@ -42,11 +42,11 @@ Outline = tuple[int, np.ndarray]
 
 
 def augment(planes: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Augment every image of a batch by itself.
+    """Augment every image of a batch independently.
 
     planes [B, 3 + C + 1, h, w] in [0, 1]: colours, shares of classes, valid share. Labels move with the image; pixels
-    from outside of it are black, those cut out of one colour, and neither valid. Returns the planes, and [B, 2, 3] that
-    maps places x, y in the image made to those in the image given, both in [-1, 1] from side to side. rng: on the
+    from outside it are black, cut-out ones of one colour, and neither is valid. Returns the planes, and [B, 2, 3] that
+    maps positions x, y in the augmented image to those in the original, both in [-1, 1] from side to side. rng: on the
     planes' device.
     """
     count, _, height, width = planes.shape
@@ -67,10 +67,10 @@ def augment(planes: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 def augment_batch(batch: Mapping[str, Any], rng: torch.Generator) -> dict[str, Tensor]:
-    """Augment every image of a batch that `LabelledImages.collate` made by itself.
+    """Augment every image of a batch from `LabelledImages.collate` independently.
 
-    Returns its image [B, 3, H, W], parts [B, H, W] and ignore [B, H, W]; ignored is also what comes from outside of an
-    image or is cut out. Boxes, depth and the rest, which would not fit any more, are left out. rng: on the images'
+    Returns its image [B, 3, H, W], parts [B, H, W] and ignore [B, H, W], which includes pixels from outside an image
+    and cut-out ones. Boxes, depth and other entries, which would no longer fit, are omitted. rng: on the images'
     device; the same state gives the same batch.
     """
     parts = batch["parts"].long()
@@ -83,7 +83,7 @@ def augment_batch(batch: Mapping[str, Any], rng: torch.Generator) -> dict[str, T
 
 
 def moved(outlines: Sequence[Outline], given_from_made: np.ndarray) -> tuple[Outline, ...]:
-    """Outlines (class, [n, 2] places in [0, 1]) in an augmented image, by its [2, 3]; what leaves it is left out."""
+    """Return outlines (class, [n, 2] in [0, 1]) in an augmented image, given its [2, 3], clipped to it."""
     linear = np.linalg.inv(given_from_made[:, :2])
     shift = (1 - linear @ (1 + given_from_made[:, 2])) / 2
     visible = []
@@ -104,16 +104,16 @@ class _Random:
     device: torch.device
 
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
-        """[B, *shape] in [low, high)."""
+        """Return [B, *shape] in [low, high)."""
         return low + (high - low) * torch.rand((self.count, *shape), generator=self.rng, device=self.device)
 
     def some(self, chance: float) -> Tensor:
-        """[B]: 1 with this chance, else 0."""
+        """Return [B]: 1 with this probability, else 0."""
         return (self.uniform(0, 1) < chance).float()
 
 
 def _placements(random: _Random, aspect: float) -> Tensor:
-    """[B, 2, 3]: flips, turns, zooms and shifts, as `augment` returns them. aspect: width over height."""
+    """Return [B, 2, 3]: flips, rotations, zooms and shifts, as in `augment`. aspect: width over height."""
     placed, flip = random.some(CHANGES.placed), 1 - 2 * random.some(0.5)
     turn, zoom = placed * random.uniform(-CHANGES.turn, CHANGES.turn), CHANGES.zoom ** (placed * random.uniform(-1, 1))
     cosine, sine = turn.cos() / zoom, turn.sin() / zoom
@@ -123,7 +123,7 @@ def _placements(random: _Random, aspect: float) -> Tensor:
 
 
 def _relight(colors: Tensor, random: _Random) -> Tensor:
-    """Other exposure, gamma, tint, saturation and lamps."""
+    """Change exposure, gamma, tint, saturation and lamps."""
     height, width = colors.shape[2:]
     angle, slope = random.uniform(-math.pi, math.pi), random.some(0.5) * random.uniform(0, CHANGES.slope)
     across, down = (torch.linspace(-0.5, 0.5, side, device=colors.device) for side in (width, height))
@@ -138,7 +138,7 @@ def _relight(colors: Tensor, random: _Random) -> Tensor:
 
 
 def _blur(colors: Tensor, deviations: Tensor) -> Tensor:
-    """Blur each image [B, 3, h, w] by a Gaussian of its own standard deviation [B] px; 0: not at all."""
+    """Blur each image [B, 3, h, w] by a Gaussian of its own standard deviation [B] px; 0: unchanged."""
     count = len(colors)
     radius = CHANGES.blur_radius
     offsets = torch.arange(-radius, radius + 1, device=colors.device)
@@ -150,7 +150,7 @@ def _blur(colors: Tensor, deviations: Tensor) -> Tensor:
 
 
 def _rectangles(random: _Random, height: int, width: int) -> Tensor:
-    """bool [B, 1, h, w]: True inside a rectangle, of every second image."""
+    """Return bool [B, 1, h, w]: True inside a rectangle, for every second image."""
     inside, chosen = [], random.some(0.5) > 0
     for side in (height, width):
         places = (torch.arange(side, device=random.device) + 0.5) / side

@@ -1,7 +1,6 @@
-"""Appearances of another operation: instruments over images of its tissue, in its light, in its frames' colours.
+"""Appearance of another operation: instruments over images of its tissue, in its light, in its frames' colours.
 
-Half of the images of a data set keep the scene's tissue, and half its colours: what is rendered is learned as well as
-what replaces it.
+Half of a data set's images keep the scene's tissue, and half its colours, so that both are learned.
 """
 
 from __future__ import annotations
@@ -30,19 +29,19 @@ from neeco.synthesis.settings import Settings
 
 @dataclass(frozen=True, kw_only=True)
 class BackgroundSettings:
-    """Settings of images placed behind instruments, and of colours taken from others."""
+    """Settings of background images, and of colour transfer from other images."""
 
-    min_crop: float = 0.7  # of the largest crop of the wanted shape: sides of the smallest
-    min_side_px: int = 32  # of an image: smaller ones are icons
+    min_crop: float = 0.7  # minimum side of a crop, relative to the largest crop of this shape
+    min_side_px: int = 32  # minimum side of an image: smaller ones are icons
     cached_images: int = 64  # decoded
-    min_share: float = 0.02  # of a pixel: of less, an instrument's colour is not known
-    shadow_blur_px: float = 1.5  # standard deviation, of the shadow that is found at the instrument's edge
-    clear_tissue: float = 0.5  # share of tissue in a pixel from which the shadow on it is measured
-    replaced: float = 0.5  # share of the images that show a background, and of those with the colours of other frames
-    border: float = 12 / 255  # brightest channel of an endoscope's black border
-    dark: float = 1e-3  # of white: no mean light is taken to be less
-    adaptation_range: tuple[float, float] = (0.25, 4.0)  # of gains that follow from other images
-    shadow_range: tuple[float, float] = (0.2, 1.1)  # of the light that a shadow leaves; above 1: errors of renderings
+    min_share: float = 0.02  # minimum share of a pixel for a known instrument colour
+    shadow_blur_px: float = 1.5  # standard deviation of the blur of shadows extrapolated at the instrument's edge
+    clear_tissue: float = 0.5  # minimum share of tissue in a pixel for measuring the shadow on it
+    replaced: float = 0.5  # share of images with a background, and of those with transferred colours
+    border: float = 12 / 255  # maximum brightness of an endoscope's black border
+    dark: float = 1e-3  # minimum mean light, of white
+    adaptation_range: tuple[float, float] = (0.25, 4.0)  # range of gains computed from other images
+    shadow_range: tuple[float, float] = (0.2, 1.1)  # range of the light left in a shadow; above 1: rendering errors
 
 
 IMAGES = BackgroundSettings()
@@ -56,8 +55,8 @@ class ImageFolder:
 
     @classmethod
     def of(cls, folder: str | Path, setting: str) -> ImageFolder:
-        """The images in a folder that a setting names, in the order of their names. Raises NeecoError where there is
-        none, or one is too small or cannot be read."""
+        """Return the images in a folder named by a setting, sorted by name. Raises NeecoError if there is none, or one
+        is too small or unreadable."""
         place, option = Path(folder), setting.replace("_", "-")
         if not place.is_dir():
             raise NeecoError(f"--{option}: {folder}: no such folder; give one with images of another operation")
@@ -70,12 +69,12 @@ class ImageFolder:
         return cls(files)
 
     def digest(self) -> str:
-        """SHA-256 of the files' content, in order."""
+        """Return the SHA-256 of the files' content, in order."""
         content = b"".join(hashlib.sha256(read_bytes(file, "an image")).digest() for file in self.files)
         return hashlib.sha256(content).hexdigest()
 
     def crop(self, number: int, rng: Generator, width: int, height: int) -> np.ndarray:
-        """Sample a background, float32 [height, width, 3] in [0, 1]: a random crop of an image, perhaps mirrored,
+        """Sample a background, float32 [height, width, 3] in [0, 1]: a random crop of an image, possibly mirrored,
         resized. Raises NeecoError where the file cannot be read."""
         image = _decoded(self.files[number])
         rows, columns = image.shape[:2]
@@ -102,14 +101,14 @@ class Colors:
 
     @classmethod
     def of(cls, image: np.ndarray) -> Colors:
-        """Those of an image [H, W, 3] in [0, 1]."""
+        """Return the colours of an image [H, W, 3] in [0, 1]."""
         lit = image[image.max(2) > IMAGES.border]
         if not len(lit):
             lit = image.reshape(-1, 3)
         return cls(lit.mean(0), lit.std(0))
 
     def given_to(self, image: np.ndarray) -> np.ndarray:
-        """An image [H, W, 3] with these colours (Reinhard et al., "Color transfer between images", 2001, in RGB)."""
+        """Return an image [H, W, 3] with these colours (Reinhard et al., "Color transfer", 2001, in RGB)."""
         colors = Colors.of(image)
         gains = np.clip(self.deviation / np.maximum(colors.deviation, IMAGES.dark), *IMAGES.adaptation_range)
         return np.clip((image - colors.mean) * gains + self.mean, 0, 1).astype(np.float32)
@@ -122,10 +121,11 @@ def _colors_of_file(file: Path) -> Colors:
 
 @dataclass(frozen=True)
 class Appearance:
-    """A background, the name of its file, the light on the instruments over it, and colours; None: as recorded.
+    """A background, its file name, the light on the instruments over it, and colours; None: as recorded.
 
-    The background's mean light differs from that of the scene's tissue by its tissue, and by camera and lamps, which
-    change instruments as well: these are multiplied, in each colour channel, by the ratio to the power of `adaptation`.
+    The mean light of a background differs from that of the scene's tissue because of the tissue itself, and of camera
+    and lamps, which affect instruments as well: these are multiplied per channel by the ratio to the power of
+    `adaptation`.
     """
 
     source: str | None = None
@@ -134,7 +134,7 @@ class Appearance:
     colors: Colors | None = None
 
     def over_background(self, layers: Layers) -> Tensor:
-        """The image [H, W, 3] of these layers over the background."""
+        """Return the image [H, W, 3] of these layers over the background."""
         assert self.background is not None
         share = layers.share.clamp(min=IMAGES.min_share)[..., None].numpy()
         alone = np.clip(layers.instruments.numpy() / share, 0, 1)
@@ -154,7 +154,7 @@ class Appearances:
 
     @classmethod
     def of(cls, settings: Settings) -> Appearances:
-        """Those that settings describe. Raises NeecoError for a folder without images."""
+        """Return the appearances that settings describe. Raises NeecoError for a folder without images."""
         folders = {name: ImageFolder.of(folder, name) for name, folder in settings.image_folders().items()}
         return cls(folders.get("backgrounds"), folders.get("match_colors"))
 
@@ -178,31 +178,31 @@ ALL_AS_RECORDED = Appearances()
 
 @dataclass(frozen=True)
 class Layers:
-    """A rendering taken apart: image is about instruments + (1 - share) * shadow * tissue."""
+    """Layers of a rendering: image is about instruments + (1 - share) * shadow * tissue."""
 
     instruments: Tensor  # [H, W, 3] in [0, 1], times their share of the pixel
     share: Tensor  # [H, W] in [0, 1], of instruments in a pixel
-    shadow: Tensor  # [H, W] share of the light that the instruments' shadow leaves on the tissue
+    shadow: Tensor  # [H, W] factor on the tissue's light by the instruments' shadow
     tissue: Tensor  # [H, W, 3] in [0, 1], without instruments and shadow
 
     def over(self, background: Tensor) -> Tensor:
-        """The image [H, W, 3] over a `background` [H, W, 3]."""
+        """Return the image [H, W, 3] over a `background` [H, W, 3]."""
         return (self.instruments + ((1 - self.share) * self.shadow)[..., None] * background).clamp(0, 1)
 
 
 @torch.no_grad()
 def split(gaussians: Gaussians, owners: Tensor, camera: Camera, image: Tensor, share: Tensor) -> Layers:
-    """Take the rendering `image` [H, W, 3] of posed Gaussians apart, on the CPU.
+    """Split the rendering `image` [H, W, 3] of posed Gaussians into layers, on the CPU.
 
     owners [N]: -1 tissue, else an instrument; share [H, W]: of instruments in each pixel. The shadow is the smoothed
-    ratio of tissue with the instruments to tissue without them; below these, that of the nearest tissue counts.
+    ratio of tissue with the instruments to tissue without; under instruments it is that of the nearest tissue.
     """
     of_tissue = owners < 0
     black = gaussians.sh.clone()
     black[of_tissue] = 0
     black[of_tissue, 0] = -0.5 / SH_C0
     instruments = rasterize(replace(gaussians, sh=black, background=None), camera).color.clamp(0, 1).cpu()
-    instruments = instruments * (share > 0)[..., None]  # components that are not labelled stay behind
+    instruments = instruments * (share > 0)[..., None]  # unlabelled components are not part of the layer
     tissue = rasterize(gaussians.select(of_tissue), camera).color.clamp(0, 1).cpu()
     clear = ((1 - share) * (share < IMAGES.clear_tissue)).numpy()
     behind = (image - instruments).clamp(0, 1)

@@ -1,7 +1,7 @@
-"""Camera effects of a data set: sampled ranges, motion blur, and the effects of lens, sensor and file.
+"""Camera effects of a data set: sampled ranges, motion blur, and effects of lens, sensor and file format.
 
 Light is linear, an image is stored by the sRGB curve: "stored" images and "linear" light are [H, W, 3] float32, 1 is
-white. Motion while the shutter is open is that of a recorded frame with a like state.
+white. Motion during an exposure is that of a recorded frame with a similar state.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
 
 SoftMasks = Literal["mid", "mean"]
 SOFT_MASKS = "soft_masks"
-SMOKE_MM = 100.0  # distance over which `smoke` is stated
+SMOKE_MM = 100.0  # distance for which `smoke` is stated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +40,10 @@ class EffectSettings:
     """Sampling of an exposure, and defaults of effects."""
 
     max_subframes: int = 64
-    subframe_px: float = 1.0  # at most, between two subframes of an exposure
-    tissue_step_px: int = 40  # spacing of the places on the tissue that are followed
-    max_gap_s: float = 0.5  # between recorded frames; a speed over a longer one means nothing
-    smoke_grey: float = 0.6  # where the file asks for smoke and does not name its brightness
+    subframe_px: float = 1.0  # maximum motion between two subframes of an exposure
+    tissue_step_px: int = 40  # spacing of tracked points on the tissue
+    max_gap_s: float = 0.5  # maximum time between recorded frames for estimating speeds
+    smoke_grey: float = 0.6  # brightness of smoke if the file does not state it
 
 
 SETTINGS = EffectSettings()
@@ -58,7 +58,7 @@ class Effect:
     meaning: str
 
 
-# in the order in which they are sampled: a new one goes to the end, or old files give other images
+# in sampling order: new ones must be appended, or existing files would give other images
 EFFECTS = {
     "shutter_s": Effect(0, 0.2, "s for which the shutter is open; instrument and camera go on moving as recorded"),
     "smoke": Effect(0, 0.95, "share of the light that smoke takes away over 100 mm"),
@@ -78,7 +78,7 @@ EFFECTS = {
 
 @dataclass(frozen=True)
 class Range:
-    """A value is uniform from `low` to `high` for `share` of the images; the others go without the effect."""
+    """A value is uniform from `low` to `high` for `share` of the images; the others have no such effect."""
 
     low: float
     high: float
@@ -87,15 +87,15 @@ class Range:
 
 @dataclass(frozen=True)
 class CameraEffects:
-    """The contents of an effects file. `soft_masks`: the `soft` images show the middle of the exposure or the mean over
+    """Contents of an effects file. `soft_masks`: `soft` images are of the middle of the exposure, or the mean over
     it."""
 
     ranges: Mapping[str, Range]
     soft_masks: SoftMasks = "mid"
 
     def draw(self, rng: Generator) -> dict[str, float]:
-        """Sample the effects of one image by name. Always takes as many random numbers, so that a value depends on no
-        other's range."""
+        """Sample the effects of one image by name. The number of random numbers is constant, so that a value is
+        independent of the others' ranges."""
         values = {}
         for name in EFFECTS:
             applies, place = rng.random(), rng.random()
@@ -146,34 +146,34 @@ def _range(node: Node, effect: Effect) -> Range:
 
 
 def srgb_to_linear(image: np.ndarray) -> np.ndarray:
-    """Stored image to linear light (IEC 61966-2-1)."""
+    """Convert a stored image to linear light (IEC 61966-2-1)."""
     image = np.clip(image, 0, 1)
     return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def linear_to_srgb(light: np.ndarray) -> np.ndarray:
-    """Linear light to stored image, the inverse of `srgb_to_linear`; what is brighter than white is white."""
+    """Convert linear light to a stored image, the inverse of `srgb_to_linear`; brighter values are clipped to white."""
     light = np.clip(light, 0, 1)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def average_exposure(images: Sequence[np.ndarray]) -> np.ndarray:
-    """The stored image of an exposure that consists of these stored images, each for the same time."""
+    """Return the stored image of an exposure made up of these stored images with equal durations."""
     if len(images) == 1:
         return images[0]
     return linear_to_srgb(np.mean([srgb_to_linear(image) for image in images], axis=0))
 
 
 def apply_effects(image: np.ndarray, depth: np.ndarray, values: Mapping[str, float], rng: Generator) -> np.ndarray:
-    """Return a rendered image as a camera with these effects (see EFFECTS) would have stored it.
+    """Return a rendered image as stored by a camera with these effects (see EFFECTS).
 
-    depth [H, W] mm, 0 = none (taken as the image's farthest). Noise is sampled from `rng`.
+    depth [H, W] mm, 0 = none (treated as the image's farthest). Noise is sampled from `rng`.
     """
     if not set(values) - {"shutter_s", "smoke_grey"}:
         return image
     height, width = depth.shape
     light = srgb_to_linear(image)
-    if (density := values.get("smoke", 0.0)) > 0:  # homogeneous (Beer-Lambert): it attenuates light, and has its own
+    if (density := values.get("smoke", 0.0)) > 0:  # homogeneous (Beer-Lambert): it attenuates and emits light
         far = np.where(depth > 0, depth, depth.max(initial=SMOKE_MM))
         transmission = ((1 - density) ** (far / SMOKE_MM)).astype(np.float32)[..., None]
         smoke = srgb_to_linear(np.full(3, values.get("smoke_grey", SETTINGS.smoke_grey)))
@@ -187,7 +187,7 @@ def apply_effects(image: np.ndarray, depth: np.ndarray, values: Mapping[str, flo
     gains = [values.get("red_gain", 1.0), 1.0, values.get("blue_gain", 1.0)]
     light = light * np.float32(2 ** values.get("exposure_stops", 0.0) * np.array(gains))
     shot, read = values.get("shot_noise", 0.0), values.get("read_noise", 0.0)
-    if shot or read:  # both normally distributed (Poisson-Gaussian noise of many photons)
+    if shot or read:  # both Gaussian (Poisson-Gaussian noise with many photons)
         deviation = np.sqrt(shot**2 * np.clip(light, 0, 1) + read**2)
         light = light + (deviation * rng.standard_normal(light.shape)).astype(np.float32)
     stored = linear_to_srgb(light) ** np.float32(values.get("gamma", 1.0))
@@ -201,27 +201,27 @@ def apply_effects(image: np.ndarray, depth: np.ndarray, values: Mapping[str, flo
 
 
 def image_circle(height: int, width: int, radius: float) -> np.ndarray:
-    """[H, W] in [0, 1]: 1 within `radius` (of half the diagonal) of the image's centre, with an edge one pixel wide."""
+    """Return [H, W] in [0, 1]: 1 within `radius` (of half the diagonal) of the centre; edge 1 px wide."""
     half = np.hypot(height, width) / 2
     return np.clip((radius - _distance_from_centre(height, width)) * half + 0.5, 0, 1).astype(np.float32)
 
 
 def _distance_from_centre(height: int, width: int) -> np.ndarray:
-    """[H, W] distance from the image's centre, 1 in the corners."""
+    """Return the distance [H, W] from the image centre, 1 in the corners."""
     y, x = np.mgrid[0:height, 0:width].astype(np.float32) + np.float32(0.5)
     return np.hypot(x - width / 2, y - height / 2) / (np.hypot(height, width) / 2)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Speeds at a moment: twists [6] (rad/s, then mm/s, each in its own body's frame) and joint rates per s."""
+    """Speeds at an instant: twists [6] (rad/s, then mm/s, each in its own body's frame) and joint rates per s."""
 
     instruments: Mapping[str, np.ndarray]
     joints: Mapping[str, Mapping[str, float]]
     camera: np.ndarray
 
     def advanced(self, state: State, camera: Camera, seconds: float) -> tuple[State, Camera]:
-        """State and camera `seconds` later (or earlier), at these speeds."""
+        """Return state and camera `seconds` later (or earlier) at these speeds."""
         moved = {
             name: InstrumentState(
                 torch.from_numpy(to_numpy(item.pose) @ _moved(self.instruments[name], seconds)).to(item.pose),
@@ -234,10 +234,10 @@ class Motion:
 
 
 class RecordedMotion:
-    """Samples motions from the recorded frames whose states are most similar to the given one.
+    """Samples motions from the recorded frames whose states are most similar to a given one.
 
-    instruments: recordings of instruments that `recorded`, of the camera, does not show: each moves as in any frame of
-    its own, and so does the camera.
+    instruments: recordings of instruments that are not in the camera's recording `recorded`; each has the motion,
+    including its camera's, of an arbitrary frame of its own.
     """
 
     def __init__(self, recorded: Recorded, instruments: Sequence[Recorded] = ()) -> None:
@@ -253,26 +253,25 @@ class RecordedMotion:
 
     @property
     def known(self) -> bool:
-        """Return whether every recording has two frames close enough in time to give a motion."""
+        """Return whether every recording has two frames close enough in time for estimating motion."""
         return bool(self._motions) and all(each.known for each in self._instruments)
 
     def __call__(self, state: State, rng: Generator) -> Motion:
         """Return a motion for `state`."""
         if not self._instruments:
             return self._motions[self._frames.like(state, rng)]
-        *motions, own = (each._motions[each._frames.any(rng)] for each in (*self._instruments, self))
+        *motions, camera_motion = (each._motions[each._frames.any(rng)] for each in (*self._instruments, self))
         twists = {name: twist for motion in motions for name, twist in motion.instruments.items()}
         rates = {name: rates for motion in motions for name, rates in motion.joints.items()}
-        return Motion(twists, rates, own.camera)
+        return Motion(twists, rates, camera_motion.camera)
 
 
 def subframes(
     scene: GaussianScene, drawing: LayeredDrawing, motion: Motion, shutter_s: float
 ) -> list[tuple[State, Camera]]:
-    """States and cameras spread evenly over an exposure of which `drawing` is the middle: so many that nothing moves
-    by more than `subframe_px` from one to the next (`max_subframes` at most), and an odd number, so that the middle is
-    one of them."""
-    places = []  # where working ends and places on the tissue are in the image, at the start and at the end
+    """Return states and cameras evenly spaced over an exposure centred at `drawing`: as many that nothing moves by more
+    than `subframe_px` between them (`max_subframes` at most), an odd number including the centre."""
+    places = []  # image positions of working ends and tissue points, at the start and at the end
     for side in (-1, 1):
         state, camera = motion.advanced(drawing.state, drawing.camera, side * shutter_s / 2)
         points = [point for ends in working_ends_of(keypoint_arrays(scene, state)).values() for point in ends]
@@ -286,7 +285,7 @@ def subframes(
 
 
 def motion_between(a: State, camera_a: Camera, b: State, camera_b: Camera) -> Motion:
-    """The constant speeds that lead from one recorded frame to a later one."""
+    """Return the constant speeds that lead from one recorded frame to a later one."""
     seconds, twists, joints = b.time - a.time, {}, {}
     for name, item in a.instruments.items():
         later = b.instruments[name]
@@ -297,7 +296,7 @@ def motion_between(a: State, camera_a: Camera, b: State, camera_b: Camera) -> Mo
 
 
 def _twist(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
-    """Constant twist [6], in its own frame, that takes pose `start` [4, 4] to `end` in `seconds`."""
+    """Return the constant twist [6], in its own frame, that takes pose `start` [4, 4] to `end` in `seconds`."""
     between = np.linalg.inv(start) @ end
     turn = Rotation.from_matrix(between[:3, :3]).as_rotvec()
     return np.concatenate([turn, between[:3, 3]]) / seconds

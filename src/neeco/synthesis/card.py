@@ -139,7 +139,7 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
 
 
 def _command(info: Mapping[str, Any]) -> str:
-    """The command that makes the set again."""
+    """Return the command that makes the set again."""
     settings = info["settings"]
     if "annotates" in settings:
         words = ["annotate", info["scene"], "--capture", settings["annotates"], "--min-trust", settings["min_trust"]]
@@ -191,8 +191,8 @@ def write_preview(root: Path, records: Sequence[Record], names: Pairs, bones: Pa
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         figure = preview_figure(root, chosen, names, bones)
-        how: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 1}}
-        write_atomically(root / "preview.png", lambda temporary: figure.savefig(temporary, **how))
+        save_options: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 1}}
+        write_atomically(root / "preview.png", lambda temporary: figure.savefig(temporary, **save_options))
 
 
 def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: Pairs = ()) -> Figure:
@@ -243,7 +243,7 @@ def _draw_label(axes: Axes, label: dict[str, Any], bones: Pairs, corner: np.ndar
 
 
 def _captions(record: Record) -> tuple[str, str]:
-    """Return those of the plain image, its joint values, and of the labelled one, the instruments' visible shares."""
+    """Return captions for the plain image (joint values) and the labelled one (the instruments' visible shares)."""
     joints = [
         f"{joint.removesuffix('_mm')} {value:.1f} mm"
         if joint.endswith("_mm")

@@ -1,6 +1,6 @@
-"""Contact of instruments with the tissue: how far a working end is below the rendered surface of the undeformed tissue.
+"""Contact of instruments with the tissue: depth of a working end below the rendered surface of the undeformed tissue.
 
-Distances are those to planes of the nearest surface points (Hoppe et al., "Surface reconstruction", 1992).
+Distances are those to planes through the nearest surface points (Hoppe et al., "Surface reconstruction", 1992).
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ NONE, TOUCHING, GRASPING = "none", "touching", "grasping"
 
 @dataclass(frozen=True, kw_only=True)
 class ContactSettings:
-    """Thresholds of contact labels, chosen on rendered worlds in which instruments touch the tissue."""
+    """Thresholds of contact labels, chosen on rendered worlds with contact between instruments and tissue."""
 
     n_views: int = 12  # recorded cameras that observe the surface
     spacing_mm: float = 1.0  # of surface points
-    n_nearest: int = 8  # surface points that form a plane
-    reach_mm: float = 10.0  # of the tissue about a contact; also the largest distance that is measured
-    end_mm: float = 15.0  # about the tips: the working end
-    n_measured: int = 100  # Gaussians of a working end, evenly chosen
-    quantile: float = 0.97  # of their depths: single Gaussians may be far off
-    touching_mm: float = -1.5  # at which contact is as likely as none: tissue learned while it was touched is dented
-    depth_sd_mm: float = 3.0  # standard deviation of a depth: with it, confidence is the share of right labels
-    joint_quantiles: tuple[float, float] = (0.05, 0.95)  # of recorded values: a range without single wrong states
-    closed_share: float = 0.25  # of the recorded range of the jaws' opening, below which they are closed
+    n_nearest: int = 8  # surface points per plane
+    reach_mm: float = 10.0  # radius of the tissue around a contact; also the maximum distance measured
+    end_mm: float = 15.0  # radius of the working end around the tips
+    n_measured: int = 100  # Gaussians sampled per working end
+    quantile: float = 0.97  # quantile of their depths, robust to single outliers
+    touching_mm: float = -1.5  # depth at which contact has probability 1/2; tissue learned during contact is indented
+    depth_sd_mm: float = 3.0  # standard deviation of a depth, calibrated for correct confidences
+    joint_quantiles: tuple[float, float] = (0.05, 0.95)  # quantiles of recorded values: a range without outliers
+    closed_share: float = 0.25  # share of the recorded range of the jaws' opening, below which they are closed
 
 
 CONTACT = ContactSettings()
 
 
 class RestingTissue:
-    """Surface of a scene's undeformed tissue (world, mm), and what of its instruments may touch it."""
+    """Surface of a scene's undeformed tissue (world, mm), and the parts of its instruments that may touch it."""
 
-    of: ClassVar[WeakKeyDictionary[GaussianScene, RestingTissue]] = WeakKeyDictionary()  # measured once
+    of: ClassVar[WeakKeyDictionary[GaussianScene, RestingTissue]] = WeakKeyDictionary()  # cache
 
     def __init__(self, scene: GaussianScene) -> None:
         recorded, tissue = scene.recorded, tissue_gaussians(scene)
@@ -69,8 +69,8 @@ class RestingTissue:
         self.rows: dict[str, Tensor] = {}  # of the opaque Gaussians of each instrument's working end
         bodies = [item.name for item in scene.instruments]
         for name, points in keypoints.items():
-            own = scene.canonical.bodies == 1 + bodies.index(name)
-            solid = (own & (posed.opacities > LABELS.surface_alpha)).nonzero()[:, 0]
+            of_instrument = scene.canonical.bodies == 1 + bodies.index(name)
+            solid = (of_instrument & (posed.opacities > LABELS.surface_alpha)).nonzero()[:, 0]
             tips = [point for key, point in points.items() if key.startswith("tip")] or list(points.values())[-1:]
             near = cdist(to_numpy(posed.means[solid]), tips).min(1) < CONTACT.end_mm
             if near.any():
@@ -79,7 +79,7 @@ class RestingTissue:
         self.closed: dict[str, tuple[str, float, float]] = {}  # joint, its values at closed and at open jaws
         for item in scene.instruments:
             jaws = [joint for joint in item.joints if "jaw" in joint or "grip" in joint] or list(item.joints)
-            if len(jaws) == 1:  # the end of its range that is nearer to 0 is that of closed jaws
+            if len(jaws) == 1:  # the end of its range nearer to 0 is closed
                 values = [float(state.instruments[item.name].joints[jaws[0]]) for state in recorded.states]
                 low, high = np.quantile(values, CONTACT.joint_quantiles).tolist()
                 self.closed[item.name] = (jaws[0], *sorted((low, high), key=abs))
@@ -92,15 +92,16 @@ def labels_of(scene: GaussianScene, drawing: LayeredDrawing, labels: Sequence[In
 
 @torch.no_grad()
 def contact_of(scene: GaussianScene, drawing: LayeredDrawing, name: str) -> dict[str, Any]:
-    """Return the contact of an instrument with the resting tissue in a rendered state; {}: its working end is unknown.
+    """Return the contact of an instrument with the resting tissue in a rendered state; {} if its working end is
+    unknown.
 
     contact: "none", "touching", or "grasping", which is touching with closed jaws. contact_confidence in [0.5, 1]: the
-    probability that it touches, or does not, as `contact` says. penetration_mm: depth below the surface along its
-    normal, a quantile over the working end's opaque Gaussians (one standard deviation thick); negative: distance above
-    it, at most `reach_mm`. contact_box: x, y, width, height (px) of the tissue within `reach_mm`; None: no contact.
+    probability of the stated contact or absence of it. penetration_mm: depth below the surface along its normal, a
+    quantile over the working end's opaque Gaussians (one standard deviation thick); negative: distance above it, at
+    most `reach_mm`. contact_box: x, y, width, height (px) of the tissue within `reach_mm`; None: no contact.
     """
-    known = drawing.keypoints.get(name)
-    tissue = known and (RestingTissue.of.get(scene) or RestingTissue.of.setdefault(scene, RestingTissue(scene)))
+    keypoints = drawing.keypoints.get(name)
+    tissue = keypoints and (RestingTissue.of.get(scene) or RestingTissue.of.setdefault(scene, RestingTissue(scene)))
     if not tissue or name not in tissue.rows:
         return {}
     state, posed, rows = drawing.state.instruments[name], drawing.posed, tissue.rows[name]
@@ -117,7 +118,7 @@ def contact_of(scene: GaussianScene, drawing: LayeredDrawing, name: str) -> dict
     depths += np.linalg.norm(np.einsum("mij,mi->mj", axes, normals), axis=1)
     deepest = np.argsort(depths)[round(CONTACT.quantile * (len(depths) - 1))]
     depth, point, normal, deviations = depths[deepest], points[deepest], normals[deepest], [CONTACT.depth_sd_mm]
-    if state.uncertainty is not None:  # shifts in the camera's axes, turns about the instrument's
+    if state.uncertainty is not None:  # translations in the camera's axes, rotations about the instrument's
         pose, along = to_numpy(state.pose), drawing.camera.camera_from_world[:3, :3] @ normal
         turned = np.cross(point - pose[:3, 3], normal) @ pose[:3, :3]  # mm/rad
         shifts, turns = state.uncertainty.translation_mm, np.radians(state.uncertainty.rotation_deg)

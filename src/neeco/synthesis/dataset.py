@@ -1,7 +1,7 @@
 """`neeco synthesize`: render many states and write the acceptable ones with labels; files of a data set as a whole.
 
-dataset.json says how it was made, and decides whether one begun may be continued. Index files, README.md and preview
-are written from the records of its images.
+dataset.json describes how it is made, and determines whether an existing one may be continued. Index files, README.md
+and preview are written from the records of its images.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from neeco.training.run import SCENE_FILE, GaussianRun, scene_digest
 SCHEMA = "neeco-dataset/1"
 INFO = "dataset.json"
 
-REMEDIES = {  # where every given state was refused
+REMEDIES = {  # if every prescribed state was refused
     LEAVES_IMAGE: "correct its poses (world frame, mm) or cameras, or lower --min-share",
     ENTERS_ANOTHER: "mix fewer instruments",
     UNOBSERVED_TISSUE: "record more of the tissue, or keep --views recorded",
@@ -71,8 +71,8 @@ class Synthesized:
     images: int
     made_now: int
     refused: dict[str, int]  # reason -> states refused
-    skipped: list[int]  # indices whose prescribed state was refused every time
-    still: bool  # the scene was recorded from one place
+    skipped: list[int]  # indices whose prescribed state was refused for all views
+    still: bool  # whether the scene was recorded by a still scope
 
 
 def synthesize(
@@ -88,12 +88,12 @@ def synthesize(
     """Write a labelled data set of `settings.count` images of the run's scene to `output`; with `instrument_runs` of
     its tissue under the instruments of those runs.
 
-    Image `index` depends on (scene, settings, index) alone, however many `workers` share the work: processes started
-    anew, so that a script needs `if __name__ == "__main__"` about its own start. Interrupted (Ctrl-C) or failing, it
-    keeps and indexes what is done, for `resume`; where no image was rendered at all, `output` is left as it was found.
-    `on_progress` gets how many images are done. How many threads torch takes is the caller's to set (`open_run`).
-    Raises NeecoError for bad settings, an output that is not empty (without `resume`) or was made with other settings,
-    and when no acceptable state is found.
+    Image `index` depends on (scene, settings, index) alone, however many `workers` share the work: these are spawned
+    processes, so a script needs `if __name__ == "__main__"` around its entry point. Interrupted (Ctrl-C) or failing, it
+    keeps and indexes completed images for `resume`; without any rendered image, `output` is unchanged. `on_progress`
+    gets the number of completed images. The caller sets the number of torch threads (`open_run`). Raises NeecoError for
+    invalid settings, an output that is not empty (without `resume`) or was made with other settings, and when no
+    acceptable state is found.
     """
     settings.check()
     check_workers(workers)
@@ -138,7 +138,7 @@ def synthesize(
         processes = min(workers, len(missing))
         if missing and (processes > 1 or address()):
             scenes = tuple(Path(each.path) / SCENE_FILE for each in runs)
-            # workers need not find the tolerance again
+            # computed once for all workers
             resolved = replace(settings, tissue_tolerance_mm=generator.acceptance.tolerance_mm)
             spec = GeneratorSpec(scenes, resolved, str(scene.center.device))
             rendered = draw_in_workers(spec, output, missing, processes)
@@ -165,8 +165,8 @@ def synthesize(
 def description(
     run: GaussianRun, settings: dict[str, Any], instrument_runs: Sequence[GaussianRun] = ()
 ) -> dict[str, Any]:
-    """Return what dataset.json begins with: how a data set of the run's scene, or of its tissue under the instruments
-    of `instrument_runs`, is made. `settings` must stay the same for it to be continued."""
+    """Return the initial content of dataset.json: how a data set of the run's scene, or of its tissue under the
+    instruments of `instrument_runs`, is made. `settings` must stay the same for it to be continued."""
     info = {
         "schema": SCHEMA,
         "version": neeco.__version__,
@@ -183,8 +183,8 @@ def description(
 
 
 def check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:
-    """Return whether a data set was begun in `output` in the same way. Raises NeecoError when it may not be written
-    to."""
+    """Return whether a data set with the same description was begun in `output`. Raises NeecoError if `output` must not
+    be written to."""
     if (begun := read_begun(output, INFO, resume, "a data set")) is None:
         return False
     if not isinstance(begun.get("settings"), dict):
@@ -199,8 +199,8 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
 
 @dataclass(frozen=True, kw_only=True)
 class DataSetFolder:
-    """The folder of a data set that is made now: what dataset.json says of the making (`info`), whether it was `begun`
-    before, and what its index files need."""
+    """Folder of a data set in progress: the description in dataset.json (`info`), whether it was `begun` before, and
+    the inputs of its index files."""
 
     output: Path
     count: int  # of records, once it is complete
@@ -213,10 +213,10 @@ class DataSetFolder:
 
     @contextlib.contextmanager
     def being_written(self) -> Iterator[dict[int, Record]]:
-        """For a block that makes the images: the records of those that are there, by index, to which it adds the rest.
+        """Yield the records of existing images, by index, for a block that adds the others.
 
-        Then the index files are written. Interrupted (Ctrl-C) or failing, what is done stays and is indexed, to be
-        continued; where nothing was begun and no image made, nothing stays.
+        Then the index files are written. Interrupted (Ctrl-C) or failing, completed images are kept and indexed for
+        continuation; if nothing was begun and no image made, nothing is left.
         """
         for name in self.formats:
             if refusal := writer(name)().refusal([part for _, part in self.labeller.names]):
@@ -229,7 +229,7 @@ class DataSetFolder:
             except (KeyboardInterrupt, NeecoError):
                 stored = self._stored()
                 if self.begun or with_image(stored.values()):
-                    with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to continue from
+                    with contextlib.suppress(NeecoError):  # on a full disk, for example: the records suffice
                         self._write_indexes(list(stored.values()), complete=False)
                 else:
                     (self.output / INFO).unlink(missing_ok=True)
@@ -242,7 +242,7 @@ class DataSetFolder:
         return {k: record for k in range(self.count) if (record := load_record(self.output, k)) is not None}
 
     def _write_indexes(self, records: list[Record], complete: bool) -> None:
-        """(Re)write everything that is about the whole data set, from the records."""
+        """(Re)write all files about the whole data set, from the records."""
         output, names, images = self.output, self.labeller.names, with_image(records)
         keypoints = keypoint_names(self.scene)
 
@@ -250,7 +250,7 @@ class DataSetFolder:
             return label | {"name": self.class_names.get(label["name"], label["name"]), "instrument": label["name"]}
 
         write_states(output, images)
-        # formats of earlier starts, too: their index files would else lack the images made now
+        # including formats of earlier starts, whose index files would lack the new images
         formats = [*self.formats, *(name for name in format_names() if name not in self.formats)]
         formats = [name for name in formats if name in self.formats or (output / name).is_dir()]
         written = WrittenImages(
@@ -282,7 +282,7 @@ class DataSetFolder:
         }
         write_card(output, info, {name: writer(name).description for name in formats})
         if complete:
-            sync_disk()  # of what is incomplete, a resumption checks every file
+            sync_disk()  # an incomplete set is verified file by file on resumption
         write_json(output / INFO, info)
 
 
@@ -296,13 +296,13 @@ def writers() -> dict[str, type[Writer]]:
 def writer(name: str) -> type[Writer]:
     """Return the writer of the format `name`. Raises NeecoError when there is none."""
     if name not in writers():
-        known = ", ".join(writers())
-        raise NeecoError(f"--formats: {name!r} is unknown; choose of {known}, or install the package that has it")
+        available = ", ".join(writers())
+        raise NeecoError(f"--formats: {name!r} is unknown; choose of {available}, or install the package that has it")
     return writers()[name]
 
 
 def check_formats(formats: Sequence[str], settings: ImageSettings) -> None:
-    """Raises NeecoError for a format that is unknown, or that cannot describe the images."""
+    """Raise NeecoError for a format that is unknown, or that cannot describe the images."""
     for name in formats:
         if not writer(name).accepts_distortion and settings.lens:
             raise NeecoError(f"--formats: {name} cannot store distorted images; remove {name} or --lens")
@@ -316,12 +316,12 @@ def part_ids(names: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
 
 
 def with_image(records: Iterable[Record]) -> list[Record]:
-    """The records of images that were written."""
+    """Return the records of images that were written."""
     return [record for record in records if not record.get("skipped")]
 
 
 def skipped(records: Iterable[Record]) -> list[int]:
-    """Indices without an image."""
+    """Return the indices without an image."""
     return [record["index"] for record in records if record.get("skipped")]
 
 

@@ -1,6 +1,6 @@
-"""Renders the samples of a data set: sample a state and a view, render, check, apply camera effects, annotate.
+"""Renderer of data set samples: sample a state and a view, render, check, apply camera effects, annotate.
 
-Sample `index` depends on scene, settings and index alone: it is the same in whichever process and order.
+Sample `index` depends on scene, settings and index alone, whatever the process and order.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, ma
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers.folder import Encoded, encoded_sample, skipped_sample
 
-# of an image's random numbers: camera effects and appearances do not change which state and view are sampled
+# separate random streams per image: camera effects and appearances do not affect the sampled state and view
 EFFECTS_STREAM, APPEARANCE_STREAM = 1, 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class AcceptanceSettings:
-    """Thresholds of the states that images show."""
+    """Thresholds of acceptable states."""
 
-    buried_share: float = 0.05  # of an instrument's pixels that may lie deeper than the tolerance: edges are uncertain
-    tolerance_range_mm: tuple[float, float] = (2.0, 5.0)  # range of tolerances found from the recording
-    n_tolerance_states: int = 12  # recorded states from which the tolerance is found
+    buried_share: float = 0.05  # share of an instrument's pixels that may be deeper, as edges are uncertain
+    tolerance_range_mm: tuple[float, float] = (2.0, 5.0)  # range of tolerances estimated from the recording
+    n_tolerance_states: int = 12  # recorded states for estimating the tolerance
     # surfaces of two instruments nearer than about a shaft's thickness: the instruments intersect
     min_gap_mm: float = 6.0
-    min_crossing_px: int = 5  # px nearer than that: instruments are taken to intersect
-    max_unobserved_share: float = 0.25  # of an image's pixels
+    min_crossing_px: int = 5  # minimum number of such pixels for an intersection
+    max_unobserved_share: float = 0.25  # maximum share of an image's pixels
 
 
 ACCEPTED = AcceptanceSettings()
@@ -66,7 +66,7 @@ UNOBSERVED_SIDE = "shows sides that no frame saw"
 
 
 class StatesRefused(NeecoError):
-    """No state sampled for an image was acceptable; `refused`: how many were refused, by reason."""
+    """No acceptable state was sampled for an image; `refused`: number of refused states, by reason."""
 
     def __init__(self, message: str, refused: Mapping[str, int] = MappingProxyType({})) -> None:
         super().__init__(message)
@@ -86,13 +86,12 @@ class LabelledSample:
 
 @dataclass(frozen=True)
 class Acceptance:
-    """The limits beyond which sampled states are refused.
+    """Limits of acceptable states.
 
-    min_share: of the image's pixels that the instruments must cover together. tolerance_mm: how deep an instrument may
-    lie behind the tissue surface in this camera (see `buried_depth`); None: any depth. A single view cannot distinguish
-    "inside the tissue" from "behind a fold of it": both are refused. max_unobserved: share of the instruments' pixels
-    that may be mostly unobserved. recorded_together: groups of instruments; only those of one group may touch; empty:
-    all may.
+    min_share: of the image's pixels covered by all instruments. tolerance_mm: maximum depth of an instrument behind the
+    tissue surface in this camera (see `buried_depth`); None: unlimited. A single view cannot distinguish "inside the
+    tissue" from "behind a fold of it": both are refused. max_unobserved: share of the instruments' pixels that may be
+    mostly unobserved. recorded_together: groups of instruments that may touch; empty: all may.
     """
 
     min_share: float
@@ -101,9 +100,9 @@ class Acceptance:
     recorded_together: tuple[frozenset[str], ...] = ()
 
     def refusal(self, drawing: LayeredDrawing) -> str | None:
-        """The reason to refuse the drawing, or None."""
+        """Return the reason to refuse the drawing, or None."""
         keypoints = working_ends_of(drawing.keypoints)
-        # first: an instrument wholly behind the tissue shows no pixels either
+        # first, as an instrument entirely behind the tissue has no pixels
         if self.tolerance_mm is not None and buried_depth(drawing) > self.tolerance_mm:
             return ENTERS_TISSUE
         if int(drawing.parts.count_nonzero()) < self.min_share * drawing.parts.numel():
@@ -116,8 +115,8 @@ class Acceptance:
         labelled = drawing.parts.numpy() > 0
         if labelled.any() and unobserved[labelled].mean(dtype=np.float32) > self.max_unobserved:
             return UNOBSERVED_SIDE
-        for some, others in combinations(self.recorded_together, 2):
-            for a, b in product(some & drawing.layers.keys(), others & drawing.layers.keys()):
+        for group, rivals in combinations(self.recorded_together, 2):
+            for a, b in product(group & drawing.layers.keys(), rivals & drawing.layers.keys()):
                 first, second = drawing.layers[a], drawing.layers[b]
                 both = first.mask & second.mask & (first.depth > 0) & (second.depth > 0)
                 near = np.abs(first.depth - second.depth)[both] < ACCEPTED.min_gap_mm
@@ -190,8 +189,8 @@ class SampleGenerator:
     def draw(self, index: int) -> LabelledSample:
         """Render sample `index`.
 
-        A random state is sampled again until one is acceptable, `settings.max_attempts` times at most. A prescribed
-        state is only rendered from other views. Raises StatesRefused where none was acceptable.
+        A random state is resampled until it is acceptable, at most `settings.max_attempts` times; a prescribed state is
+        rendered from other views. Raises StatesRefused if none was acceptable.
         """
         rng = self._rng(index, EFFECTS_STREAM)
         effects = {} if self.effects is None else self.effects.draw(rng)
@@ -200,7 +199,7 @@ class SampleGenerator:
         appearance = self.appearances.draw(self._rng(index, APPEARANCE_STREAM), width, height)
         image = self._image(drawing.state, drawing.camera, drawing.image, drawing.share, appearance)
         drawing = replace(drawing, image=image)
-        if appearance.background is not None:  # whose depth is unknown
+        if appearance.background is not None:  # its depth is unknown
             depth = np.where(drawing.parts.numpy() > 0, drawing.depth, 0.0)
             drawing = replace(drawing, depth=depth, unobserved=drawing.unobserved * drawing.share)
         labels = annotate(self.scene, drawing, self.labeller.names)
@@ -235,7 +234,7 @@ class SampleGenerator:
 
     @torch.no_grad()
     def _image(self, state: State, camera: Camera, image: Tensor, share: Tensor, appearance: Appearance) -> Tensor:
-        """The rendered `image` of a state, with its share of instruments, in an appearance."""
+        """Return the rendered `image` of a state, with its share of instruments, in an appearance."""
         if appearance.background is not None:
             gaussians = self.scene.at(state)
             owners = self.labeller.owners(state, gaussians)
@@ -247,7 +246,7 @@ class SampleGenerator:
     def _through_camera(
         self, drawing: LayeredDrawing, effects: Mapping[str, float], rng: Generator, appearance: Appearance
     ) -> LayeredDrawing:
-        """Apply the camera effects; labels stay those of the middle of the exposure."""
+        """Apply the camera effects; labels remain those of the middle of the exposure."""
         if not effects:
             return drawing
         if self.effects is not None and self.motion is not None and (shutter_s := effects.get("shutter_s", 0.0)) > 0:
@@ -257,7 +256,7 @@ class SampleGenerator:
                 rendering, _, share = self.labeller.draw(gaussians, camera, self.labeller.owners(state, gaussians))
                 shares.append(share.clamp(0, 1).cpu())
                 image = rendering.color.clamp(0, 1).cpu()
-                image = self._image(state, camera, image, shares[-1], appearance)  # a background stands still
+                image = self._image(state, camera, image, shares[-1], appearance)  # a background does not move
                 images.append(image.numpy())
             drawing = replace(drawing, image=torch.from_numpy(average_exposure(images)))
             if self.effects.soft_masks == "mean":
@@ -269,23 +268,23 @@ class SampleGenerator:
 
 
 def draw_encoded(generator: SampleGenerator, index: int) -> Encoded:
-    """Render sample `index` as it is written, or, for a prescribed state that was refused, that it was. Raises
-    StatesRefused where no random state was acceptable."""
+    """Render and encode sample `index`, or the refusal of a prescribed state. Raises StatesRefused if no random state
+    was acceptable."""
     try:
         sample = generator.draw(index)
     except StatesRefused as error:
         if generator.sampler.prescribed:
             return skipped_sample(index, error.refused)
         raise
-    how: dict[str, Any] = {"refused": sample.refused, "facts": sample.facts, "quality": generator.settings.jpeg_quality}
-    return encoded_sample(index, sample.drawing, labels_of(generator.scene, sample.drawing, sample.labels), **how)
+    labels, quality = labels_of(generator.scene, sample.drawing, sample.labels), generator.settings.jpeg_quality
+    return encoded_sample(index, sample.drawing, labels, refused=sample.refused, facts=sample.facts, quality=quality)
 
 
 def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
-    """Find the tolerance, in mm, under which nine of ten recorded states are acceptable, between 2 and 5 mm.
+    """Return the tolerance, in mm, under which nine of ten recorded states are acceptable, limited to 2 to 5 mm.
 
-    No recorded instrument was in the tissue: where the model says so, that is the model's error. More than 5 mm is no
-    such error: there, tissue stood before the instrument.
+    No recorded instrument was inside the tissue: where it seems so, the model is wrong. Depths above 5 mm are no such
+    error: there, tissue was in front of the instrument.
     """
     recorded = scene.recorded
     depths = [
@@ -298,8 +297,7 @@ def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
 def buried_depth(drawing: LayeredDrawing) -> float:
     """Return the depth, in mm, of the deepest instrument behind the tissue surface in this camera; 0 for none.
 
-    All but the deepest `buried_share` of an instrument's pixels are above this depth, and all keypoints of its working
-    end.
+    All but the deepest `buried_share` of an instrument's pixels and all keypoints of its working end are less deep.
     """
     deepest = 0.0
     keypoints = working_ends_of(drawing.keypoints)
@@ -319,7 +317,7 @@ def buried_depth(drawing: LayeredDrawing) -> float:
 
 
 def format_counts(refused: Mapping[str, int]) -> str:
-    """`leaves the image: 3, enters the tissue: 1`."""
+    """Format counts as `leaves the image: 3, enters the tissue: 1`."""
     return ", ".join(f"{reason}: {count}" for reason, count in refused.items())
 
 

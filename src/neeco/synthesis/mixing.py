@@ -1,7 +1,7 @@
-"""The tissue of one run under the instruments of others: one scene of them all, and where the instruments stand in it.
+"""Mixed scenes: the tissue of one run under the instruments of others, and the placement of the instruments.
 
-An instrument is placed before the camera as in its own recording, its working end as far before the tissue as it was
-there; lengths stay what they are (mm). The light is that of the tissue's capture.
+An instrument is placed relative to the camera as in its own recording, its working end at the same distance from the
+tissue; lengths in mm are preserved. The light is that of the tissue's capture.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from neeco.synthesis.states import with_poses
 
 @dataclass(frozen=True, kw_only=True)
 class MixingSettings:
-    """Settings of tissue and instruments of different runs."""
+    """Settings of mixed scenes."""
 
-    depth_scale: float = 0.25  # of the image's size, at which the depth of tissue is looked up
-    n_recorded_frames: int = 24  # frames that the mixed scene has as if they had been recorded
-    # range of the change of colours: beyond that, the shafts differ in make
+    depth_scale: float = 0.25  # scale of the image for looking up the depth of tissue
+    n_recorded_frames: int = 24  # number of frames created for the mixed scene's recording
+    # range of colour gains: beyond it, the shafts are of different materials
     gain_range: tuple[float, float] = (0.6, 1.6)
-    min_shaft_opacity: float = 0.5  # least opacity of Gaussians from which a shaft's colour is estimated
+    min_shaft_opacity: float = 0.5  # minimum opacity of Gaussians that determine a shaft's colour
 
 
 MIXING = MixingSettings()
@@ -51,19 +51,19 @@ MIXING = MixingSettings()
 
 @dataclass(frozen=True, kw_only=True)
 class Mixture:
-    """A scene of one run's tissue and other runs' instruments, with a way to place them."""
+    """A scene of one run's tissue and other runs' instruments, and the placement of these."""
 
     scene: GaussianScene
     tissue: GaussianScene
     instrument_scenes: tuple[GaussianScene, ...]
-    gains: tuple[tuple[float, float, float], ...]  # by which each instrument scene's colours were multiplied
-    min_depth: Mapping[str, float]  # mm from the lens, by instrument: working ends were recorded no nearer
+    gains: tuple[tuple[float, float, float], ...]  # colour gains of each instrument scene
+    min_depth: Mapping[str, float]  # mm from the lens, by instrument: the minimum recorded depth of working ends
     tissue_alone: Gaussians  # of `tissue`
     own_tissue_alone: tuple[Gaussians, ...]  # of every instrument scene
 
     @classmethod
     def of(cls, tissue: GaussianScene, instrument_scenes: Sequence[GaussianScene]) -> Mixture:
-        """Raises NeecoError where a scene's instruments cannot be taken out of it, or two have the same name."""
+        """Mix the scenes. Raises NeecoError if a scene's instruments are not separate, or two have the same name."""
         for scene in (tissue, *instrument_scenes):
             if not scene.deformation.separates_instruments or scene.method != tissue.method:
                 problem = f"method {scene.method} does not keep tissue and instruments apart"
@@ -77,9 +77,9 @@ class Mixture:
         if any(not scene.recorded.states for scene in (tissue, *instrument_scenes)):
             raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
         gains: list[tuple[float, float, float]] = []
-        for scene in instrument_scenes:  # 1 where there is no instrument to compare with, or it is the same run
+        for scene in instrument_scenes:  # gain 1 without an instrument to compare with, or for the same run
             gain = torch.ones(3)
-            if tissue is not scene and tissue.instruments:  # shafts are of a similar grey in both
+            if tissue is not scene and tissue.instruments:  # assuming that both shafts have the same grey
                 ratio = _shaft_color(tissue) / _shaft_color(scene).clamp_min(1e-3)
                 gain = ratio.clamp(*MIXING.gain_range)
             gains.append((float(gain[0]), float(gain[1]), float(gain[2])))
@@ -104,7 +104,7 @@ class Mixture:
         return mixture
 
     def sampler(self, settings: Settings) -> MixedSampler:
-        """Draws where the instruments are, each as its own run's sampler does."""
+        """Return the sampler of placed instruments, each from its own run's sampler."""
         if settings.states not in ("interpolate", "extrapolate"):
             fitting = "with --instruments use interpolate or extrapolate"
             raise NeecoError(f"--states: {settings.states}: states of one recording; {fitting}")
@@ -115,27 +115,27 @@ class Mixture:
         return MixedSampler(self, tuple(samplers))
 
     def place(self, scene: GaussianScene, state: State, seen_by: Camera, camera: Camera) -> dict[str, InstrumentState]:
-        """The instruments of instrument scene `scene`, in `state` before `seen_by`, as placed before `camera` of the
-        tissue's run.
+        """Return the instruments of instrument scene `scene`, in `state` relative to `seen_by`, placed relative to
+        `camera` of the tissue's run.
 
-        They are shifted along the line of sight until they are as far before this tissue as before their own, but no
-        nearer to the lens than they were recorded: how they look there is unknown.
+        They are shifted along the line of sight to have the same distance from this tissue as from their own, but no
+        nearer to the lens than recorded, as their appearance there is unknown.
         """
         registered = scene.registered(state)
         camera_from_world = np.linalg.inv(to_numpy(seen_by.world_from_camera))
         end = _working_end(scene, state, seen_by)
         shift = np.eye(4)
         own_tissue = self.own_tissue_alone[self.instrument_scenes.index(scene)]
-        here, there = tissue_depth(self.tissue_alone, camera, end), tissue_depth(own_tissue, seen_by, end)
-        if here > 0 and there > 0 and end[2] > 0:
+        target, source = tissue_depth(self.tissue_alone, camera, end), tissue_depth(own_tissue, seen_by, end)
+        if target > 0 and source > 0 and end[2] > 0:
             min_depth = min(self.min_depth[name] for name in registered.instruments)
-            depth = max(end[2] + here - there, min(min_depth, end[2]))
+            depth = max(end[2] + target - source, min(min_depth, end[2]))
             shift[:3, 3] = (depth / end[2] - 1) * end
         carry = to_numpy(camera.world_from_camera) @ shift @ camera_from_world
         return dict(with_poses(registered, lambda name, pose: carry @ pose).instruments)
 
     def _recorded(self) -> Recorded:
-        """Frames spread over the tissue's cameras, with the instrument scenes' recorded states placed before them."""
+        """Return frames at the tissue's cameras, with the instruments' recorded states placed there."""
         cameras = self.tissue.recorded.cameras
         count = min(MIXING.n_recorded_frames, len(cameras))
         chosen, states = [], []
@@ -156,19 +156,19 @@ class Mixture:
 
 @dataclass(frozen=True)
 class MixedSampler:
-    """Draws (state, camera): a recorded camera of the tissue's run, and before it what the sampler of every instrument
-    scene draws."""
+    """Samples (state, camera): a recorded camera of the tissue's run, with a placed sample of every instrument
+    scene."""
 
     mixture: Mixture
     samplers: tuple[Sampler, ...]
     prescribed: bool = False
 
     def fixed(self, index: int) -> bool:
-        """Never: another draw is another image."""
+        """Return False: every sample differs."""
         return False
 
     def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
-        """The next (state, camera) for image `index`."""
+        """Return the next (state, camera) for image `index`."""
         cameras = self.mixture.tissue.recorded.cameras
         camera = cameras[int(rng.integers(len(cameras)))]
         placed: dict[str, InstrumentState] = {}
@@ -178,7 +178,7 @@ class MixedSampler:
 
 
 def _working_end(scene: GaussianScene, state: State, camera: Camera) -> np.ndarray:
-    """The mean [3] mm of the instruments' working ends in the camera's frame; of their origins where none is known."""
+    """Return the mean [3] mm of the instruments' working ends, camera frame; of their origins without any."""
     ends = [point for points in working_ends_or_origins(scene, state).values() for point in points]
     camera_from_world = np.linalg.inv(to_numpy(camera.world_from_camera))
     return camera_from_world[:3, :3] @ np.mean(ends, axis=0) + camera_from_world[:3, 3]
@@ -186,16 +186,16 @@ def _working_end(scene: GaussianScene, state: State, camera: Camera) -> np.ndarr
 
 @torch.no_grad()
 def tissue_gaussians(scene: GaussianScene) -> Gaussians:
-    """The scene's tissue alone, which stands still; for its depth, so without its light."""
+    """Return the scene's static tissue alone, for its depth; so without its light."""
     gaussians = scene.at(scene.recorded.states[0])
     return dataclasses.replace(gaussians, sh=gaussians.sh[:, :1], headlight=None).select(scene.canonical.bodies == 0)
 
 
 @torch.no_grad()
 def tissue_depth(tissue: Gaussians, camera: Camera, point: np.ndarray) -> float:
-    """Depth mm of a tissue alone on the line of sight through `point` [3] mm of the camera's frame; 0 for none.
+    """Return the depth mm of a tissue on the line of sight through `point` [3] mm, camera frame; 0 for none.
 
-    Beyond the image's border, that of the nearest pixel.
+    Beyond the image border, that of the nearest pixel.
     """
     coarse = camera.scaled(MIXING.depth_scale)
     rendering = rasterize(tissue, coarse)
@@ -211,7 +211,7 @@ def merged_scene(
 ) -> GaussianScene:
     """Return one scene of the tissue of `tissue` and the instruments of `instrument_scenes`, which share a method.
 
-    gains: by which the colours of each instrument scene are multiplied; None: they stay as they are.
+    gains: colour gains of each instrument scene; None: unchanged.
     """
     method, combined = instrument_scenes[0].method, instrument_scenes[0].deformation.combined
     instruments = tuple(instrument for scene in instrument_scenes for instrument in scene.instruments)
@@ -246,7 +246,7 @@ def _body(scene: GaussianScene, index: int, deformation: Deformation) -> Canonic
 
 
 def _shaft_color(scene: GaussianScene) -> Tensor:
-    """[3] the mean colour, at 100 mm, of what is solid of the instruments' shafts."""
+    """Return the mean colour [3], at 100 mm, of the solid Gaussians of the instruments' shafts."""
     labels = scene.label_channels()
     shaft = [k for k, (_, part) in enumerate(scene.label_names) if part in ("shaft", "instrument")]
     weight = labels[:, shaft].sum(1) * (torch.sigmoid(scene.canonical.opacity_logits) > MIXING.min_shaft_opacity)

@@ -1,8 +1,8 @@
-"""The images of a data set, rendered by several processes of this machine or on a Ray cluster.
+"""Images of a data set, rendered by several processes on this machine or on a Ray cluster.
 
-Each worker opens the scene anew. On a machine the workers map the same file and write to the same folder. A cluster
-needs nothing but neeco installed: the scene files go out with the tasks, the files of the images come back and are
-written here.
+Each worker opens the scene itself. On one machine the workers map the same file and write to the same folder. A cluster
+needs nothing but an installed neeco: scene files are sent with the tasks, and image files are returned and written
+here.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from neeco.synthesis.samplers import states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Settings
 from neeco.synthesis.writers.folder import Encoded, Record
 
-TASK_SIZE = 8  # images of a cluster's task
+TASK_SIZE = 8  # images per task of a cluster
 
 
 @dataclass(frozen=True)
 class GeneratorSpec:
-    """Scene files and settings, small enough to be sent to another process, or `packed`, with all files' content."""
+    """Scene files and settings, small enough to be sent to another process; or `packed`, with all files' content."""
 
-    scenes: tuple[Path, ...]  # of the tissue, then of the instruments that are rendered over it instead of its own
+    scenes: tuple[Path, ...]  # the tissue's, then those of the instruments rendered over it instead of its own
     settings: Settings
     device: str = "cpu"
     files: Mapping[str, bytes] = field(default_factory=dict, compare=False)  # by path; packed: paths are relative
     digest: str = ""  # of `files`
 
     def packed(self) -> GeneratorSpec:
-        """The same with the content of its files. Raises NeecoError where one cannot be read."""
+        """Return a copy with the content of its files. Raises NeecoError if one cannot be read."""
         files = {}
 
         def pack(name: str, path: Path) -> Path:
@@ -63,10 +63,10 @@ class GeneratorSpec:
         return replace(spec, files=files, digest=digest.hexdigest())
 
     def open(self) -> SampleGenerator:
-        """The generator. Raises NeecoError where a file cannot be read or does not fit."""
+        """Return the generator. Raises NeecoError where a file cannot be read or does not fit."""
         if not self.files:
-            scene, *others = (load_gaussians(path, "synthesize", torch.device(self.device)) for path in self.scenes)
-            return SampleGenerator.of(scene, self.settings, others)
+            scene, *rest = (load_gaussians(path, "synthesize", torch.device(self.device)) for path in self.scenes)
+            return SampleGenerator.of(scene, self.settings, rest)
         folder = tempfile.TemporaryDirectory()
         for name, content in self.files.items():
             file = Path(folder.name) / name
@@ -74,11 +74,11 @@ class GeneratorSpec:
             file.write_bytes(content)
         spec = replace(self, files={})._moved(lambda _, path: Path(folder.name) / path)
         generator = spec.open()
-        weakref.finalize(generator, folder.cleanup)  # backgrounds are read when they are needed
+        weakref.finalize(generator, folder.cleanup)  # backgrounds are read on demand
         return generator
 
     def _moved(self, move: Callable[[str, Path], Path]) -> GeneratorSpec:
-        """The same with other paths of files, by `move` of a name and a path."""
+        """Return a copy with other paths of files, by `move` of a name and a path."""
         settings = self.settings
         named = {"camera_effects": settings.camera_effects} | settings.image_folders()
         moved: dict[str, Any] = {name: str(move(name, Path(path))) for name, path in named.items() if path is not None}
@@ -99,7 +99,7 @@ def limit_threads(threads: int) -> None:
 def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], workers: int) -> Iterator[Record]:
     """Yield the records of these images as they are rendered, in any order; the images are written to `output`.
 
-    Raises NeecoError with what a worker met, and where workers are killed repeatedly.
+    Raises NeecoError with a worker's error, and if workers are killed repeatedly.
     """
     shared: tuple[GeneratorSpec, Path | None] = (spec, output)
     size, each = 1, max(1, threads() // workers)
@@ -117,13 +117,13 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
                 for result in event.value if event.stage == "done" else ():
                     yield result.write(output) if isinstance(result, Encoded) else result
     finally:
-        sweep_unfinished(output)  # what a worker had half written
+        sweep_unfinished(output)  # a worker's unfinished files
 
 
 def _draw(
     shared: tuple[GeneratorSpec, Path | None], indices: tuple[int, ...], threads: int
 ) -> list[Record] | list[Encoded]:
-    """Render these images in a worker; return their records where it can write to the output, else all of them."""
+    """Render these images in a worker; return their records if it can write to the output, else all files."""
     spec, output = shared
     with readable_failures():
         generator = _opened(spec, threads)
@@ -133,6 +133,6 @@ def _draw(
 
 @lru_cache(maxsize=1)
 def _opened(spec: GeneratorSpec, threads: int) -> SampleGenerator:
-    """The generator, opened once in a worker, whatever number of tasks it gets."""
+    """Return the generator, opened once per worker."""
     limit_threads(threads)
     return spec.open()

@@ -41,9 +41,9 @@ class View(NamedTuple):
 
 
 def split_views(run: TrainedRun, split: str, capture_path: Path | None = None) -> list[View]:
-    """The frames of one split of a capture (the run's own unless given), named by their files' stems.
+    """Return the frames of one split of a capture (default: the run's own), named by their files' stems.
 
-    Stems that several frames share are made unique by the names of the folders above them. Raises NeecoError.
+    Shared stems are made unique by folder names. Raises NeecoError.
     """
     other = None if capture_path is None else read_capture(capture_path)
     capture = run.scene.recorded.completed(other, run.scene.instruments) if other else run.capture()
@@ -61,7 +61,7 @@ def split_views(run: TrainedRun, split: str, capture_path: Path | None = None) -
 
 
 def state_views(scene: DrawableScene, path: Path) -> list[View]:
-    """The states of a JSON-lines file, each from its own camera, or the first recorded one where it has none."""
+    """Return the states of a JSON-lines file, each with its own camera, else the first recorded one."""
     first, lines = scene.recorded.cameras[0], read_states(path, scene.recorded.with_limits(scene.instruments))
     poses = (line.world_from_camera for line in lines)
     cameras = [first if pose is None else moved_camera(first, pose) for pose in poses]
@@ -75,8 +75,8 @@ def render(
     on_progress: Callable[[int], None] = lambda done: None,
     images: ImageSettings = AS_RECORDED,
 ) -> None:
-    """Write NAME.png (or .jpg), NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json:
-    what the ids mean. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError."""
+    """Write NAME.png (or .jpg), NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json with
+    the meaning of the ids. The caller sets the number of torch threads (`open_run`). Raises NeecoError."""
     cameras = DrawnCameras.of(images, scene.recorded, (view.camera for view in views))
     for done, view in enumerate(views, 1):
         drawing = draw(scene, view.state, cameras(view.camera))
@@ -96,8 +96,8 @@ def require_pyav() -> None:
 
 
 def views_along(views: Sequence[View], count: int) -> list[View]:
-    """Return `count` views evenly spread along given ones, the first and last included: states as `PathStates`, camera
-    poses as `interpolate_pose`. Raises NeecoError for fewer than two views."""
+    """Return `count` views evenly spaced along the given ones, the first and last included: states as `PathStates`,
+    camera poses as `interpolate_pose`. Raises NeecoError for fewer than two views."""
     path, rng = PathStates([view.state for view in views], count), np.random.default_rng(0)
     poses = [to_numpy(view.camera.world_from_camera) for view in views]
     along = []
@@ -115,9 +115,8 @@ def write_video(
     on_progress: Callable[[int], None] = lambda done: None,
     images: ImageSettings = AS_RECORDED,
 ) -> None:
-    """Write the views' images in order, FPS of them a second, without the last row or column where that is odd (H.264
-    has colours of two by two pixels). Raises NeecoError where PyAV is missing, images differ in size, or the disk
-    refuses."""
+    """Write the views' images in order, FPS per second, without the last row or column if odd (H.264 stores colours for
+    two by two pixels). Raises NeecoError if PyAV is missing, images differ in size, or the disk refuses."""
     require_pyav()
     import av
 

@@ -1,6 +1,6 @@
 """Samplers of views, and of the state and camera of image `index`; the cameras that render them.
 
-Views: recorded cameras, cameras near them, cameras in orbit about the tissue.
+Views: recorded cameras, cameras near them, cameras in orbit around the tissue.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from neeco.synthesis.states import (
 class SamplerSettings:
     """Settings of the samplers of views."""
 
-    n_similar: int = 10  # recorded frames whose cameras may observe a sampled state
-    max_view_attempts: int = 50  # views sampled until one has the instrument in the image
-    still_degrees: float = 1.0  # by which perturbed views differ from those of a still scope: it observed one side
+    n_similar: int = 10  # recorded frames whose cameras are candidates for a sampled state
+    max_view_attempts: int = 50  # maximum number of views sampled until one contains the instrument
+    still_degrees: float = 1.0  # perturbation of views of a still scope, which observed one side only
     still_mm: float = 1.0  # the same, of their positions
-    n_surface_views: int = 5  # recorded views that decide where the surface's middle is
+    n_surface_views: int = 5  # recorded views that determine the centre of the surface
 
 
 SAMPLING = SamplerSettings()
@@ -58,8 +58,8 @@ ViewSampler = Callable[[State, Generator], Camera]
 
 
 class SimilarFrames:
-    """Picks one of `count` recorded frames (its index): among the `n_similar` ones with the most similar states, or any
-    where all states are equal. states: those of the frames; empty: none are known."""
+    """Selects one of `count` recorded frames (its index): among the `n_similar` ones with the most similar states, or
+    any if all states are equal. states: of the frames; empty: unknown."""
 
     def __init__(self, states: Sequence[State], count: int, joints: bool) -> None:
         common = set.intersection(*(set(state.instruments) for state in states)) if states else set()
@@ -82,8 +82,8 @@ class SimilarFrames:
 class RecordedViews:
     """The camera of a recorded frame, one of the SAMPLING.n_similar with the most similar states.
 
-    A camera that follows its instrument observed it there: instruments stand in the image as recorded ones do, which
-    is what a detector learns from. states: the recorded frames'; empty: any camera.
+    A camera that followed its instrument recorded it there: instruments are positioned in the image as in recorded
+    ones, which a detector learns. states: the recorded frames'; empty: any camera.
     """
 
     def __init__(self, cameras: Sequence[Camera], states: Sequence[State] = ()) -> None:
@@ -98,7 +98,7 @@ class RecordedViews:
 
 @dataclass(frozen=True)
 class PerturbedViews:
-    """A recorded camera, turned about its centre and shifted, both normally distributed about zero.
+    """A recorded camera, rotated about its centre and shifted, both normally distributed about zero.
 
     `degrees` and `mm` are standard deviations of the angle about each axis and of the shift along each.
     """
@@ -116,9 +116,9 @@ class PerturbedViews:
 
 @dataclass(frozen=True)
 class OrbitViews:
-    """A recorded camera carried round `centre` (world mm), which stays at its place in the image.
+    """A recorded camera in orbit around `centre` (world mm), which stays at its position in the image.
 
-    The turn is uniform in direction and uniform in angle up to `degrees`.
+    The rotation is uniform in direction and in angle up to `degrees`.
     """
 
     recorded: RecordedViews
@@ -129,7 +129,7 @@ class OrbitViews:
         camera = self.recorded(state, rng)
         world_from_camera = to_numpy(camera.world_from_camera)
         direction = 2 * np.pi * rng.random()
-        # the axis lies in the image plane: the camera moves sideways, it does not roll
+        # axis in the image plane: the camera moves sideways without roll
         axis = world_from_camera[:3, :3] @ np.array([np.cos(direction), np.sin(direction), 0.0])
         turn = turn_about(self.centre, np.deg2rad(self.degrees) * rng.random() * axis)
         return moved_camera(camera, turn @ world_from_camera)
@@ -142,18 +142,18 @@ class Sampler:
     scene: GaussianScene
     states: StateSampler
     views: ViewSampler
-    cameras: tuple[Camera | None, ...] = (None,)  # given with the states, in turn; None: the view sampler decides
-    prescribed: bool = False  # whether the state of an index is given rather than random
+    cameras: tuple[Camera | None, ...] = (None,)  # prescribed with the states, in turn; None: by the view sampler
+    prescribed: bool = False  # whether the state of an index is prescribed, not random
 
     def fixed(self, index: int) -> bool:
-        """Return whether both state and camera of image `index` are given: another sample would be the same."""
+        """Return whether both state and camera of image `index` are prescribed: resampling would not change them."""
         return self.prescribed and self.cameras[index % len(self.cameras)] is not None
 
     def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
         """Return the next (state, camera) for image `index`.
 
-        Most views of a moving camera do not show the instrument, and rendering is costly: views are sampled until one
-        has the instrument in the image, SAMPLING.max_view_attempts times at most.
+        Most views of a moving camera do not contain the instrument, and rendering is slow: views are sampled until one
+        does, at most SAMPLING.max_view_attempts times.
         """
         state = self.states(index, rng)
         prescribed = self.cameras[index % len(self.cameras)]
@@ -169,7 +169,7 @@ class Sampler:
 
 
 def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views, count: int) -> Sampler:
-    """The sampler named by `states` (interpolate, extrapolate, grid, path:FILE or FILE) and `views`. Raises
+    """Return the sampler named by `states` (interpolate, extrapolate, grid, path:FILE or FILE) and `views`. Raises
     NeecoError."""
     recorded = RecordedViews(scene.recorded.cameras, scene.recorded.states)
     view_sampler: ViewSampler = recorded
@@ -198,12 +198,12 @@ def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views,
     intrinsics = scene.recorded.cameras[0]
     poses = [line.world_from_camera for line in lines]
     cameras = tuple(None if pose is None else moved_camera(intrinsics, pose) for pose in poses)
-    # from the start again when more images than states are requested
+    # cyclic when more images than states are requested
     return Sampler(scene, lambda index, _: lines[index % len(lines)].state, view_sampler, cameras, prescribed=True)
 
 
 def states_file(states: str) -> Path:
-    """The file that `--states` names; NeecoError when it is meant to be a sampler's name but is none."""
+    """Return the file named by `--states`. Raises NeecoError if it is a misspelled sampler."""
     path = Path(states.removeprefix(PATH_PREFIX))
     if path.is_dir() or (not path.suffix and not path.exists()):
         raise NeecoError(f"--states: {states!r} is neither interpolate, extrapolate, grid, path:FILE.jsonl nor a file")
@@ -211,7 +211,7 @@ def states_file(states: str) -> Path:
 
 
 def states_fingerprint(states: str) -> str | None:
-    """sha256 of the file that `--states` names; None when it names a sampler."""
+    """Return the sha256 of the file named by `--states`; None if it names a sampler."""
     if states in SAMPLERS:
         return None
     missing = "no such file; --states takes interpolate, extrapolate, grid, path:FILE.jsonl or FILE.jsonl"
@@ -220,7 +220,7 @@ def states_fingerprint(states: str) -> str | None:
 
 @torch.no_grad()
 def shafts_of(scene: DrawableScene) -> dict[str, Shaft]:
-    """Every instrument's shaft: as learned, where the method learns one."""
+    """Return every instrument's shaft, as learned if the method learns one."""
     shafts = {item.name: Shaft(np.zeros(3), np.array([0.0, 0.0, 1.0]), False) for item in scene.instruments}
     if not is_gaussian(scene) or not scene.recorded.states:
         return shafts
@@ -237,12 +237,12 @@ def shafts_of(scene: DrawableScene) -> dict[str, Shaft]:
 
 
 def moved_camera(camera: Camera, world_from_camera: np.ndarray) -> Camera:
-    """The same camera elsewhere; world_from_camera [4, 4] with OpenCV axes."""
+    """Return the camera at another pose; world_from_camera [4, 4] with OpenCV axes."""
     return replace(camera, world_from_camera=torch.from_numpy(world_from_camera).to(camera.world_from_camera))
 
 
 def surface_points(depth: np.ndarray, camera: Camera, step: int = 4) -> np.ndarray:
-    """World points [P, 3] mm under every `step`-th pixel of a depth image [H, W] mm; pixels of depth 0 give none."""
+    """Return world points [P, 3] mm under every `step`-th pixel of a depth image [H, W] mm, if not 0."""
     rows, columns = np.mgrid[0 : camera.height : step, 0 : camera.width : step]
     z = depth[rows, columns]
     if camera.is_pinhole:
@@ -256,8 +256,8 @@ def surface_points(depth: np.ndarray, camera: Camera, step: int = 4) -> np.ndarr
 
 @dataclass(frozen=True)
 class DrawnCameras:
-    """Maps cameras with recorded intrinsics to those that render. `lens`: the recording's, where distortion is
-    wanted."""
+    """Maps cameras with recorded intrinsics to those that render. `lens`: the recording's, if distortion is
+    requested."""
 
     size: SizeSettings
     lens: Lens | None = None
@@ -275,7 +275,7 @@ class DrawnCameras:
         return drawn_cameras
 
     def __call__(self, camera: Camera) -> Camera:
-        """The camera in the place of `camera`, a pinhole."""
+        """Return the rendering camera for `camera`, a pinhole."""
         seen = camera if self.lens is None else self.lens.distorted_camera(camera)
         size = self.size.of(seen.width, seen.height)
         return seen if size == (seen.width, seen.height) else seen.resized(*size)

@@ -41,7 +41,7 @@ class SizeSettings:
     """Instead of --size: times the recorded width and height. Default: 1."""
 
     def check(self) -> None:
-        """Raises NeecoError naming the option that makes no sense."""
+        """Raise NeecoError naming an invalid option."""
         if self.size is not None and self.scale is not None:
             raise NeecoError("--size: given with --scale; give one of the two")
         if self.size is not None and not SIZE.fullmatch(self.size):
@@ -50,8 +50,8 @@ class SizeSettings:
             raise NeecoError(f"--scale must be a number above 0, such as 2 (got {self.scale})")
 
     def of(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height, px, of images that were recorded `width` x `height` px large. Raises NeecoError where these
-        have another shape than the requested size, or no image can be so large."""
+        """Return width and height, px, of images recorded at `width` x `height` px. Raises NeecoError if these differ
+        in shape from the requested size, or the images are too large."""
         size = width, height
         if self.scale is not None:
             scale = min(self.scale, MAX_PIXELS)
@@ -81,7 +81,7 @@ class ImageSettings(SizeSettings):
     """Of JPEG images, 1 to 100."""
 
     def check(self) -> None:
-        """Raises NeecoError naming the option that makes no sense."""
+        """Raise NeecoError naming an invalid option."""
         super().check()
         if not 1 <= self.quality <= 100:
             raise NeecoError(f"--quality must be 1 to 100 (got {self.quality})")
@@ -94,8 +94,8 @@ class ImageSettings(SizeSettings):
         return self.quality if self.image_format == "jpg" else None
 
     def image_identity(self, width: int, height: int) -> dict[str, Any]:
-        """Return the settings of images recorded `width` x `height` px large that must stay the same for a data set to
-        be continued; None where they are the only ones that earlier versions had."""
+        """Return the settings of images recorded at `width` x `height` px that must stay the same for a data set to be
+        continued; None if they are the only ones that earlier versions had."""
         size = self.of(width, height)
         return {
             "size": None if size == (width, height) else "x".join(map(str, size)),
@@ -117,7 +117,7 @@ def parse_class_names(words: Sequence[str], instruments: Sequence[str]) -> dict[
 
 
 def format_names() -> tuple[str, ...]:
-    """Return the names that `--formats` takes: ours, then those of installed packages. Loads none of them."""
+    """Return the names accepted by `--formats`: ours, then those of installed packages. Loads none of them."""
     return tuple(dict.fromkeys((*FORMATS, *sorted(point.name for point in entry_points(group=WRITERS)))))
 
 
@@ -142,7 +142,7 @@ RECORDED_SIZE, AS_RECORDED = SizeSettings(), ImageSettings()
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(ImageSettings):
-    """Everything that decides the pixels and labels of a data set, apart from the scene; stored in dataset.json."""
+    """All settings that determine the pixels and labels of a data set, apart from the scene; stored in dataset.json."""
 
     count: int
     """How many images."""
@@ -186,8 +186,8 @@ class Settings(ImageSettings):
 
     @classmethod
     def from_values(cls, owner: str, **values: Any) -> Settings:
-        """The settings with `values`, by the fields' names; `owner` has them, in messages. Raises NeecoError naming the
-        one that is unknown or does not fit."""
+        """Return the settings with `values` by field name; `owner`: their source in messages. Raises NeecoError naming
+        one that is unknown or invalid."""
         plain = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in values.items()}
         try:
             settings = structure(cls, plain, owner=owner)
@@ -198,7 +198,7 @@ class Settings(ImageSettings):
         return settings
 
     def check(self) -> None:
-        """Raises NeecoError naming the option that makes no sense."""
+        """Raise NeecoError naming an invalid option."""
         super().check()
         for option, number in (("count", self.count), ("seed", self.seed), ("max-attempts", self.max_attempts)):
             if not math.isfinite(number) or number != int(number):
@@ -217,10 +217,10 @@ class Settings(ImageSettings):
         return {name: folder for name, folder in folders.items() if folder is not None}
 
     def identity(self) -> dict[str, Any]:
-        """Return the settings that must stay the same for a data set to be continued, other than `image_identity`: all
-        but the count, unless a path spreads over it."""
+        """Return the settings that must stay the same for a data set to be continued, besides `image_identity`: all
+        except the count, unless a path is distributed over it."""
         values = asdict(self)
-        del values["max_attempts"]  # more of them change no image that was made
+        del values["max_attempts"]  # more attempts do not change existing images
         for field in fields(ImageSettings):
             del values[field.name]
         if not self.states.startswith(PATH_PREFIX):

@@ -21,8 +21,8 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
 
-ZERO_SHARE = 0.05  # of a joint's range: what lies past 0 by less is noise of its sensor
-JITTER_SHARE = 0.02  # of the recorded spread: keeps a sample off the exact line between two recorded states
+ZERO_SHARE = 0.05  # share of a joint's range: values beyond 0 by less are sensor noise
+JITTER_SHARE = 0.02  # share of the recorded spread: jitter off the exact line between two recorded states
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class JointRange:
     upper: float
 
     def at(self, share: float) -> float:
-        """The value with `share` of the range below it."""
+        """Return the value with `share` of the range below it."""
         return float(self.lower + share * (self.upper - self.lower))
 
     def widened(self, margin: float, limits: tuple[float, float] | None) -> JointRange:
-        """The range, wider by `margin` of its length at either end, but never outside `limits`. Where the capture
-        states none, a range on one side of 0 stays there: an angle of 0 is a closed jaw."""
+        """Return the range widened by `margin` of its length at either end, within `limits`. Without stated limits, a
+        range on one side of 0 stays there: an angle of 0 is a closed jaw."""
         length = self.upper - self.lower
         reach = margin * length
         if limits is None and self.lower >= -ZERO_SHARE * length:
@@ -47,28 +47,28 @@ class JointRange:
             limits = -math.inf, 0.0
         lower, upper = self.lower - reach, self.upper + reach
         if limits is not None:
-            # where the capture states limits narrower than what it recorded, the recording counts
+            # if stated limits are narrower than the recorded values, the latter count
             lower = min(self.lower, max(lower, limits[0]))
             upper = max(self.upper, min(upper, limits[1]))
         return JointRange(lower, upper)
 
 
 class Shaft(NamedTuple):
-    """The line that an instrument is slid along and turned about, in its own frame."""
+    """The line that an instrument slides along and rotates about, in its own frame."""
 
     end: np.ndarray  # [3] mm; yaw and pitch turn about it
     along: np.ndarray  # [3] unit, towards the jaws
-    learned: bool  # False: the scene knows no shaft; the tracked frame's origin and z axis
+    learned: bool  # False: unknown shaft, replaced by the tracked frame's origin and z axis
 
 
 def turn_about(point: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
-    """The rigid motion [4, 4] that turns by a rotation vector [3] rad and leaves `point` [3] mm where it is."""
+    """Return the rigid motion [4, 4] that rotates by a rotation vector [3] rad about `point` [3] mm."""
     rotation = Rotation.from_rotvec(rotvec).as_matrix()
     return rigid(rotation, point - rotation @ point)
 
 
 def interpolate_pose(first: np.ndarray, second: np.ndarray, weight: float) -> np.ndarray:
-    """The rigid pose [4, 4] between two: positions on a line, rotations by slerp.
+    """Return the rigid pose [4, 4] between two: positions linearly, rotations by slerp.
 
     Weight 0 gives the first, 1 the second. Weights outside [0, 1] extrapolate.
     """
@@ -79,7 +79,7 @@ def interpolate_pose(first: np.ndarray, second: np.ndarray, weight: float) -> np
 
 
 def interpolate_state(first: State, second: State, weight: float) -> State:
-    """The state between two, of the instruments both know: poses as `interpolate_pose`, joints and time linearly."""
+    """Return the interpolated state of common instruments: poses as `interpolate_pose`, the rest linearly."""
     instruments = {}
     for name in (name for name in first.instruments if name in second.instruments):
         a, b = first.instruments[name], second.instruments[name]
@@ -91,7 +91,7 @@ def interpolate_state(first: State, second: State, weight: float) -> State:
 
 
 def joint_ranges(states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
-    """The range of every joint, by (instrument, joint), over recorded states."""
+    """Return the range of every joint, by (instrument, joint), over recorded states."""
     readings: dict[tuple[str, str], list[float]] = {}
     for state in states:
         for name, instrument in state.instruments.items():
@@ -110,8 +110,8 @@ class InterpolatedStates:
     """States inside the recorded range.
 
     A random point between two random recorded states, jittered by a rigid motion common to all instruments (so that
-    bodies tracked apart but joined in the world stay together), every position clipped to the recorded bounds; joints
-    uniform over their recorded range.
+    bodies tracked separately but joined in the world stay together), every position clipped to the recorded bounds;
+    joints uniform over their recorded range.
     """
 
     def __init__(self, states: Sequence[State]) -> None:
@@ -119,7 +119,7 @@ class InterpolatedStates:
         self.ranges = joint_ranges(self.states)
         self.means: dict[str, np.ndarray] = {}  # mean position and the chordal mean of the rotations
         self.bounds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        turns = []  # rad, the largest from the mean rotation
+        turns = []  # rad, the maximum from the mean rotation
         for name in {name for state in self.states for name in state.instruments}:
             poses = np.stack([to_numpy(s.instruments[name].pose) for s in self.states if name in s.instruments])
             rotations, positions = Rotation.from_matrix(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
@@ -154,10 +154,9 @@ class InterpolatedStates:
 class ExtrapolatedStates(InterpolatedStates):
     """States from the recorded range widened by `margin`.
 
-    Joints are uniform over their range widened by that fraction at either end, within the limits the capture states;
-    poses are sampled as `InterpolatedStates` does and then moved away from the mean recorded pose by a factor in
-    [1, 1 + 2 margin], as the half range either side of the mean grows by that much; all instruments of a state by the
-    same factor.
+    Joints are uniform over their range widened by this share at either end, within stated limits; poses are sampled as
+    in `InterpolatedStates` and then moved away from the mean recorded pose by a factor in [1, 1 + 2 margin], by which
+    half the range around the mean grows; one factor for all instruments of a state.
     """
 
     def __init__(self, states: Sequence[State], instruments: Sequence[Instrument], margin: float) -> None:
@@ -175,10 +174,10 @@ class ExtrapolatedStates(InterpolatedStates):
 
 
 class GridStates:
-    """Every joint value with every roll, about recorded poses.
+    """Every joint value with every roll, at recorded poses.
 
     Cell `index` mod (joint_values * rolls): all joints at the same fraction of their recorded ranges, each instrument
-    rolled about its shaft by -30 to 30 degrees. Each full round of cells stands on another recorded pose.
+    rolled about its shaft by -30 to 30 degrees. Each full round of cells uses another recorded pose.
     """
 
     def __init__(
@@ -193,7 +192,7 @@ class GridStates:
     def __call__(self, index: int, rng: Generator) -> State:
         round_number, cell = divmod(index, len(self.fractions) * len(self.rolls))
         fraction, roll = self.fractions[cell // len(self.rolls)], self.rolls[cell % len(self.rolls)]
-        # golden-ratio steps: successive rounds stand far apart in the recording
+        # golden-ratio steps: successive rounds are far apart in the recording
         base = self.states[int(round_number * 0.6180339887 * len(self.states)) % len(self.states)]
 
         turns = {name: turn_about(shaft.end, roll * shaft.along) for name, shaft in self.shafts.items()}
@@ -202,7 +201,7 @@ class GridStates:
 
 
 class PathStates:
-    """`count` states evenly spread along key states, first and last included."""
+    """`count` states evenly spaced along key states, first and last included."""
 
     def __init__(self, keys: Sequence[State], count: int) -> None:
         if len(keys) < 2:
@@ -210,7 +209,7 @@ class PathStates:
         self.keys, self.count = list(keys), count
 
     def place(self, index: int) -> tuple[int, float]:
-        """Return the key state before state `index`, and the share of the way to the next one."""
+        """Return the key state before state `index`, and the fraction of the way to the next one."""
         position = index / max(self.count - 1, 1) * (len(self.keys) - 1)
         segment = min(int(position), len(self.keys) - 2)
         return segment, position - segment
@@ -221,7 +220,7 @@ class PathStates:
 
 
 def with_poses(state: State, moved: Callable[[str, np.ndarray], np.ndarray]) -> State:
-    """The same state with every pose [4, 4] replaced by `moved(instrument, pose)`."""
+    """Return the state with every pose [4, 4] replaced by `moved(instrument, pose)`."""
     instruments = {
         name: InstrumentState(torch.from_numpy(moved(name, to_numpy(item.pose))), item.joints)
         for name, item in state.instruments.items()
@@ -230,7 +229,7 @@ def with_poses(state: State, moved: Callable[[str, np.ndarray], np.ndarray]) -> 
 
 
 def with_joints(state: State, value: Callable[[str, str], float]) -> State:
-    """The same state with every joint set to `value(instrument, joint)`."""
+    """Return the state with every joint set to `value(instrument, joint)`."""
     instruments = {
         name: InstrumentState(instrument.pose, {joint: value(name, joint) for joint in sorted(instrument.joints)})
         for name, instrument in state.instruments.items()

@@ -137,9 +137,9 @@ class LabelledImages(Dataset[Sample]):
         self.count, self.transform = count, transform
         self._settings = Settings.from_values(ASKED_BY, count=count, seed=seed, **options)
         self._opened = [_opened(one) for one in (scene, *instruments)]
-        first, *others = (opened for opened, _ in self._opened)
+        first, *instrument_scenes = (opened for opened, _ in self._opened)
         with torch_threads(1):
-            generator = SampleGenerator.of(first, self._settings, others)
+            generator = SampleGenerator.of(first, self._settings, instrument_scenes)
         self.part_names = generator.labeller.names  # (instrument, part) of part id 1, 2, ...
         self.classes = instruments_of(self.part_names)
         self.keypoint_names = keypoint_names(generator.scene)

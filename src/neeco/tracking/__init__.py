@@ -1,1 +1,1 @@
-"""States of footage, from its images alone: instruments are followed by their own learned scene."""
+"""States of footage, from its images alone: instruments are tracked with their own learned scene."""

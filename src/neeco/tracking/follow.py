@@ -1,4 +1,4 @@
-"""Frames followed one after the other: predicted, fitted and judged; searched near the prediction, then anywhere."""
+"""Frame-to-frame tracking: prediction, fit and evaluation; searches near the prediction, then anywhere."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class FollowSettings:
     unusual: float = 1.3  # ratio to the usual misfit, above which another state is searched for
     better: float = 0.85  # ratio of another state's misfit to the fit's, below which it replaces the fit
     n_recent: int = 10  # number of frames whose median misfit is the usual one
-    min_overlap: float = 0.5  # minimum overlap of the label; below it, the instruments are lost
-    search_rolls_every: int = 6  # frames between searches for other rolls, since drifting states may have small misfits
-    # deg, mm, deg of joints: standard deviations of a given state
+    min_overlap: float = 0.5  # minimum overlap of the label, below which tracking is lost
+    search_rolls_every: int = 6  # frames between searches for other rolls, as drifting states may have small misfits
+    # deg, mm, deg of joints: standard deviations of the stated initial state
     given_prior: tuple[float, float, float] = (4.0, 4.0, 8.0)
-    search_every_s: float = 0.2  # time between searches anywhere
-    low_trust: float = 0.5  # trust below which a followed state is searched anywhere
+    search_every_s: float = 0.2  # time between global searches
+    low_trust: float = 0.5  # trust of a tracked state below which a global search runs
     low_trust_search_every_s: float = 0.4  # time between these searches
 
 
@@ -46,18 +46,18 @@ How = Literal["begun", "followed", "beside", "found", "lost"]
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """The result for one frame, with all that the next one needs."""
+    """Result of one frame, with all inputs of the next step."""
 
     frame: int
     how: How
-    motion: MotionState  # where lost: the last estimate
+    motion: MotionState  # the last estimate if lost
     misfit: float = 0.0
     gain: float = 0.0
     trust: TrackTrust = NO_TRUST
-    recent: tuple[float, ...] = ()  # misfits of frames before
-    found_at: float  # s, when the instruments were last found
-    searched_at: float  # s, of the last search anywhere
-    unsearched: int = 0  # frames since other rolls were searched for
+    recent: tuple[float, ...] = ()  # misfits of preceding frames
+    found_at: float  # s, of the last successful track or search
+    searched_at: float  # s, of the last global search
+    unsearched: int = 0  # frames since the last search for other rolls
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, which `from_json` reads back exactly."""
@@ -88,7 +88,7 @@ def _converter() -> Any:
 
 @dataclass(frozen=True)
 class Follower:
-    """Follows instruments through frames, in either direction of time."""
+    """Tracks instruments through frames, in either direction of time."""
 
     frames: Sequence[Frame]
     fitter: TrackingFitter
@@ -105,7 +105,7 @@ class Follower:
         return cls(frames, fitter, search.motion, search, Judge(fitter, search, reference, allowance))
 
     def begin(self, frame: int, state: State) -> Step:
-        """Return the first step from a state that is approximately known."""
+        """Return the first step from an approximately known state."""
         prior = loose_prior(self.fitter.parameters, *FOLLOW.given_prior)
         fit = self.fitter.fit(
             self._view(frame, state), state, prior, levels=(0.125, 0.25, 0.5, 1.0), steps=(3, 3, 3, 4)
@@ -115,7 +115,7 @@ class Follower:
         return self._begun(frame, "begun", fit)
 
     def find(self, frame: int) -> Step:
-        """Return the first step of instruments whose state is not known."""
+        """Return the first step with an unknown state."""
         view = self._view(frame, None)
         best = self.search.anywhere(view)
         if best is None:
@@ -123,7 +123,7 @@ class Follower:
         return self._begun(frame, "found", best)
 
     def follow(self, before: Step, frame: int) -> Step:
-        """Return the step of a frame next in time to that of `before`."""
+        """Return the step of the frame adjacent in time to that of `before`."""
         time = self.frames[frame].state.time
         if before.how == "lost" and abs(time - before.found_at) > MOTION.max_gap_s:
             return self._searched(before, frame, None)
@@ -162,7 +162,7 @@ class Follower:
         return self._step(frame, how, fit, motion, trust, recent=recent, searched_at=searched_at, unsearched=unsearched)
 
     def _searched(self, before: Step, frame: int, view: FrameView | None) -> Step:
-        """Return the step after a search anywhere; lost where that fails, or the last one was a moment ago."""
+        """Return the step after a global search; lost if that fails, or the last one was too recent."""
         time, searched_at = self.frames[frame].state.time, before.searched_at
         if abs(time - searched_at) >= FOLLOW.search_every_s:
             best, searched_at = self.search.anywhere(self._view(frame, None) if view is None else view), time
@@ -172,7 +172,7 @@ class Follower:
         return self._lost(frame, before.motion, **history)
 
     def _begun(self, frame: int, how: How, fit: StateFit) -> Step:
-        """Return the step of a state just found."""
+        """Return the step of a newly detected state."""
         time = self.frames[frame].state.time
         trust, _ = self.judge.judge(fit)
         motion = self.motion.begin(replace(fit.state, time=time), fit.information)
@@ -183,7 +183,7 @@ class Follower:
     def _step(
         self, frame: int, how: How, fit: StateFit, motion: MotionState, trust: TrackTrust, **history: Any
     ) -> Step:
-        """Return the step of a frame in which the instruments are as fitted."""
+        """Return the step of a frame with fitted instruments."""
         trust = replace(trust, determined=self.motion.probability_within(motion, TRUST.wrong_deg))
         fitted: dict[str, Any] = {
             "misfit": fit.misfit,
@@ -194,14 +194,14 @@ class Follower:
         return Step(frame=frame, how=how, motion=motion, **fitted | history)
 
     def _lost(self, frame: int, motion: MotionState, **history: Any) -> Step:
-        """Return the step of a frame in which nothing was found, which was searched unless `history` says otherwise."""
+        """Return the step of a frame without a detection, which was searched unless `history` states otherwise."""
         searched: dict[str, Any] = {"found_at": NEVER, "searched_at": self.frames[frame].state.time}
         return Step(frame=frame, how="lost", motion=motion, **searched | history)
 
     def _usual_misfit(self, before: Step) -> float:
-        """Return the misfit that a followed frame may have.
+        """Return the misfit that is acceptable in a tracked frame.
 
-        A rise leads to a search once, and again when other rolls are searched for.
+        An increase triggers a search once, and again whenever other rolls are searched.
         """
         usual = [self.judge.reference.misfit]
         if before.recent:
@@ -214,11 +214,11 @@ class Follower:
 
 
 def _refutes(other: StateFit, fit: StateFit) -> bool:
-    """Return whether another fit leaves much less unexplained, and explains more of the image: an instrument that
-    hardly shows in it leaves little unexplained, too."""
+    """Return whether another fit has a much smaller misfit and a larger gain: an instrument that is hardly in the image
+    has a small misfit as well."""
     return other.misfit < FOLLOW.better * fit.misfit and other.gain > fit.gain
 
 
 def is_lost(trust: TrackTrust) -> bool:
-    """Return whether a state is not that of the instruments."""
+    """Return whether the state is not that of the instruments."""
     return trust.overlap < FOLLOW.min_overlap

@@ -1,7 +1,7 @@
-"""Motion of instruments between frames: constant velocity, with accelerations as large as were recorded.
+"""Motion of instruments between frames: constant velocity, with accelerations of the recorded magnitude.
 
-A Kalman filter over the parameters of states (`TrackedParameters`) and their velocities. Fits to frames are its
-measurements, so that prediction and image are weighed in the fit itself.
+A Kalman filter over the parameters of states (`TrackedParameters`) and their velocities. Its measurements are fits to
+frames, so that prediction and image are weighed within the fit.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from neeco.tracking.parameters import TrackedParameters
 class MotionSettings:
     """Settings of the motion prior."""
 
-    min_differences: int = 8  # minimum number of second differences from which accelerations are estimated
-    # deg, mm, deg and mm of joints: least second difference between frames
+    min_differences: int = 8  # minimum number of second differences for estimating accelerations
+    # deg, mm, deg and mm of joints: minimum second difference between frames
     min_difference: tuple[float, float, float, float] = (0.05, 0.03, 0.1, 0.05)
-    # the same: standard deviations of a state just found
+    # same units: standard deviations of a newly detected state
     initial_sd: tuple[float, float, float, float] = (2.0, 2.0, 3.0, 1.0)
-    # the same: of a state that no image determines
+    # same units: of a state that no image determines
     unknown_sd: tuple[float, float, float, float] = (60.0, 30.0, 40.0, 10.0)
-    max_gap_s: float = 0.4  # maximum gap over which a state is predicted; after a longer one it is searched for
+    max_gap_s: float = 0.4  # maximum gap for prediction; after a longer one, a search follows
 
 
 MOTION = MotionSettings()
 
-MAD_TO_SD = 1.4826  # standard deviation of a normal distribution, in median absolute deviations
+MAD_TO_SD = 1.4826  # ratio of a normal distribution's standard deviation to its median absolute deviation
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class MotionState:
     """Estimate of a state and its velocity at an instant."""
 
     state: State
-    velocity: Tensor  # [P] a second
+    velocity: Tensor  # [P] per s
     covariance: Tensor  # [2 P, 2 P] of parameters and velocity
 
 
@@ -53,14 +53,14 @@ class MotionModel:
     """Statistics of the instruments' recorded motion."""
 
     parameters: TrackedParameters
-    density: Tensor  # [P] of the white noise that accelerates: variance of the velocity a second
-    velocities: Tensor  # [P, P] covariance of the velocities, a second
+    density: Tensor  # [P] spectral density of white-noise acceleration: variance of the velocity per s
+    velocities: Tensor  # [P, P] covariance of the velocities, per s
     interval: float  # s between recorded frames
 
     @classmethod
     def of(cls, parameters: TrackedParameters, states: Sequence[State]) -> MotionModel:
-        """Estimate it from recorded states: robust deviation of second differences between consecutive frames, of first
-        differences where there are too few."""
+        """Estimate the model from recorded states: robust standard deviation of second differences between consecutive
+        frames, of first differences if there are too few."""
         ordered = sorted(states, key=lambda state: state.time)
         gaps = np.diff([state.time for state in ordered])
         gaps = gaps[gaps > 0]
@@ -86,9 +86,9 @@ class MotionModel:
         return cls(parameters, deviation**2 / interval**3, velocities, interval)
 
     def begin(self, state: State, information: Tensor | None = None) -> MotionState:
-        """Return the estimate of a state just found, of unknown velocity.
+        """Return the estimate of a newly detected state, with unknown velocity.
 
-        information [P, P]: of the image on the state, little on jaws outside of it; None: as much as is usual.
+        information [P, P]: of the image on the state, low for jaws outside it; None: the usual amount.
         """
         place = torch.diag(self.parameters.vector_from_degrees(*MOTION.initial_sd) ** 2)
         if information is not None:
@@ -98,9 +98,9 @@ class MotionModel:
         return MotionState(state, torch.zeros_like(place[0]), torch.block_diag(place, self.velocities))
 
     def predict(self, before: MotionState, seconds: float) -> MotionState:
-        """Return the estimate after `seconds`, which are negative where frames are followed backwards.
+        """Return the estimate after `seconds`, negative for backward tracking.
 
-        Velocities are along the direction of following.
+        Velocities are in the direction of tracking.
         """
         step, eye = abs(seconds), torch.eye(self.parameters.size, dtype=torch.float64)
         forward = torch.cat([torch.cat([eye, step * eye], 1), torch.cat([torch.zeros_like(eye), eye], 1)])
@@ -117,7 +117,7 @@ class MotionModel:
         return torch.linalg.inv(predicted.covariance[:size, :size])
 
     def update(self, predicted: MotionState, fit: StateFit) -> MotionState:
-        """Return the estimate after a frame to which the predicted state was fitted."""
+        """Return the estimate updated by a frame to which the predicted state was fitted."""
         size = self.parameters.size
         moved = self.parameters.increments_between(predicted.state, fit.state)
         place, cross = predicted.covariance[:size, :size], predicted.covariance[size:, :size]
@@ -128,8 +128,8 @@ class MotionModel:
         return MotionState(fit.state, velocity, (covariance + covariance.T) / 2)
 
     def probability_within(self, estimate: MotionState, degrees: float) -> float:
-        """Return the probability that rotation and every joint err by less than `degrees` (prismatic ones by 0.25 mm
-        per degree). A joint is taken to be evenly distributed between its bounds where nothing determines it."""
+        """Return the probability that rotation and all joints are accurate to `degrees` (prismatic ones to 0.25 mm per
+        degree). A joint that nothing determines is uniformly distributed between its bounds."""
         variance, limits = (
             estimate.covariance.diagonal(),
             self.parameters.vector_from_degrees(degrees, math.inf, degrees, degrees / 4),
@@ -138,14 +138,14 @@ class MotionModel:
         for item, (pose, rows) in zip(self.parameters.instruments, self.parameters.rows, strict=True):
             rotation = torch.linalg.eigvalsh(estimate.covariance[pose, pose][:3, :3])[-1:].clamp_min(0)
             joints = variance[rows].clamp_min(0)
-            between = ((item.high - item.low) ** 2 / 12).clamp_min(1e-12)  # variance of an even distribution
+            between = ((item.high - item.low) ** 2 / 12).clamp_min(1e-12)  # variance of a uniform distribution
             deviation = torch.cat([rotation, 1 / (1 / joints.clamp_min(1e-12) + 1 / between)]).sqrt()
             tolerance = torch.cat([limits[pose][:1], limits[rows]])
             probability *= float(torch.erf(tolerance / (math.sqrt(2) * deviation.clamp_min(1e-9))).prod())
         return probability
 
     def released(self, predicted: MotionState) -> MotionState:
-        """Return a prediction without its prior, to be updated by a fit that the motion did not foresee."""
+        """Return a prediction without its prior, for an update by a fit that is inconsistent with the motion."""
         place = torch.diag(self.parameters.vector_from_degrees(*MOTION.unknown_sd) ** 2)
         covariance = predicted.covariance + torch.block_diag(place, self.velocities)
         return MotionState(predicted.state, predicted.velocity, covariance)

@@ -1,4 +1,4 @@
-"""The parameters by which tracked states are corrected: rotations about a joint, joints near their recorded range."""
+"""Parameters of tracked states: rotations about a joint, joints near their recorded range."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from neeco.states.crop_rendering import InstrumentRenderer, TissueRenderer
 from neeco.states.fitter import Fitter
 from neeco.states.parameters import InstrumentParameters, StateParameters
 
-RANGE_BELOW, RANGE_ABOVE = 0.1, 0.5  # of a joint's recorded range: how far below and above it a joint may be
+RANGE_BELOW, RANGE_ABOVE = 0.1, 0.5  # extension of a joint's range, as shares of its recorded range
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackedInstrument(InstrumentParameters):
-    """The parameters of one instrument, its shaft's axis, and the bounds of its joints."""
+    """Parameters of one instrument, its shaft's axis, and the bounds of its joints."""
 
-    pivot: Tensor  # [3] mm, instrument frame: its first joint, or where its shaft ends
+    pivot: Tensor  # [3] mm, instrument frame: its first joint, or the end of its shaft
     axis: Tensor  # [3] unit, along the shaft, instrument frame
     low: Tensor  # [J] rad or mm
     high: Tensor
@@ -37,7 +37,7 @@ class TrackedParameters(StateParameters):
 
     @classmethod
     def of(cls, scene: GaussianScene) -> TrackedParameters:
-        """Take them from a scene. Raises NeecoError for one that does not keep tissue and instruments apart, or has no
+        """Create them for a scene. Raises NeecoError if its tissue and instruments are not separate, or it has no
         instrument."""
         deformation = scene.deformation
         if not (deformation.separates_instruments and isinstance(deformation, ArticulatedInstruments)):
@@ -59,7 +59,7 @@ class TrackedParameters(StateParameters):
             low, high = lowest - RANGE_BELOW * (highest - lowest), highest + RANGE_ABOVE * (highest - lowest)
             for k, name in enumerate(names):
                 limits = instrument.joints[name]
-                if limits is not None:  # noise of what was recorded may pass them
+                if limits is not None:  # noisy recorded values may exceed them
                     low[k], high[k] = max(float(low[k]), limits[0]), min(float(high[k]), limits[1])
             if articulation.jointed:
                 pivot = articulation.axes(shaft)[0][-1]
@@ -99,6 +99,6 @@ TrackingFitter = Fitter[TrackedParameters]
 def fitter_of(scene: GaussianScene) -> TrackingFitter:
     """Return the fitter of a scene's instruments over its tissue. Raises NeecoError as `TrackedParameters.of`."""
     parameters = TrackedParameters.of(scene)
-    scene.visibility()  # by which states are trusted; of the whole scene, where training did not store it
+    scene.visibility()  # for trust in states; of the whole scene, if training did not store it
     instruments = InstrumentRenderer(scene)
     return Fitter(instruments, parameters, TissueRenderer(scene, instruments))

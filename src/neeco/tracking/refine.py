@@ -1,7 +1,7 @@
-"""Training again on tracked frames, which show sides of the instruments that the run's own frames do not.
+"""Retraining with tracked frames, which show sides of the instruments that the run's own frames do not.
 
-States of the run's own frames are first fitted to their images, as tracked ones were, so that both are free of a
-tracker's latency and noise. Trust weighs frames in the loss.
+States of the run's own frames are first fitted to their images, like tracked ones, so that both are free of a tracker's
+latency and noise. Trust weights frames in the loss.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "neeco-refined/1"
 CAPTURE, RUN = "capture", "run"  # folders of the output
-BEGUN = "refined.json"  # in it: run and captures
+BEGUN = "refined.json"  # file in it with the run and captures
 RECORDED_PRIOR = (2.0, 2.0, 4.0)  # deg, mm, deg of joints: standard deviations of recorded states
 STAGING = "images"
 
@@ -48,11 +48,11 @@ def refine_run(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     on_row: ShowRow | None = None,
 ) -> Path:
-    """Train again on the run's own frames and on those of captures that `track` made over its tissue; return the run.
+    """Train again on the run's own frames and those of captures that `track` made over its tissue; return the run.
 
-    Writes into the folder `output`: `CAPTURE`, all these frames, and `RUN`, trained on it as the run was. Raises
-    NeecoError for captures of other instruments or tissue, and an `output` that is not empty (without `resume`) or was
-    begun otherwise.
+    Writes into the folder `output`: `CAPTURE`, all these frames, and `RUN`, trained on it with the run's settings.
+    Raises NeecoError for captures of other instruments or tissue, and an `output` that is not empty (without `resume`)
+    or was begun otherwise.
     """
     folder = output / CAPTURE
     info: dict[str, Any] = {
@@ -70,7 +70,7 @@ def refine_run(
         with own_folder(output):
             write_json(output / BEGUN, info)
             recorded = fitted(scene, capture, on_progress)
-            staging, named = output / STAGING, []  # images under names that the run's own do not have
+            staging, named = output / STAGING, []  # images whose names differ from the run's own
             staging.mkdir(parents=True, exist_ok=True)
             for k, frame in enumerate(frames):
                 path = staging / f"tracked_{k:05d}_{frame.name}{frame.image_path.suffix}"
@@ -78,7 +78,7 @@ def refine_run(
                 named.append(replace(frame, image_path=path))
             write_capture(replace(capture, frames=(*recorded, *named)), folder)
             shutil.rmtree(staging)
-    # the latency of a tracker is gone from the states
+    # fitted states have no tracker latency
     config = with_fields(
         stored_config(run.path, run.config), {"refine.latency": False, "transforms": "transforms.json"}
     )
@@ -86,7 +86,7 @@ def refine_run(
 
 
 def _tracked_frames(path: Path, scene: GaussianScene) -> list[Frame]:
-    """Return the frames of a tracked capture, to train on. Raises NeecoError where they do not fit the scene."""
+    """Return the training frames of a tracked capture. Raises NeecoError if they do not fit the scene."""
     capture = read_capture(path)
     info = read_json(path / INFO) if (path / INFO).exists() else {}
     if isinstance(info, dict) and info.get("tissue", "run") != "run":
@@ -103,10 +103,10 @@ def _tracked_frames(path: Path, scene: GaussianScene) -> list[Frame]:
 
 
 def without_twice(capture: Capture, tracked: Sequence[Frame]) -> tuple[Capture, list[Frame]]:
-    """Return both without images that both have, and each image of the tracked ones once.
+    """Return both lists of frames without images that are in both, and each tracked image once.
 
-    Training frames stay as recorded. Withheld frames that were tracked are trained on as tracked, and are no longer
-    test frames. Raises NeecoError when an image cannot be read.
+    Training frames stay as recorded. Tracked held-out frames become training frames with their tracked states. Raises
+    NeecoError when an image cannot be read.
     """
 
     def digest_of(frame: Frame) -> bytes:

@@ -1,4 +1,4 @@
-"""Searches for states where a fit from the prediction fails: near it, or anywhere."""
+"""Searches for states after a fit from the prediction failed: near it, or global."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from neeco.tracking.parameters import TrackedParameters, TrackingFitter
 
 @dataclass(frozen=True, kw_only=True)
 class TrackSearchSettings:
-    """Settings of searches from afar."""
+    """Settings of searches."""
 
-    # along the shaft: its teeth, rings and end hold a fit where it was
+    # along the shaft, as its teeth, rings and end are local minima
     shifts_mm: tuple[float, ...] = (-5.0, -2.5, 0.0, 2.5, 5.0)
-    rolls_deg: tuple[float, float, float] = (-8.0, 0.0, 8.0)  # tried about a prediction
+    rolls_deg: tuple[float, float, float] = (-8.0, 0.0, 8.0)  # candidates about a prediction
     n_samples: int = 48  # number of samples of the prediction
     prior_scale: float = 3.0  # factor on the prediction's standard deviations
     n_fitted_near: int = 3  # number of starts near the prediction that are fitted
@@ -33,13 +33,13 @@ class TrackSearchSettings:
     n_starts: int = 6  # number of these that are fitted
     n_turned: int = 3  # number of variants of the best state, with other rolls and joints, that are fitted
     n_finalists: int = 2  # number of fits that are refined at full size
-    apart_mm: float = 8.0  # minimum distance between starts: closer states lead to the same fit
-    apart_deg: float = 15.0  # the same, of turns
+    apart_mm: float = 8.0  # minimum distance between starts; closer ones converge to the same fit
+    apart_deg: float = 15.0  # the same, of rotations
     apart_joint_deg: float = 15.0  # the same, of joints
-    # of states that look alike
+    # of states with similar appearance
     other_rolls_deg: tuple[float, ...] = (-90.0, -60.0, -40.0, -25.0, 25.0, 40.0, 60.0, 90.0, 180.0)
-    other_joints_deg: tuple[float, float] = (-15.0, 15.0)  # of states that look alike
-    mm_per_deg: float = 0.25  # of prismatic joints, wherever a number of degrees is asked for
+    other_joints_deg: tuple[float, float] = (-15.0, 15.0)  # of states with similar appearance
+    mm_per_deg: float = 0.25  # of prismatic joints, for numbers in degrees
 
 
 STARTS = TrackSearchSettings()
@@ -55,16 +55,16 @@ class Search:
 
     @classmethod
     def of(cls, fitter: TrackingFitter) -> Search:
-        """Return the search among the recorded states of the fitter's scene."""
+        """Return a search among the recorded states of the fitter's scene."""
         recorded = fitter.instruments.scene.recorded
         return cls(fitter, MotionModel.of(fitter.parameters, recorded.states), recorded)
 
     def near(
         self, view: FrameView, predicted: MotionState, others: Sequence[State], usual_misfit: float
     ) -> StateFit | None:
-        """Return the best fit begun from states along the shaft, at other rolls, and sampled from the prediction.
+        """Return the best fit from states along the shaft, at other rolls, and sampled from the prediction.
 
-        Starts are taken about the prediction and `others`. The first fit with at most `usual_misfit` ends the search.
+        Candidates are around the prediction and `others`. The first fit with at most `usual_misfit` ends the search.
         """
         parameters, tried = self.fitter.parameters, []
         for base in (predicted.state, *others):
@@ -92,17 +92,17 @@ class Search:
         return self.fitter.fit(view, predicted.state, precision, best.state, levels=(1.0,), steps=(4,))
 
     def anywhere(self, view: FrameView) -> StateFit | None:
-        """Return the best fit begun from recorded states, then from the best one with other rolls and joints.
+        """Return the best fit from recorded states, then from the best one with other rolls and joints.
 
-        None where no state explains the image better than the tissue alone.
+        None if no state explains the image better than the tissue alone.
         """
         fitter, prior = self.fitter, loose_prior(self.fitter.parameters, *STARTS.anywhere_prior)
         starts = self._different(fitter.ranked(view, self.recorded_states(view.camera), 0.125), STARTS.n_starts)
         fits = [fitter.fit(view, state, prior, levels=(0.125, 0.25), steps=(6, 4)) for state in starts]
         fitted = _by_gain(fits)
         if fitted:
-            others = self._different(fitter.ranked(view, self.turned(fitted[0].state), 0.25), STARTS.n_turned)
-            fits = [fitter.fit(view, state, prior, levels=(0.25,), steps=(6,)) for state in others]
+            distinct_states = self._different(fitter.ranked(view, self.turned(fitted[0].state), 0.25), STARTS.n_turned)
+            fits = [fitter.fit(view, state, prior, levels=(0.25,), steps=(6,)) for state in distinct_states]
             fitted = _by_gain([*fitted, *fits])
         last = [
             fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4)) for fit in fitted[: STARTS.n_finalists]
@@ -111,7 +111,7 @@ class Search:
         return best[0] if best and best[0].gain > 0 else None
 
     def recorded_states(self, camera: Camera) -> list[State]:
-        """Return recorded states, moved so that `camera` observes them as their own cameras did."""
+        """Return recorded states, moved to have the same pose relative to `camera` as to their own cameras."""
         recorded, world = self.recorded, camera.world_from_camera.double().cpu()
         states = []
         for k in evenly_spaced(len(recorded.states), STARTS.n_recorded):
@@ -124,7 +124,7 @@ class Search:
         return states
 
     def turned(self, state: State) -> list[State]:
-        """Return variants of a state: each instrument in turn at other rolls, with its joints as they are and moved."""
+        """Return variants of a state: each instrument at other rolls, with unchanged and changed joints."""
         parameters, variants = self.fitter.parameters, []
         for k, item in enumerate(parameters.instruments):
             joints = state.instruments[item.name].joints
@@ -140,7 +140,7 @@ class Search:
         return variants
 
     def _different(self, states: Sequence[State], count: int) -> list[State]:
-        """Return the first `count` states that lead to different fits."""
+        """Return the first `count` states that lead to distinct fits."""
         chosen: list[State] = []
         for state in states:
             limits = STARTS.apart_deg, STARTS.apart_joint_deg, STARTS.apart_mm

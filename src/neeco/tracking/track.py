@@ -1,8 +1,8 @@
-"""`neeco track`: footage without states becomes a capture, with the trust in each state.
+"""`neeco track`: estimate the states of footage, with the trust in each, and write a capture.
 
-Frames are followed forwards from where the instruments were first found, then backwards to the beginning. Stretches of
-low trust are followed once more, backwards from the frame after them; the more trusted result is kept. Every step is
-written into the output as it is made, so that interrupted work continues to the same bytes.
+Frames are tracked forwards from the first detection, then backwards to the beginning. Intervals of low trust are
+tracked again, backwards from the frame after them; the more trusted result is kept. Every step is written immediately,
+so that interrupted work continues to the same bytes.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ if TYPE_CHECKING:
 
 SCHEMA = "neeco-track/1"
 INFO = "track.json"
-STEPS = "steps"  # the folder of finished steps, removed at the end
+STEPS = "steps"  # folder of finished steps, removed at the end
 PAGE = "track.html"
-RUN = "run"  # the folder of the run with which footage over another tissue was tracked
+RUN = "run"  # folder of the run used for footage over another tissue
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackSettings:
-    """Thresholds of tracks."""
+    """Thresholds of tracking."""
 
-    other_tissue_misfit: float = 3.0  # of instruments over another run's tissue, times that over their own
-    min_trust: float = 0.5  # of a frame's state, below which the frame is left out
-    min_trusted_share: float = 0.5  # of the frames, below which the result is DOUBTFUL
-    certain: float = 0.8  # trust with which following begins at once
-    n_beginnings: int = 8  # frames in which the instruments are searched for, until one is certain
-    follow_again: float = 0.7  # trust below which a stretch is followed once more, from its far end
+    other_tissue_misfit: float = 3.0  # ratio of the misfit over another run's tissue to that over their own
+    min_trust: float = 0.5  # trust of a frame's state below which the frame is excluded
+    min_trusted_share: float = 0.5  # share of frames below which the result is DOUBTFUL
+    certain: float = 0.8  # trust at which tracking starts immediately
+    n_beginnings: int = 8  # frames searched for a first detection, until one is certain
+    follow_again: float = 0.7  # trust below which an interval is tracked again, from its far end
 
 
 TRACK = TrackSettings()
@@ -65,7 +65,7 @@ Start = Literal["first", "none"]
 
 @dataclass(frozen=True)
 class Tracked:
-    """The result: a record of every frame, in order of time, and the capture of those that are trusted."""
+    """The result: a record of every frame, in order of time, and the capture of the trusted ones."""
 
     output: Path
     footage: Capture
@@ -76,7 +76,7 @@ class Tracked:
 
     @property
     def page(self) -> Path:
-        """The page about all frames, once `write_track_page` has written it."""
+        """Return the page about all frames, once `write_track_page` has written it."""
         return self.output / PAGE
 
     def __repr__(self) -> str:
@@ -87,14 +87,14 @@ class Tracked:
         """One sentence on the trust in the states; the verdict DOUBTFUL is in capitals."""
         count, missing = len(self.records), sum(record["how"] == "lost" for record in self.records)
         typical = median(record["trust"]["value"] for record in self.records)
-        summary = f"trust is {typical:.2f} in the median"
+        summary = f"trust is {typical:.2f} (median)"
         summary += f", and in {missing} of {count} frames nothing was found" if missing else ""
         if self.written < TRACK.min_trusted_share * count:
             return f"DOUBTFUL: {summary}; check that it shows the run's instrument over its tissue"
         return f"{'good' if self.written == count else 'usable'}: {summary}"
 
     def require_trusted(self) -> None:
-        """Raises NeecoError where no frame is trusted."""
+        """Raise NeecoError if no frame is trusted."""
         if not self.written:
             best = max(record["trust"]["value"] for record in self.records)
             raise NeecoError(
@@ -160,7 +160,7 @@ def track_footage(
             records = [_record(frames[k], step, parameters) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
         else:
-            info = stored | {"min_trust": min_trust}  # of the same steps, other frames may be trusted
+            info = stored | {"min_trust": min_trust}  # with the same steps, other frames may be trusted
         registered = trained_on.registered or tissue is not None
         chosen = tuple(
             replace(frame, state=state_of(record))
@@ -171,7 +171,7 @@ def track_footage(
         if trusted.frames:
             write_tracked(trusted, output, scene, trained_on)
         elif stored.get("complete"):
-            info = stored  # its capture stays
+            info = stored  # its capture is kept
         if tissue is not None and (trusted.frames or not stored.get("complete")):
             _write_run(output, run, scene)
         write_json(output / INFO, info)
@@ -183,8 +183,8 @@ def track_footage(
 def over_tissue(instruments: GaussianScene, tissue: GaussianScene) -> GaussianScene:
     """Return the instruments of one scene over the tissue of another, in its light.
 
-    Recorded are the states and cameras of the first, corrected by its registration, which is removed. Raises NeecoError
-    for a scene that does not tell its tissue from what moves.
+    The recording is that of the first, corrected by its registration, which is removed. Raises NeecoError for a scene
+    that does not separate tissue from moving parts.
     """
     if tissue.deformation.motion(tissue.canonical) is None:
         raise NeecoError(f"--tissue: method {tissue.method} learns no tissue by itself; use a run of method 3dgs")
@@ -197,7 +197,7 @@ def over_tissue(instruments: GaussianScene, tissue: GaussianScene) -> GaussianSc
 
 
 def _write_run(output: Path, run: GaussianRun, scene: GaussianScene) -> None:
-    """Write the scene used for tracking as a run of its own, trained on the capture at `output`, where there is one."""
+    """Write the scene used for tracking as a run of its own, trained on the capture at `output`, if there is one."""
     folder, digest = output / RUN, ""
     if (output / "transforms.json").exists():
         capture = read_capture(output)
@@ -211,7 +211,7 @@ def _write_run(output: Path, run: GaussianRun, scene: GaussianScene) -> None:
 
 @dataclass
 class StepFiles:
-    """Steps, each in a file of its own: computed once, then read back."""
+    """Steps, one file each: computed once, then read."""
 
     folder: Path
     follower: Follower
@@ -236,7 +236,7 @@ class StepFiles:
         return [steps[frame] for frame in range(count)]
 
     def _beginning(self) -> Step:
-        """Return the first step: the most trusted of a few frames spread over the footage."""
+        """Return the first step: the most trusted of several frames spread over the footage."""
         count, steps = len(self.follower.frames), []
         spread = [k * count // TRACK.n_beginnings for k in range(TRACK.n_beginnings)]
         for frame in dict.fromkeys(spread):
@@ -246,9 +246,9 @@ class StepFiles:
         return max(steps, key=lambda step: step.trust.value)
 
     def _again(self, steps: dict[int, Step]) -> None:
-        """Follow backwards through every stretch of low trust that a trusted frame follows.
+        """Track backwards through every interval of low trust that precedes a trusted frame.
 
-        Other rolls are searched for in every frame of it, so that both results are judged by the same measure.
+        Other rolls are searched in each of its frames, so that both results are judged by the same measure.
         """
         before: Step | None = None
         for frame in range(len(steps) - 1, -1, -1):
@@ -257,7 +257,7 @@ class StepFiles:
                 continue
             if before is None:
                 continue
-            if before is steps.get(frame + 1):  # its motion was learned the other way
+            if before is steps.get(frame + 1):  # its motion was estimated in the other direction
                 before = replace(before, motion=self.follower.motion.begin(before.motion.state))
             before = self._follow("again", replace(before, unsearched=FOLLOW.search_rolls_every), frame)
             if before.trust.value > steps[frame].trust.value:
@@ -267,7 +267,7 @@ class StepFiles:
         return self._step(f"{name}-{frame}", lambda: self.follower.follow(before, frame))
 
     def _step(self, name: str, make: Callable[[], Step]) -> Step:
-        """Return one step as its file says, which is written first where there is none."""
+        """Return one step from its file, which is written first if absent."""
         path = self.folder / f"{name}.json"
         if not path.exists():
             write_json(path, make().to_json())
@@ -279,14 +279,14 @@ class StepFiles:
 
 
 def _record(frame: Frame, step: Step, parameters: TrackedParameters) -> dict[str, Any]:
-    """Return what track.json says of a frame; `deviation`: standard deviations of rotation (rad), place (mm) and every
-    joint."""
+    """Return a frame's record for track.json; `deviation`: standard deviations of rotation (rad), position (mm) and
+    every joint."""
     instruments = {}
     variance = step.motion.covariance.diagonal()
     for item, (pose, rows) in zip(parameters.instruments, parameters.rows, strict=True):
         state, pose_variance = step.motion.state.instruments[item.name], variance[pose].clamp_min(0)
         deviation = {"rotation": float(pose_variance[:3].sum().sqrt()), "place": float(pose_variance[3:].sum().sqrt())}
-        most = (item.high - item.low) / math.sqrt(12)  # of a joint that may be anywhere between its bounds
+        most = (item.high - item.low) / math.sqrt(12)  # of a joint uniformly distributed between its bounds
         joints = torch.minimum(variance[rows].clamp_min(0).sqrt(), most).tolist()
         deviation |= {f"joint.{name}": value for name, value in zip(item.joints, joints, strict=True)}
         instruments[item.name] = {
@@ -316,9 +316,9 @@ def state_of(record: dict[str, Any]) -> State:
 
 
 def write_tracked(trusted: Capture, output: Path, scene: GaussianScene, trained_on: Capture) -> None:
-    """Write tracked frames as a capture, whose states tell every joint.
+    """Write tracked frames as a capture whose states include every joint.
 
-    All else that is known of the footage (its lens, a still scope) holds for them.
+    Other data of the footage (its lens, a still scope) are kept.
     """
     points = trusted.points if trusted.points.measured else trained_on.points
     instruments = tuple(replace(item, unrecorded=()) for item in scene.instruments)
@@ -332,9 +332,9 @@ def _first_state(footage: Capture, frame: Frame, scene: GaussianScene) -> State:
         stated = frame.state.instruments.get(item.name)
         missing = [name for name in item.joints if stated is not None and name not in stated.joints]
         if stated is None or missing:
-            what = f"instrument {item.name!r}" if stated is None else f"joint {missing[0]!r} of {item.name!r}"
+            absent = f"instrument {item.name!r}" if stated is None else f"joint {missing[0]!r} of {item.name!r}"
             raise NeecoError(
-                f"{footage.root}: {frame.name}: instruments: the first frame does not state {what}; state it there, "
+                f"{footage.root}: {frame.name}: instruments: the first frame does not state {absent}; state it there, "
                 "or use --start none"
             )
         states[item.name] = InstrumentState(stated.pose.double(), {name: stated.joints[name] for name in item.joints})

@@ -36,19 +36,19 @@ FLAGS = (  # fields that `neeco train` has a flag for; the others are set by --s
 LOG_INTERVAL = 50
 REMOVED_GROUPS = ("search",)  # of settings that config.yaml of version 0.2 and older has; no longer settings
 ITERATIONS = 6000  # of a run of many frames
-TISSUE_GAUSSIANS, INSTRUMENT_GAUSSIANS = 20_000, 4_000  # at most, for images of 320x256
+TISSUE_GAUSSIANS, INSTRUMENT_GAUSSIANS = 20_000, 4_000  # maxima for images of 320x256
 
 
 @dataclass(frozen=True, kw_only=True)
 class OptimizerConfig:
-    """Adam's learning rates, except those of the deformation's own parameters."""
+    """Adam's learning rates, except those of the deformation's parameters."""
 
-    position_rate: float = 1.6e-4  # of means, times the scene's extent (3DGS); falls log-linearly
+    position_rate: float = 1.6e-4  # of means, per extent of the scene (3DGS); falls log-linearly
     rotation_rate: float = 1e-3  # of quaternions
     scale_rate: float = 5e-3  # of log scales
     opacity_rate: float = 5e-2  # of logits
     color_rate: float = 2.5e-3  # of the spherical harmonics' constant term
-    sh_rate: float = 1.25e-4  # of the others
+    sh_rate: float = 1.25e-4  # of the higher orders
     light_rate: float = 3e-3  # of falloff and vignette
     shadow_offset_rate: float = 3e-2  # mm, of each lamp's position relative to the lens
     shadow_strength_rate: float = 2e-3
@@ -59,10 +59,10 @@ class OptimizerConfig:
 class DensityConfig:
     """Density control, except its intervals and thresholds, which the schedule sets."""
 
-    min_opacity: float = 0.005  # Gaussians below are pruned
-    dense_size: float = 0.01  # times the scene's extent: smaller Gaussians are cloned, larger ones split
-    split_shrink: float = 1.6  # by which the halves of a split Gaussian are smaller
-    reset_opacity: float = 0.01  # to which opacity resets clamp
+    min_opacity: float = 0.005  # below, Gaussians are pruned
+    dense_size: float = 0.01  # relative to the scene's extent: smaller Gaussians are cloned, larger ones split
+    split_shrink: float = 1.6  # size ratio of a split Gaussian to its halves
+    reset_opacity: float = 0.01  # maximum opacity after a reset
     prune_interval: int = 200  # iterations between prunings, and between re-centrings of the refinement
     prune_stop: float = 0.95  # share of the run
 
@@ -72,26 +72,26 @@ class TrainConfig:
     """Settings of one run."""
 
     method: str = DEFAULT
-    iterations: int | None = None  # frames rendered and learned from; None: 6,000, fewer of few frames (`for_frames`)
-    batch_size: int = 1  # frames between two optimiser steps
-    minutes: float | None = None  # stop in time with a finished run; None: no limit
+    iterations: int | None = None  # frames rendered and learned from; None: 6,000, less with few frames (`for_frames`)
+    batch_size: int = 1  # frames per optimiser step
+    minutes: float | None = None  # time limit, within which the run is finished; None: unlimited
     seed: int = 0
     transforms: str = "transforms.json"
-    scale: float = 1.0  # of the recorded images' size, at most 1, at which the scene is learned
+    scale: float = 1.0  # scale, at most 1, of the recorded images for learning
     max_tissue_gaussians: int | None = None  # None: 20,000 for images of 320x256, more for larger ones
-    initial_points: int | None = None  # most sparse points to begin with; None: max_tissue_gaussians
-    max_instrument_gaussians: int | None = None  # of each instrument; None: 4,000 for images of 320x256, as above
+    initial_points: int | None = None  # maximum number of sparse points used; None: max_tissue_gaussians
+    max_instrument_gaussians: int | None = None  # per instrument; None: 4,000 for images of 320x256, as above
     ssim_weight: float = 0.1  # lambda of the paper
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     density_start: int = 500
     density_stop: float | None = None  # share of the run; None: half of what is left once images have their full size
     deformation: Any = None  # the method's own settings, an instance of its `Settings`; None: its defaults
-    joints: tuple[str, ...] | None = None  # joints that move parts; None: those that the pose does not already explain
+    joints: tuple[str, ...] | None = None  # joints that move parts; None: those that the pose does not determine
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     resolution: ResolutionConfig = field(default_factory=ResolutionConfig)
-    log_interval: int = LOG_INTERVAL  # iterations averaged into one row of metrics.jsonl
+    log_interval: int = LOG_INTERVAL  # iterations per row of metrics.jsonl
     checkpoint_interval: int = 500  # iterations
 
     def __post_init__(self) -> None:
@@ -100,26 +100,26 @@ class TrainConfig:
             object.__setattr__(self, "deformation", method_class(self.method).Settings())
 
     def gaussian_limits(self, pixels: float) -> tuple[int, int]:
-        """Return the largest numbers of Gaussians of the tissue and of each instrument, for images of `pixels`."""
+        """Return the maximum numbers of Gaussians of the tissue and of each instrument, for images of `pixels`."""
         factor = size_factor(pixels, self.resolution)
         tissue, instrument = self.max_tissue_gaussians, self.max_instrument_gaussians
         return tissue or round(TISSUE_GAUSSIANS * factor), instrument or round(INSTRUMENT_GAUSSIANS * factor)
 
     @property
     def growth_stop(self) -> float:
-        """Share of the run after which Gaussians are no longer cloned or split."""
+        """Return the share of the run after which Gaussians are no longer cloned or split."""
         return (1 + self.resolution.full_size_at) / 2 if self.density_stop is None else self.density_stop
 
     @property
     def length(self) -> RunLength:
-        """The end of the run, in iterations or minutes."""
+        """Return the length of the run, in iterations or minutes."""
         return RunLength(self.iterations or ITERATIONS, self.minutes)
 
     def for_frames(self, frames: int) -> TrainConfig:
-        """Return the settings of a run of so many training frames: its iterations, where these are not set.
+        """Return the settings for this number of training frames: sets the iterations if they are unset.
 
-        A third of them, in which shapes form, does not depend on the frames. The others are proportional to the frames
-        up to the method's `enough_frames`: repeated longer, few frames are memorised.
+        A third of them, in which shapes form, is independent of the frames. The rest is proportional to the frames up
+        to the method's `enough_frames`, as few frames are memorised when repeated longer.
         """
         if self.iterations is not None:
             return self
@@ -145,16 +145,16 @@ def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
     if not isinstance(group := values.get("deformation") or {}, Mapping):
         raise NeecoError(f"deformation: {group!r} is not a group of fields")
     settings = method_settings(method, group)
-    others = {name: value for name, value in values.items() if name not in ("deformation", *REMOVED_GROUPS)}
-    config = structure(TrainConfig, others, owner="the training config")
+    general = {name: value for name, value in values.items() if name not in ("deformation", *REMOVED_GROUPS)}
+    config = structure(TrainConfig, general, owner="the training config")
     return with_fields(config, {"deformation": settings})
 
 
 def _variant_defaults(name: str) -> TrainConfig:
-    """Return the config that METHOD or METHOD+dta starts from.
+    """Return the config of METHOD or METHOD+dta.
 
-    With +dta every part of the paper's dynamic training adjustment is on; one that does not apply to the method (noise,
-    where nothing is encoded) has no effect.
+    +dta enables all parts of the paper's dynamic training adjustment; those that do not apply to the method (noise
+    without an encoding) have no effect.
     """
     method, plus, _ = name.partition("+")
     base = method_defaults(method)
@@ -185,17 +185,17 @@ def training_config(
 ) -> TrainConfig:
     """Return the settings of a run.
 
-    name: METHOD or METHOD+dta, whose defaults are changed; None: the default method. values: those that are not None
-    replace defaults. assignments: NAME=VALUE, or values by name, applied last (dots reach nested fields); a preset
-    that they name comes before all. begun: settings of a run to be resumed, in place of the defaults. Raises NeecoError
-    naming the option for an unknown name, a value that does not fit, and an unknown method or variant.
+    name: METHOD or METHOD+dta, which determines the defaults. values: replace defaults where they are not None.
+    assignments: NAME=VALUE, or values by name, applied last (dots reach nested fields); a preset among them is applied
+    first. begun: settings of a run to be resumed, instead of the defaults. Raises NeecoError naming the option for an
+    unknown name, a value that does not fit, and an unknown method or variant.
     """
     base = _variant_defaults(name or DEFAULT) if begun is None else _resumed(begun, name)
     if isinstance(assignments, Mapping):
         named: list[tuple[str, Any]] = list(assignments.items())
     else:
         named = [name_and_value("--set", assignment, "ssim_weight=0.2") for assignment in assignments]
-    preset = [value for name, value in named if name == "deformation.preset"]  # an unknown one is refused later
+    preset = [value for name, value in named if name == "deformation.preset"]  # an unknown one is rejected later
     fields_of_it = method_class(base.method).presets.get(preset[-1], {}) if preset else {}
     changed = config_to_dict(with_fields(base, fields_of_it))
     changed |= {option: value for option, value in values.items() if value is not None}
@@ -228,7 +228,7 @@ def _resumed(begun: TrainConfig, name: str | None) -> TrainConfig:
 
 
 def require_begun_with(begun: TrainConfig, now: TrainConfig, output: Path) -> None:
-    """Raise NeecoError where settings `now` contradict those that the run in `output` was begun with. None contradicts
+    """Raise NeecoError where settings `now` contradict those that the run in `output` was begun with; None contradicts
     nothing."""
     before, after = _flat(config_to_dict(begun)), _flat(config_to_dict(now))
     names = [*FLAGS, *(name for name in after if name not in FLAGS and begun.method == now.method)]
@@ -248,7 +248,7 @@ def _option(name: str) -> str:
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested dicts as one, by dotted names."""
+    """Flatten nested dicts to dotted names."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
         flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
@@ -310,7 +310,7 @@ def check_ranges(config: TrainConfig) -> None:
 
 def _assign(values: dict[str, Any], name: str, value: Any, *, parse: bool) -> None:
     """Set the field `name` in `values`, the plain dicts of a config; the value's type is checked later. With `parse`
-    the value is text, read as YAML unless the field is text."""
+    the value is text, parsed as YAML unless the field is text."""
     *path, last = name.split(".")
     target: Any = values
     for part in path:
@@ -323,7 +323,7 @@ def _assign(values: dict[str, Any], name: str, value: Any, *, parse: bool) -> No
     if path == [] and last == "method":
         raise NeecoError("--set method: would keep the other method's settings; use --method")
     old = target.get(last)
-    if parse and not isinstance(old, str):  # a word is taken literally: YAML reads on and off as truth values
+    if parse and not isinstance(old, str):  # words are literal: YAML would read on and off as booleans
         try:
             value = yaml.load(value, YamlLoader)
         except yaml.YAMLError:

@@ -78,7 +78,7 @@ def control_density(
     counts = tuple(int((bodies[index] == body).sum()) for body in range(len(max_gaussians)))
     adam.select_rows(list(canonical.tensors()), index, fresh)
     changed = canonical.map(lambda tensor: tensor[index].contiguous(), counts)
-    # halves are smaller, at random places inside their parent
+    # halves are smaller, at random positions inside their parent
     rotation = quat_to_matrix(torch.nn.functional.normalize(changed.quats[is_half], dim=-1))
     scales = changed.log_scales[is_half].exp()
     offset = torch.randn(scales.shape, generator=generator, device=scales.device) * scales

@@ -22,11 +22,11 @@ from neeco.training.session import new_session
 
 @dataclass(frozen=True, kw_only=True)
 class JointSettings:
-    """Thresholds of joints that are learned."""
+    """Thresholds for joints that are learned."""
 
-    max_pose_explained: float = 0.98  # share of a joint's variance that its instrument's pose may explain
-    n_stretches: int = 4  # of the recording, held out in turn
-    min_held_out_explained: float = 0.5  # the share explained there
+    max_pose_explained: float = 0.98  # maximum share of a joint's variance explained by its instrument's pose
+    n_stretches: int = 4  # contiguous intervals of the recording for cross-validation
+    min_held_out_explained: float = 0.5  # minimum share explained on held-out intervals
 
 
 JOINTS = JointSettings()
@@ -49,8 +49,8 @@ def begin_session(
     session = new_session(scene.to(views.device), views, config, report)
     session.timed = capture.timed
     if is_new and (trees := scene.deformation.begin(session)):
-        found = [replace(item, kinematics=trees.get(item.name, item.kinematics)) for item in capture.instruments]
-        return begin_session(replace(capture, instruments=tuple(found)), views, config, report)
+        instruments = [replace(item, kinematics=trees.get(item.name, item.kinematics)) for item in capture.instruments]
+        return begin_session(replace(capture, instruments=tuple(instruments)), views, config, report)
     session.start()
     return session
 
@@ -60,10 +60,10 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
 
     Raises NeecoError when `config.joints` has an unknown one, or an image cannot be read.
     """
-    # the grey behind transparent images, which need not be learned; read first, as files may go once training has begun
+    # the grey behind transparent images, which is not learned; read first, as files may disappear during training
     background = next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)
     instruments = tuple(_learned_instrument(item, frames, config, report) for item in capture.instruments)
-    # at their recorded size, whatever size is learned from
+    # at their recorded size, independent of the learning scale
     recorded = Recorded.of(
         capture.split("train"),
         instruments,
@@ -91,10 +91,10 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
 def _learned_instrument(
     instrument: Instrument, frames: tuple[Frame, ...], config: TrainConfig, report: Report
 ) -> Instrument:
-    """Return the instrument with the joints that are learned.
+    """Return the instrument with its learned joints.
 
-    These are `config.joints`; else those of its stated kinematics, where the method moves such links; else those that
-    may move something (`moving_joints`) and that the method can learn.
+    These are `config.joints`; else those of its stated kinematics, if the method moves such links; else those that may
+    move parts (`moving_joints`) and that the method can learn.
     """
     method, tree = method_class(config.method), instrument.kinematics
     if config.joints is None and tree is not None and method.moves_stated_links(config.deformation):
@@ -138,7 +138,7 @@ def moving_joints(
     moving = []
     for joint in instrument.joints:
         if joint in instrument.unrecorded:
-            report(f"{instrument.name}: joint {joint} is not recorded; only with its kinematics can it be found")
+            report(f"{instrument.name}: joint {joint} is not recorded; it can only be estimated with its kinematics")
             continue
         reading = np.array([states[i].joints[joint] for i in first])
         if (
@@ -153,10 +153,10 @@ def moving_joints(
 
 
 def _explained(design: np.ndarray, values: np.ndarray, stretches: int) -> float:
-    """Return the share of the variance of values [N] that a linear fit to design [N, P] explains, of each of several
-    stretches by the fit to the others: dozens of smooth frames fit a dozen numbers of a pose by chance."""
-    left = np.zeros(len(values))
+    """Return the share of the variance of values [N] explained by a linear fit to design [N, P], each interval by a fit
+    to the others: smooth frames fit the dozen numbers of a pose by chance."""
+    residuals = np.zeros(len(values))
     for test in np.array_split(np.arange(len(values)), stretches):
         use = np.setdiff1d(np.arange(len(values)), test) if stretches > 1 else test
-        left[test] = values[test] - design[test] @ np.linalg.lstsq(design[use], values[use], rcond=1e-6)[0]
-    return 1 - float(np.square(left).mean() / values.var())
+        residuals[test] = values[test] - design[test] @ np.linalg.lstsq(design[use], values[use], rcond=1e-6)[0]
+    return 1 - float(np.square(residuals).mean() / values.var())

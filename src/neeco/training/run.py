@@ -43,7 +43,7 @@ from neeco.training.config import TrainConfig, check_ranges, config_from_dict, c
 
 SCHEMA = "neeco-run/1"
 CONFIG_FILE, SCENE_FILE = "config.yaml", "scene.safetensors"
-STATES_FILE = "states.json"  # training states as corrected
+STATES_FILE = "states.json"  # corrected training states
 CAPTURE_DIGEST = "capture_sha256"
 CHECKPOINT_SCHEMA = "neeco-checkpoint/1"
 CHECKPOINT_HEADER = {"schema": str, "scene": {}, "iteration": int, "seconds": float}
@@ -59,8 +59,8 @@ class TrainedRun:
     force: bool = False  # use it although its capture has changed, or its labels are doubtful
 
     def capture(self) -> Capture:
-        """Return the capture it was trained on, unrecorded joints as training estimated them (`Recorded.completed`).
-        Raises NeecoError when it has moved, and unless `force` when it has changed since."""
+        """Return the capture it was trained on, with estimated unrecorded joints (`Recorded.completed`). Raises
+        NeecoError when it has moved and, unless `force`, when it has changed since."""
         root = Path(self.config["capture"])
         if not root.exists():
             config = self.path / CONFIG_FILE
@@ -78,7 +78,7 @@ class TrainedRun:
         return doubts_of(noted, self.config["method"], len(self.scene.recorded.names))
 
     def require_trusted(self, verb: str) -> None:
-        """Raise NeecoError where the labels that `verb` is to write are doubtful, unless `force`."""
+        """Raise NeecoError if the labels that `verb` would write are doubtful, unless `force`."""
         if not self.force and (doubts := self.doubts):
             raise NeecoError(
                 f"{self.path}: its labels are doubtful: {'; '.join(doubts)}; train longer or record again, or {verb} "
@@ -86,8 +86,8 @@ class TrainedRun:
             )
 
     def gaussians(self, asked_by: str) -> GaussianRun:
-        """Return the run as one whose scene consists of Gaussians. Raises NeecoError, in the words of the option or
-        verb `asked_by`, for a radiance field."""
+        """Return the run as one of a Gaussian scene. Raises NeecoError, naming the option or verb `asked_by`, for a
+        radiance field."""
         return GaussianRun(self.path, require_gaussians(self.scene, asked_by), self.config, self.force)
 
 
@@ -99,9 +99,8 @@ class GaussianRun(TrainedRun):
 
 
 def doubts_of(diagnostics: Mapping[str, Any], method: str, frames: int) -> tuple[str, ...]:
-    """Return the reasons to doubt the labels of a run on so many frames, by what training measured: too few iterations,
-    else labels that leave out what the images show of the instrument or take in tissue, and joints that were not
-    found."""
+    """Return the reasons to doubt the labels of a run on this many frames, from training diagnostics: too few
+    iterations, else labels that miss visible parts of the instrument or include tissue, and joints without a hinge."""
     usual = replace(method_defaults(method), iterations=None).for_frames(frames).length
     if usual.is_short(done := diagnostics.get("iterations", usual.iterations)):
         return (f"training ended after {done:,} iterations, usual are {usual.iterations:,}",)
@@ -113,7 +112,7 @@ def doubts_of(diagnostics: Mapping[str, Any], method: str, frames: int) -> tuple
 
 
 def verdict_on(diagnostics: Mapping[str, Any], method: str, frames: int) -> str:
-    """Return in words what training measured of the labels (see `doubts_of`)."""
+    """Return a sentence on the label quality measured in training (see `doubts_of`)."""
     if doubts := doubts_of(diagnostics, method, frames):
         return f"DOUBTFUL: {'; '.join(doubts)}"
     if (quality := diagnostics.get(LABEL_QUALITY)) is None:
@@ -128,8 +127,8 @@ def scene_digest(path: Path) -> str:
 
 
 def load_run(path: Path, device: torch.device | None = None, *, force: bool = False) -> TrainedRun:
-    """Open a run folder, its scene on `device` (None: the CPU); `force`: see `TrainedRun`. Raises NeecoError when it is
-    not one, is unfinished or comes from another version's format."""
+    """Open a run folder, its scene on `device` (None: the CPU); `force`: see `TrainedRun`. Raises NeecoError if it is
+    no run folder, is unfinished or has another version's format."""
     path = Path(path)
     config = read_config(path)
     if not (path / SCENE_FILE).is_file():
@@ -146,7 +145,7 @@ def resume_command(capture: Path | str, run: Path) -> str:
 
 @contextmanager
 def open_run(path: Path, device: torch.device | None = None, *, force: bool = False) -> Iterator[TrainedRun]:
-    """`load_run` for a block that renders: until its end torch uses as many threads as pay for the run's method."""
+    """Open a run (`load_run`) in a block that renders, with the best number of torch threads for its method."""
     run = load_run(path, device, force=force)
     with run.scene.torch_threads():
         yield run
@@ -156,8 +155,8 @@ def open_run(path: Path, device: torch.device | None = None, *, force: bool = Fa
 def open_gaussian_run(
     path: Path, asked_by: str, device: torch.device | None = None, *, force: bool = False
 ) -> Iterator[GaussianRun]:
-    """`open_run` for a verb that poses or labels Gaussians. Raises NeecoError, in the words of the option or verb
-    `asked_by`, for a run of a radiance field."""
+    """Open a run (`open_run`) for a verb that poses or labels Gaussians. Raises NeecoError, naming the option or verb
+    `asked_by`, for a radiance field."""
     with open_run(path, device, force=force) as run:
         yield run.gaussians(asked_by)
 
@@ -170,7 +169,7 @@ def read_config(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise NeecoError(f"{path}: no such run folder; correct the path, or make one with `neeco train`")
     for entry in path.glob("*"):
-        if not entry.is_dir():  # folders that their owner has linked there are no part of the run
+        if not entry.is_dir():  # folders that are linked there are not part of the run
             require_inside(entry, path)
     if not os.path.lexists(file):
         raise NeecoError(f"{path}: {'; '.join(misplaced(path, 'a run folder', 'config.yaml, by `neeco train`'))}")
@@ -193,12 +192,12 @@ def write_config(path: Path, capture: Path, config: TrainConfig, digest: str) ->
 def require_same_capture(
     path: Path, root: Path, digest: str, remedy: str = "put its files back as they were, or give another --output"
 ) -> None:
-    """Raise NeecoError, with the `remedy`, when a run was begun in `path` on the capture at `root` before it had this
-    fingerprint `digest`."""
+    """Raise NeecoError, with the `remedy`, if the run in `path` was begun when the capture at `root` had another
+    fingerprint than `digest`."""
     file = path / CONFIG_FILE
     if not file.exists():
         return
-    if read_config(path).get(CAPTURE_DIGEST, digest) != digest:  # older versions noted none
+    if read_config(path).get(CAPTURE_DIGEST, digest) != digest:  # absent in older versions
         raise NeecoError(f"{file}: capture: {root} has changed since this run was begun; {remedy}")
 
 
@@ -227,11 +226,18 @@ def checkpoint_path(run: Path) -> Path:
 
 
 def save_checkpoint(session: Session, run: Path) -> None:
-    """Write the session's whole state atomically."""
+    """Write the session's whole state atomically. Raises NeecoError for one that diverged; the last one is kept."""
     scene_tensors, scene_header = pack_scene(session.scene)
     session_tensors, fields = session.pack()
     tensors = {f"scene/{name}": tensor for name, tensor in scene_tensors.items()} | session_tensors
     tensors |= {f"adam/{name}": tensor for name, tensor in session.adam.tensors().items()}
+    try:
+        require_numbers(tensors)
+    except ValueError as error:
+        raise NeecoError(
+            f"training: the scene diverged: {error} after {session.iteration} iterations; train anew with another "
+            "--seed or a milder schedule"
+        ) from None
     device = session.generator.device
     tensors |= {"random/torch": torch.get_rng_state(), "random/generator": session.generator.get_state()}
     if device.type == "cuda":
@@ -266,19 +272,19 @@ def read_checkpoint(run: Path) -> tuple[DrawableScene, dict[str, Any], dict[str,
         parts = {name.removeprefix("scene/"): t for name, t in tensors.items() if name.startswith("scene/")}
         try:
             scene = unpack_scene(parts, header["scene"])
-        except NeecoError as error:  # which knows no file
+        except NeecoError as error:  # its message names no file
             raise ValueError(str(error)) from None
-        others = {name: t for name, t in tensors.items() if not name.startswith("scene/")}
-        require_numbers(others)
+        training_tensors = {name: t for name, t in tensors.items() if not name.startswith("scene/")}
+        require_numbers(training_tensors)
         json.dumps(header, allow_nan=False)  # raises ValueError for NaN and infinity
         if not all(isinstance(value, int | float) for row in header.get("window", []) for value in row):
             raise ValueError("window: losses that are no numbers")
-    return scene, header, others
+    return scene, header, training_tensors
 
 
 @contextmanager
 def reporting_damage(path: Path) -> Iterator[None]:
-    """Raise NeecoError where the block, which reads the checkpoint in `path`, finds content that does not fit."""
+    """Raise NeecoError if the block, which reads the checkpoint in `path`, finds unfitting content."""
     try:
         yield
     except DAMAGED as error:
@@ -289,9 +295,9 @@ def reporting_damage(path: Path) -> Iterator[None]:
 
 
 def restore_session(session: Session, header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-    """Put a fresh session, made around the checkpoint's scene, where the checkpoint was.
+    """Restore a session, created with the checkpoint's scene, to the checkpoint's state.
 
-    Raises NeecoError on another kind of device: its random numbers would not go on.
+    Raises NeecoError on another kind of device, whose random numbers would differ.
     """
     device = session.generator.device
     before = header.get("device", "cpu")  # not in older checkpoints

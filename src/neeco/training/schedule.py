@@ -1,8 +1,8 @@
 """The paper's dynamic training adjustment: four settings that switch together when the scene has settled.
 
-Phase 1 looks for the coarse motion: sparse densification, low SH order, frames sorted by instrument pose, noise on the
-encoded state. Phase 2 refines. Each part can be turned off (3DGS's behaviour) or inverted (phases swapped), as the
-paper's ablations do; density control has three parts of its own, its interval, opacity reset and gradient threshold.
+Phase 1 learns the coarse motion: sparse densification, low SH order, frames sorted by instrument pose, noise on the
+encoded state. Phase 2 refines. Each part can be turned off (3DGS's behaviour) or inverted (phases swapped), as in the
+paper's ablations; density control has three separate parts: interval, opacity reset and gradient threshold.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class DensityPhase:
 class Event:
     """An action of the method between two steps of the run."""
 
-    at: float  # share of the run; above 1, an iteration
+    at: float  # share of the run; above 1: iteration
     action: str  # one of the method's `actions`
 
     def passed(self, progress: tuple[float, float], iterations: tuple[int, int]) -> bool:
-        """Return whether its moment lies after the first and not after the second of two `progress` (shares of the run)
-        or `iterations`."""
+        """Return whether the event is after the first and not after the second of two `progress` (shares of the run) or
+        `iterations`."""
         before, now = progress if self.at <= 1 else iterations
         return before < self.at <= now
 
@@ -60,13 +60,13 @@ class ScheduleConfig:
     psnr_threshold: float = 20.0
     window: int = 200  # iterations in the moving averages
     earliest: int = 1_000
-    latest_fraction: float = 0.4  # of the run; then phase 2 is forced
+    latest_fraction: float = 0.4  # share of the run after which phase 2 is forced
     sh_interval: int = 1_000  # iterations between SH orders in phase 2
     max_sh_degree: int = 3
-    plain_density: DensityPhase = DensityPhase(100, 3_000, 2e-4)  # 3DGS's: the parts of density control that are off
+    plain_density: DensityPhase = DensityPhase(100, 3_000, 2e-4)  # 3DGS's, for parts of density control that are off
     phase_1: DensityPhase = DensityPhase(500, 10_000, 4e-4)
     phase_2: DensityPhase = DensityPhase(200, 3_000, 2e-4)
-    events: tuple[Event, ...] = ()  # what the method does between steps; those of one moment in this order
+    events: tuple[Event, ...] = ()  # actions of the method between steps; simultaneous ones in this order
     # Numbers of iterations here and in TrainConfig.density_start are stated for a run of so many steps and scale with
     # the run's length; None: they stand as they are, however short the run.
     published_steps: int | None = None
@@ -91,7 +91,7 @@ class Schedule:
         return max(1, round(iterations * self.scale)) if iterations else 0
 
     def observe(self, iteration: int, loss: float, psnr: float, progress: float) -> None:
-        """Note one step's loss and PSNR; `progress` in [0, 1] is how much of the run is done. May begin phase 2."""
+        """Record one step's loss and PSNR; `progress` in [0, 1] of the run. May start phase 2."""
         self.history.append((loss, psnr))
         if self.phase == 2:
             return
@@ -110,16 +110,16 @@ class Schedule:
         return bool(values[window:, 1].mean() > self.config.psnr_threshold and loss_now < loss_before)
 
     def _acting_phase(self, part: Part) -> int:
-        """Return the phase whose settings of `part` are in force; 0: off, as in 3DGS."""
+        """Return the phase whose settings of `part` apply; 0: off, as in 3DGS."""
         return {"off": 0, "on": self.phase, "inverse": 3 - self.phase}[part]
 
     def density(self) -> DensityPhase:
-        """Return the density settings in force, in iterations of this run."""
+        """Return the current density settings, in iterations of this run."""
         config = self.config
         resets = self._density_of(config.opacity_reset).opacity_reset
         return DensityPhase(
             self.scaled(self._density_of(config.density_interval).interval),
-            # but not below MIN_RESET_INTERVAL, or what was published where that is less
+            # but at least MIN_RESET_INTERVAL, or the published value if smaller
             max(self.scaled(resets), min(resets, MIN_RESET_INTERVAL)),
             self._density_of(config.gradient_threshold).threshold,
         )
@@ -128,7 +128,7 @@ class Schedule:
         return (self.config.plain_density, self.config.phase_1, self.config.phase_2)[self._acting_phase(part)]
 
     def sh_degree(self, iteration: int) -> int:
-        """Return the SH order: 0 in phase 1, then one more every `sh_interval`; where off, from the start (3DGS)."""
+        """Return the SH order: 0 in phase 1, then one more every `sh_interval`; from the start if off (3DGS)."""
         config, acting = self.config, self._acting_phase(self.config.sh_order)
         if acting == 1:
             return 0
@@ -137,7 +137,7 @@ class Schedule:
 
     def state_noise(self, progress: float) -> float:
         """Return the standard deviation of the compensation Delta = N(0, sigma^2) * beta * t_phase, where t_phase falls
-        from 1 to 0 in its phase."""
+        from 1 to 0 within its phase."""
         config = self.config
         if self._acting_phase(config.compensation) != 1:
             return 0.0
@@ -170,7 +170,7 @@ def due(interval: int, before: int, now: int) -> bool:
 
 
 def order_by_pose(states: np.ndarray) -> np.ndarray:
-    """Return indices [F] of a walk through states [F, S] that always steps to the nearest one left (the paper's uniform
+    """Return indices [F] of a walk through states [F, S] that steps to the nearest unvisited one (the paper's uniform
     motion).
 
     Starts at the state of smallest first principal coordinate, so that the walk sweeps the range once.
@@ -180,13 +180,13 @@ def order_by_pose(states: np.ndarray) -> np.ndarray:
     centred = (states - states.mean(0)) / (states.std(0) + 1e-9)
     _, _, directions = np.linalg.svd(centred, full_matrices=False)
     current = int((centred @ directions[0]).argmin())
-    left = np.ones(len(states), bool)
+    unvisited = np.ones(len(states), bool)
     walk = []
     for _ in range(len(states)):
         walk.append(current)
-        left[current] = False
-        if left.any():
+        unvisited[current] = False
+        if unvisited.any():
             distance = ((centred - centred[current]) ** 2).sum(1)
-            distance[~left] = np.inf
+            distance[~unvisited] = np.inf
             current = int(distance.argmin())
     return np.array(walk)

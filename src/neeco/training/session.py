@@ -45,15 +45,15 @@ class GaussianSession(Session):
     batch_size: int  # frames per step
     timed: bool = field(default=True, init=False)  # `State.time` is in seconds
     config: TrainConfig
-    extent: float  # mm; positions' learning rates and the dense size scale with it
+    extent: float  # mm; unit of the positions' learning rate and the dense size
     pose_order: np.ndarray = field(init=False)
     refinement: Refinement = field(init=False)
     rng: np.random.Generator = field(init=False)
     schedule: Schedule = field(init=False)
     resolution: Resolution = field(init=False)
-    full_views: TrainingViews = field(init=False)  # at full size; `views` are those in use
+    full_views: TrainingViews = field(init=False)  # at full size; `views` are the current ones
     scale: float = field(init=False)  # of `views`
-    limits: tuple[int, int] = field(init=False)  # most Gaussians of the tissue, and of each instrument
+    limits: tuple[int, int] = field(init=False)  # maximum Gaussians of the tissue, and of each instrument
     recorded: Recorded = field(init=False)  # as it was before training
     given: list[tuple[State, Camera]] = field(init=False)  # of every frame of `views`, as recorded, on their device
     statistics: GradientStatistics = field(init=False)
@@ -76,15 +76,15 @@ class GaussianSession(Session):
         self._use_views(self.full_views, 1.0)
 
     def _use_views(self, views: TrainingViews, scale: float) -> None:
-        """Render and compare these views from now on, whose images have `scale` times their full size."""
+        """Render and compare with these views from now on, whose images are scaled by `scale`."""
         self.views, self.scale = views, scale
         self.given = [(frame.state.to(views.device), frame.camera.to(views.device)) for frame in views.frames]
 
     @contextmanager
     def searching(self, as_learned: bool = False) -> Iterator[None]:
-        """Give `views` the size at which instruments, joints and shadows are searched, within the block.
+        """Set `views` to the size for searches of instruments, joints and shadows within the block.
 
-        as_learned: at most the size learned from so far, where detail that the scene lacks would hide what is searched.
+        as_learned: at most the current size, as detail that the scene lacks would hide what is searched.
         """
         views, scale = self.views, self.scale
         if not (as_learned and scale < self.resolution.search_scale):
@@ -96,7 +96,7 @@ class GaussianSession(Session):
 
     @cached_property
     def search_views(self) -> TrainingViews:
-        """The views of the size for searches; made once, as a run searches about ten times."""
+        """Return the views at search size; cached, as a run searches about ten times."""
         return self.full_views.scaled(self.resolution.search_scale)
 
     def start(self) -> None:
@@ -104,7 +104,7 @@ class GaussianSession(Session):
         scene = self.scene
         scene.requires_grad_(True)
         scene.registration.requires_grad_(self.config.refine.registration)
-        scene.base_corrections.requires_grad_(False)  # found before the first step: gradients hardly move them
+        scene.base_corrections.requires_grad_(False)  # estimated before the first step: gradients hardly change them
         self.begin_statistics()
 
     def begin_statistics(self) -> None:
@@ -134,7 +134,7 @@ class GaussianSession(Session):
         return self.schedule.forced
 
     def step(self) -> StepResult:
-        """Render `batch_size` frames, minimise their mean loss, and from time to time add and remove Gaussians.
+        """Render `batch_size` frames, minimise their mean loss, and control density when due.
 
         Iterations count frames. A step reads numbers from the device once, after all its work is queued.
         """
@@ -161,7 +161,7 @@ class GaussianSession(Session):
         return StepResult.mean(results)
 
     def _accumulate(self, index: int, progress: float, following: int | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Add one frame's share to all gradients; return the minimised total, the image's loss and squared error.
+        """Accumulate one frame's share of all gradients; return minimised total, image loss and squared error.
 
         The pixels of the `following` frame are prefetched.
         """
@@ -184,7 +184,7 @@ class GaussianSession(Session):
         weight = trust_of(self.given[index][0]) * float(self.refinement.counts(index))
         total = weight * fitted + self._regularisation(rendering, penalty)
         with tf32_products(self.views.device) if scene.deformation.large_operations else nullcontext():
-            (total / views).backward()  # given the gradient instead, torch would import sympy: 2 s of every training
+            (total / views).backward()  # passing a gradient would make torch import sympy: 2 s per training
         gradient = rendering.center_offsets.grad
         assert gradient is not None
         self.statistics.record(gradient, views * camera.width, views * camera.height)  # of the frame's own loss
@@ -199,13 +199,13 @@ class GaussianSession(Session):
         return self.refinement.apply(index, *self.given[index], self.iteration)[:2]
 
     def compared(self, index: int) -> Comparison:
-        """Return training frame `index` beside the scene as learned and refined so far."""
+        """Return the comparison of training frame `index` with the scene as learned and refined so far."""
         return Comparison.of(self.scene, *self.corrected(index), self.views.target(index), self.views.mask(index))
 
     def frames_along_poses(self, count: int) -> list[int]:
         """Return indices of at most `count` training frames, evenly spaced in the order of poses."""
         order = self.pose_order
-        # float32 and rounded down: other roundings choose other frames, and runs would not stay the same
+        # float32, rounded down: other roundings would select other frames and change runs
         return [int(order[int(place)]) for place in torch.linspace(0, len(order) - 1, min(count, len(order)))]
 
     def _next_frame(self) -> int:
@@ -224,9 +224,9 @@ class GaussianSession(Session):
         return sum(term for term in terms if term is not None)
 
     def _update(self, progress: float) -> None:
-        """Take an optimiser step on all that has a gradient; shadows have none until one was found."""
+        """Take an optimiser step on everything that has a gradient; shadows have none before one is detected."""
         scene, optimizer = self.scene, self.config.optimizer
-        # by progress alone positions would be stiff before there is detail to fit
+        # by progress alone, positions would be stiff before there is detail to fit
         done = self.resolution.rendered_share(progress)
         position_rate = optimizer.position_rate * self.extent * log_linear(1.0, DEFORMATION.final_rate, done)
         rates = self.gaussian_rates | {"means": position_rate}
@@ -334,7 +334,7 @@ class GaussianSession(Session):
         return self.refinement.to_json(replace(self.recorded, states=tuple(states)))
 
     def _predict_states(self) -> None:
-        """Correct new states by what the training frames' corrections depend on, and report that."""
+        """Correct new states by what predicts the training frames' corrections, and report it."""
         parts = predict_corrections(self.scene.state_corrections, self.refinement, self.views.frames)
         self.scene.diagnostics["state_errors"] = {
             part: {"explained": round(item.explained, 4), "corrected": item.applied} for part, item in parts.items()
@@ -359,7 +359,7 @@ class GaussianSession(Session):
             scene.diagnostics["still_scope"] = f"the tissue's depth is {depth}; render views near the recorded ones"
         scene.diagnostics["phase_2_began"] = self.schedule.phase_started
         scene.diagnostics["phase_2_forced"] = self.schedule.forced
-        shares = self.refinement.prior_shares()  # before what states predict is taken out of the corrections
+        shares = self.refinement.prior_shares()  # before predicted parts are subtracted from the corrections
         self._predict_states()
         self.refinement.scale_deviations(shares)
         scene.deformation.finish(self)
@@ -369,7 +369,7 @@ class GaussianSession(Session):
 
     @torch.no_grad()
     def _judge_labels(self) -> None:
-        """Record how much of what the training images show of the instruments is labelled."""
+        """Record the share of instrument pixels in training images that are labelled."""
         views = [self.compared(index) for index in self.frames_along_poses(QUALITY.n_views)]
         foreground = Foreground.learned(views)
         if foreground is None:
@@ -411,5 +411,5 @@ def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.nd
 
 
 def trust_of(state: State) -> float:
-    """Return the weight of a frame in the loss: the least trust of its states, 1 for recorded ones."""
+    """Return the weight of a frame in the loss: the minimum trust of its states, 1 for recorded ones."""
     return min((1.0 if item.trust is None else item.trust for item in state.instruments.values()), default=1.0)

@@ -1,5 +1,5 @@
-"""Silhouettes of instruments in the training images: where a pixel shows an instrument, where tissue, where it is not
-known; and the loss of rendered labels against them."""
+"""Silhouettes of instruments in the training images (instrument, tissue or unknown per pixel), and the loss of rendered
+labels against them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ UNKNOWN, INSTRUMENT = 128, 255  # of stored values; tissue is 0
 
 @dataclass(frozen=True, kw_only=True)
 class SilhouetteSettings:
-    """Weight of the loss, and what silhouettes are learned from."""
+    """Weight of the loss, and the data for silhouettes."""
 
-    weight: float = 0.1  # of the loss, beside the photometric one
-    # frames, from which on it falls with their number: many frames show for themselves what is instrument
+    weight: float = 0.1  # of the loss, relative to the photometric one
+    # number of frames above which it decreases: many frames are sufficient evidence themselves
     few: int = 30
-    min_share: float = 1e-4  # of rendered labels, in logarithms
-    n_views: int = 20  # training frames from which instruments and tissue are told apart
+    min_share: float = 1e-4  # lower bound of rendered labels in logarithms
+    n_views: int = 20  # training frames from which the classifier is learned
 
 
 SILHOUETTES = SilhouetteSettings()
@@ -30,22 +30,22 @@ SILHOUETTES = SilhouetteSettings()
 
 @dataclass(eq=False)
 class Silhouettes:
-    """Silhouettes of all training frames: values [H, W] uint8 each, UNKNOWN where images do not tell; `noise` of the
+    """Silhouettes of all training frames: values [H, W] uint8 each, UNKNOWN where images are ambiguous; `noise` of the
     tissue that they were compared with."""
 
     values: tuple[Tensor, ...]
     noise: float
 
     def instrument(self, index: int) -> Tensor:
-        """Return how certainly each pixel of frame `index` shows an instrument [H, W], in [0, 1]."""
+        """Return the certainty of each pixel of frame `index` to show an instrument [H, W], in [0, 1]."""
         return ((self.values[index].float() - UNKNOWN) / (INSTRUMENT - UNKNOWN)).clamp(0, 1)
 
     def loss(self, index: int, label: Tensor) -> Tensor:
         """Return the weighted cross entropy [] of the rendered label [h, w] of frame `index` against its silhouette."""
         height, width = label.shape
         values = self.values[index].cpu().numpy().astype(np.float32)
-        how = cv2.INTER_AREA if width < values.shape[1] else cv2.INTER_LINEAR
-        resized = cv2.resize(values, (width, height), interpolation=how)
+        interpolation = cv2.INTER_AREA if width < values.shape[1] else cv2.INTER_LINEAR
+        resized = cv2.resize(values, (width, height), interpolation=interpolation)
         certain = torch.from_numpy((resized - UNKNOWN) / (INSTRUMENT - UNKNOWN)).to(label)
         instrument, tissue = certain.clamp(0, 1), (-certain).clamp(0, 1)
         label = label.clamp(SILHOUETTES.min_share, 1 - SILHOUETTES.min_share)

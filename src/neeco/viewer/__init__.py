@@ -1,1 +1,1 @@
-"""The scene to look at and steer: in a browser, served from here, or in one file."""
+"""Interactive viewer: in a browser, served from here, or exported to one file."""

@@ -1,8 +1,7 @@
-"""Addresses and access of every server of `neeco view`: whoever asks needs the token in the address.
+"""Addresses and access control of all servers of `neeco view`: every request needs the token in the address.
 
-The token is the first part of the path, of the page, its pictures and its web socket. Unlike a cookie, it is added to
-no request by the browser itself: a page of another site, which does not know it, gets nothing, by whatever name it
-calls.
+The token is the first part of the path of the page, its pictures and its web socket. Unlike a cookie, the browser does
+not add it to requests by itself: a page of another site, which does not know it, has no access under any name.
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ from neeco.base.errors import NeecoError
 
 HOST, PORT = "127.0.0.1", 8080
 TOKEN_BYTES = 24
-MAX_MESSAGE = 2**20  # limit on the bytes of a message; a browser's messages have some hundred
-MAX_PORTS = 100  # limit on the ports tried, one after another
+MAX_MESSAGE = 2**20  # maximum size of a message in bytes; a browser's have some hundred
+MAX_PORTS = 100  # maximum number of ports tried, in sequence
 INLINE_SCRIPT = re.compile(rb"<script[^>]*>(.*?)</script>", re.DOTALL)
 REFUSED = "neeco view: refused: open the whole address that neeco view printed\n"
 
 log = logging.getLogger(__name__)
-quiet = log.getChild("connections")  # of websockets, which logs a traceback for every browser that goes away
+quiet = log.getChild("connections")  # logger of websockets, which logs a traceback for every browser that disconnects
 quiet.setLevel(logging.CRITICAL)
 
 Respond = Callable[[Any, Any], Any]  # (connection, request) -> response, or None: a web socket
@@ -41,7 +40,7 @@ Respond = Callable[[Any, Any], Any]  # (connection, request) -> response, or Non
 
 @dataclass(frozen=True)
 class Access:
-    """The address of a server, and who gets in."""
+    """The address of a server, and its access control."""
 
     host: str
     port: int
@@ -49,19 +48,19 @@ class Access:
 
     @classmethod
     def at(cls, host: str, port: int) -> Access:
-        """Return that of a server on `host` and `port`, or the next that is free, with a new token. Raises
+        """Return the access of a server on `host` and `port`, or the next free one, with a new token. Raises
         NeecoError."""
         host = host.strip("[]")
         return cls(host, _free_port(host, port), secrets.token_urlsafe(TOKEN_BYTES))
 
     @property
     def address(self) -> str:
-        """Address to open in a browser."""
+        """Return the address to open in a browser."""
         host = socket.gethostname() if self.host in ("0.0.0.0", "::", "") else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self.token}/"
 
     def controlled(self, respond: Respond) -> Respond:
-        """Return `respond` for those who have the token; it sees the path without it."""
+        """Return `respond` restricted to requests with the token; it gets the path without it."""
 
         def answer(connection: Any, request: Any) -> Any:
             token, _, path = request.path.partition("?")[0].removeprefix("/").partition("/")
@@ -73,7 +72,7 @@ class Access:
                 if response is not None:
                     for name, value in _page_headers(response.body, request.headers["Host"]).items():
                         response.headers[name] = value
-            except (LookupError, OSError, ValueError):  # a header given twice, a name that no file can have
+            except (LookupError, OSError, ValueError):  # duplicate header, or an invalid file name
                 return connection.respond(http.HTTPStatus.BAD_REQUEST, "neeco view: not understood\n")
             return response
 
@@ -81,12 +80,12 @@ class Access:
 
 
 def family_of(host: str) -> socket.AddressFamily:
-    """Family of a host's addresses."""
+    """Return the address family of a host."""
     return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
 def is_loopback(host: str) -> bool:
-    """Whether `--host` is reachable from this machine alone."""
+    """Return whether `--host` is reachable from this machine only."""
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -95,9 +94,9 @@ def is_loopback(host: str) -> bool:
 
 @contextlib.contextmanager
 def controlled_sockets(access: Access, head: bytes) -> Iterator[list[bool]]:
-    """Inside the block, a server that is opened by `websockets` answers as `access` allows; its pages begin with
-    `head`. viser has no setting for that, so `websockets.serve` is replaced. Yields a list that is empty as long as
-    none was opened."""
+    """Make a server opened by `websockets` inside the block answer as `access` allows; its pages begin with `head`.
+    viser has no setting for that, so `websockets.serve` is replaced. Yields a list that is empty until one is
+    opened."""
     import websockets.asyncio.server as websocket_server
 
     opened: list[bool] = []
@@ -132,8 +131,8 @@ def controlled_sockets(access: Access, head: bytes) -> Iterator[list[bool]]:
 
 
 def _page_headers(page: bytes, host: str) -> dict[str, str]:
-    """Headers of a page whose own scripts may run, and nothing that is injected into it; it connects to nothing else,
-    and gives its address to nobody."""
+    """Return headers of a page that allow its own scripts and nothing injected; it connects to nothing else, and
+    reveals its address to nobody."""
     scripts = [base64.b64encode(hashlib.sha256(text).digest()).decode() for text in INLINE_SCRIPT.findall(page)]
     allowed = " ".join(f"'sha256-{digest}'" for digest in scripts)
     policy = (
@@ -150,7 +149,7 @@ def _page_headers(page: bytes, host: str) -> dict[str, str]:
 
 
 def _free_port(host: str, port: int) -> int:
-    """`port`, or the next one that is free on `host`. Raises NeecoError for a host or port that cannot be."""
+    """Return `port`, or the next free one on `host`. Raises NeecoError for an invalid host or port."""
     if not 0 < port < 65536:
         raise NeecoError(f"--port must be 1 to 65535 (got {port})")
     last: Exception = OSError()

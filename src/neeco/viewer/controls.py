@@ -1,4 +1,4 @@
-"""The sliders' values as a state: a place in the recording, and each instrument's departure from it."""
+"""Slider values as a state: a position in the recording, and each instrument's departure from it."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from neeco.geometry.rotations import rigid
 from neeco.labels.drawing import to_numpy
 from neeco.synthesis.states import JointRange, Shaft, interpolate_state, joint_ranges, turn_about
 
-MARGIN = 0.2  # extension of a slider, as a share of the recorded range, where the capture states no limits
-STILL = math.radians(1.0)  # half of the range, in rad, of the slider of a joint that never moved
+MARGIN = 0.2  # extension of a slider without stated limits, as a share of the recorded range
+STILL = math.radians(1.0)  # half range, in rad, of the slider of a joint that never moved
 
 
 @dataclass(frozen=True)
 class InstrumentControls:
     """Departure of one instrument from the recording; none by default."""
 
-    joints: Mapping[str, float] = field(default_factory=dict)  # rad; those not named are as recorded
+    joints: Mapping[str, float] = field(default_factory=dict)  # rad; others are as recorded
     slide: float = 0.0  # mm along the shaft, towards the jaws
     roll: float = 0.0  # rad about the shaft
     yaw: float = 0.0  # rad about the shaft's end, to the side
     pitch: float = 0.0  # rad, about an axis at right angles to that of yaw
-    pose: np.ndarray | None = None  # [4, 4] world_from_instrument, mm: slides and turns start here
+    pose: np.ndarray | None = None  # [4, 4] world_from_instrument, mm, to which slides and rotations are added
 
     @property
     def departs(self) -> bool:
@@ -39,21 +39,21 @@ class InstrumentControls:
 
 @dataclass(frozen=True)
 class Controls:
-    """A place in the recording, and what is to be otherwise. frame: 1.5 is half way from the second to the third."""
+    """A position in the recording, and departures from it. frame: 1.5 is half way from the second to the third."""
 
     frame: float = 0.0
     instruments: Mapping[str, InstrumentControls] = field(default_factory=dict)
 
     @property
     def recorded_frame(self) -> int | None:
-        """The frame whose state this is, just as it was recorded; None between frames and for other states."""
+        """Return the frame whose recorded state this is; None between frames and for other states."""
         departs = any(item.departs for item in self.instruments.values())
         return int(self.frame) if self.frame == int(self.frame) and not departs else None
 
 
 def controlled_state(states: Sequence[State], shafts: Mapping[str, Shaft], controls: Controls) -> State:
-    """The state that the controls ask for. states: the recording's, at least one; controls of instruments that it lacks
-    are passed over. A frame outside the recording is its first or last."""
+    """Return the state set by the controls. states: the recording's, at least one; controls of other instruments are
+    ignored. Frames outside the recording are clamped."""
     state = interpolated_state(states, controls.frame)
     moved = {
         name: _moved(recorded, shafts[name], controls.instruments[name]) if name in controls.instruments else recorded
@@ -63,15 +63,15 @@ def controlled_state(states: Sequence[State], shafts: Mapping[str, Shaft], contr
 
 
 def interpolated_state(states: Sequence[State], frame: float) -> State:
-    """The recording at a place between two frames: positions, joints and time linearly, rotations by slerp."""
+    """Interpolate the recording between two frames: positions, joints and time linearly, rotations by slerp."""
     frame = min(max(frame, 0.0), len(states) - 1.0)
     first, share = int(frame), frame - int(frame)
     return interpolate_state(states[first], states[first + 1], share) if share else states[first]
 
 
 def slider_ranges(instruments: Sequence[Instrument], states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
-    """Range of the slider of each (instrument, joint), in rad: the capture's limits, or a little beyond what was
-    recorded where it states none."""
+    """Return the range of the slider of each (instrument, joint), in rad: the capture's limits, else slightly more than
+    the recorded range."""
     ranges = {}
     for (name, joint), recorded in joint_ranges(states).items():
         limits = next((item.joints.get(joint) for item in instruments if item.name == name), None)
@@ -86,7 +86,7 @@ def slider_ranges(instruments: Sequence[Instrument], states: Sequence[State]) ->
 
 
 def _moved(recorded: InstrumentState, shaft: Shaft, controls: InstrumentControls) -> InstrumentState:
-    """Roll about the shaft, then pitch and yaw about its end, then slide along where it pointed before."""
+    """Apply roll about the shaft, pitch and yaw about its end, then a slide along its original direction."""
     if not controls.departs:
         return recorded
     side, up, _ = frame_about(shaft.along).T
@@ -97,6 +97,6 @@ def _moved(recorded: InstrumentState, shaft: Shaft, controls: InstrumentControls
     )
     pose = to_numpy(recorded.pose) if controls.pose is None else controls.pose
     joints = {joint: controls.joints.get(joint, value) for joint, value in recorded.joints.items()}
-    with np.errstate(invalid="ignore"):  # a browser may send infinity: nothing can be rendered there
+    with np.errstate(invalid="ignore"):  # a browser may send infinity, which cannot be rendered
         offset = rigid(np.eye(3), controls.slide * shaft.along) @ turn_about(shaft.end, turns.as_rotvec())
         return InstrumentState(torch.from_numpy(pose @ offset), joints)

@@ -47,11 +47,11 @@ MAX_DEGREE = 3
 class ExportSettings:
     """Limits of what an exported page holds."""
 
-    embedded_degree: int = 1  # degree of the harmonics in a report: half the size, and for a first look
-    max_instruments: int = 8  # limit on the instruments: the page's rasteriser has room for these
-    max_axes: int = 8  # limit on the axes of one instrument
-    max_labels: int = 32  # limit on the labels: the page's rasteriser has room for these
-    thinnest_mm: float = 0.01  # least thickness of a Gaussian in mm, below any pixel
+    embedded_degree: int = 1  # degree of the harmonics in a report: half the size, for an overview
+    max_instruments: int = 8  # maximum number of instruments of the page's rasteriser
+    max_axes: int = 8  # maximum number of axes of one instrument
+    max_labels: int = 32  # maximum number of labels of the page's rasteriser
+    thinnest_mm: float = 0.01  # minimum thickness of a Gaussian in mm, below any pixel
     position_steps: int = 2**20 - 1  # of a body's box: 2**16 change the order in depth of neighbours, which costs 5 dB
 
 
@@ -76,12 +76,12 @@ def export_page(run: Path, output: Path, sh_degree: int, device: torch.device) -
 
 
 def embedded_page(run: TrainedRun) -> str | None:
-    """The page of a run for a frame in its report; None where a page cannot hold it."""
+    """Return the page of a run for a frame in its report; None if unsupported."""
     return None if why_not(run.scene) else page_of_run(run, EXPORT.embedded_degree)
 
 
 def page_of_run(run: TrainedRun, sh_degree: int) -> str:
-    """The page of a run, harmonics up to `sh_degree`. Raises NeecoError where a page cannot hold it (`why_not`)."""
+    """Return the page of a run, harmonics up to `sh_degree`. Raises NeecoError if unsupported (`why_not`)."""
     scene, packed = run.scene, pack(run.scene, sh_degree)
     facts = [
         ("capture", Path(run.config["capture"]).name),
@@ -126,7 +126,7 @@ def _source(*names: str) -> str:
 
 
 def _hash(text: str) -> str:
-    """Source expression of an inline script or style in a Content-Security-Policy."""
+    """Return the source expression of an inline script or style in a Content-Security-Policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
@@ -155,8 +155,8 @@ def why_not(scene: DrawableScene) -> str | None:
 
 @torch.no_grad()
 def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
-    """(header, planes) of a scene, harmonics up to `sh_degree`. Raises NeecoError where its method cannot be packed, or
-    there are more instruments, joints or labels than the page has room for."""
+    """Return (header, planes) of a scene, harmonics up to `sh_degree`. Raises NeecoError if its method cannot be
+    packed, or it exceeds the page's numbers of instruments, joints or labels."""
     motion = scene.motion()
     if (refusal := why_not(scene)) or motion is None:
         raise NeecoError(f"--export: {refusal}")
@@ -196,14 +196,14 @@ def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
 
 
 def _planes(numbers: np.ndarray, kind: str) -> bytes:
-    """K planes of N numbers [N, K], all low bytes before the high ones."""
+    """Return K planes of N numbers [N, K], all low bytes before the high ones."""
     split = np.ascontiguousarray(numbers.T, "<i4")[..., None].view(np.uint8)  # [K, N, 4]
     return np.ascontiguousarray(split[..., : BYTES[kind]].transpose(2, 0, 1)).tobytes()
 
 
 def _harmonics(rest: Tensor, degree: int) -> tuple[np.ndarray, list[float]]:
-    """[N, 3 K] in -127 to 127 of harmonics [N, 15, 3], the first left out, and what 127 stands for in every degree: its
-    largest."""
+    """Return [N, 3 K] in -127 to 127 of harmonics [N, 15, 3], without the first, and the value of 127 for every degree:
+    its maximum."""
     blocks, bands = [np.zeros((len(rest), 0), np.int64)], []
     for d in range(1, degree + 1):
         band = rest[:, d * d - 1 : (d + 1) ** 2 - 1]
@@ -214,7 +214,7 @@ def _harmonics(rest: Tensor, degree: int) -> tuple[np.ndarray, list[float]]:
 
 
 def _in_boxes(means: Tensor, counts: Sequence[int]) -> tuple[np.ndarray, list[list[list[float]]]]:
-    """[N, 3] of positions within the box of each body, and the boxes' corners."""
+    """Return positions [N, 3] relative to the box of each body, and the boxes' corners."""
     rows, boxes = [], []
     for body in torch.split(means, list(counts)):
         low, high = (body.amin(0), body.amax(0)) if len(body) else (means.new_zeros(3), means.new_ones(3))
@@ -224,7 +224,7 @@ def _in_boxes(means: Tensor, counts: Sequence[int]) -> tuple[np.ndarray, list[li
 
 
 def _quantized(values: Tensor, steps: int) -> tuple[np.ndarray, list[float]]:
-    """Numbers [N, K] in so many steps of their common range, and the range."""
+    """Return numbers [N, K] quantised to this many steps of their common range, and the range."""
     low, high = (float(values.min()), float(values.max())) if values.numel() else (0.0, 1.0)
     return _rounded((values - low) / max(high - low, 1e-9) * steps), [low, high]
 

@@ -123,13 +123,13 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") 
 
 def _add_mesh(document: _Document, node: int, splats: Splats) -> None:
     """Give a node its Gaussians, in its own frame, mm."""
-    shown = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, splats.opacities[:, None]], 1)
+    colors = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, splats.opacities[:, None]], 1)
     columns = {"SCALE": np.exp(splats.log_scales) * document.per_mm, "OPACITY": splats.opacities}
     for degree in range(splats.degree + 1):
         for order in range(2 * degree + 1):
             columns[f"SH_DEGREE_{degree}_COEF_{order}"] = splats.sh[:, degree**2 + order]
     attributes = {"POSITION": document.add((splats.means * document.per_mm).astype(np.float32), bounds=True)}
-    attributes["COLOR_0"] = document.add(to_uint8(255 * shown))
+    attributes["COLOR_0"] = document.add(to_uint8(255 * colors))
     rotations = np.rint(splats.quats[:, [1, 2, 3, 0]] * np.iinfo(np.int16).max).astype(np.int16)  # to .002 degrees
     attributes[f"{EXTENSION}:ROTATION"] = document.add(rotations)
     attributes |= {f"{EXTENSION}:{name}": document.add(v.astype(np.float32)) for name, v in columns.items()}

@@ -88,19 +88,19 @@ def moving_scene(scene: GaussianScene, states: Sequence[State], camera: Camera) 
     corrected = [scene.registered(state) for state in states]
     for number, instrument in enumerate(scene.instruments):
         rows = np.arange(len(scene.canonical))[scene.canonical.body(number + 1)]
-        given = [state.instruments[instrument.name] for state in corrected]
+        instrument_states = [state.instruments[instrument.name] for state in corrected]
         columns = [k for k, (name, _) in enumerate(scene.label_names) if name == instrument.name]
         links, body = motion.links[number][0].argmax(1).cpu().numpy(), len(nodes)
-        bodies = np.stack([item.pose.double().cpu().numpy() for item in given])
+        bodies = np.stack([item.pose.double().cpu().numpy() for item in instrument_states])
         facts = _facts(instrument, motion, number)
         nodes.append(MovingNode(name=instrument.name, poses=bodies, facts=facts))
         for link in np.unique(links).tolist():
-            own = rows[links == link]
-            shown = labels[np.ix_(own, columns)].argmax(1) if columns else np.zeros(len(own), int)
-            poses = np.stack([_link_pose(motion, number, link, item) for item in given])
-            for part in np.unique(shown).tolist():
+            link_rows = rows[links == link]
+            parts = labels[np.ix_(link_rows, columns)].argmax(1) if columns else np.zeros(len(link_rows), int)
+            poses = np.stack([_link_pose(motion, number, link, item) for item in instrument_states])
+            for part in np.unique(parts).tolist():
                 name = scene.label_names[columns[part]][1] if columns else f"link {link}"
-                local = local_splats(splats, own[shown == part], bodies[0] @ poses[0])
+                local = local_splats(splats, link_rows[parts == part], bodies[0] @ poses[0])
                 facts = {"instrument": instrument.name, "part": name, "link": link}
                 nodes.append(MovingNode(name=name, parent=body, poses=poses, splats=local, facts=facts))
     blended = [weights.max(1).values < MOVING.least_weight for weights, _ in motion.links]
@@ -113,9 +113,9 @@ def local_splats(splats: Splats, rows: np.ndarray, world_from_part: np.ndarray) 
     rotation, translation = world_from_part[:3, :3], world_from_part[:3, 3]
     back = matrix_to_quat(torch.from_numpy(rotation.T.copy())).expand(len(rows), 4)
     quats = quat_multiply(back, torch.from_numpy(splats.quats[rows]).double()).numpy().astype(np.float32)
-    own = {name: values[rows] for name, values in vars(splats).items()}
-    means = ((own["means"] - translation) @ rotation).astype(np.float32)
-    return replace(Splats(**own), means=means, quats=quats)
+    selected = {name: values[rows] for name, values in vars(splats).items()}
+    means = ((selected["means"] - translation) @ rotation).astype(np.float32)
+    return replace(Splats(**selected), means=means, quats=quats)
 
 
 def _facts(instrument: Instrument, motion: ArticulatedMotion, number: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The control panel of one browser, and its status. What comes from a run is shown as text, never as markup."""
+"""The control panel of one browser, and its status. Names from a run are shown as text, never as markup."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 class PanelSettings:
     """Settings of the panel's sliders and plots."""
 
-    slide_mm: float = 30.0  # range in mm of the sliders of position, to either side
-    yaw_deg: float = 45.0  # range in degrees of the sliders of yaw and pitch, to either side
-    plots_every_s: float = 0.5  # s between two plots, while more becomes known
+    slide_mm: float = 30.0  # range in mm of position sliders, to either side
+    yaw_deg: float = 45.0  # range in degrees of yaw and pitch sliders, to either side
+    plots_every_s: float = 0.5  # minimum s between two plots while scores arrive
     plot_height: int = 140  # height of the plot in px
-    line: int = 80  # limit on the characters of a name or message
+    line: int = 80  # maximum length of a name or message
 
 
 PANEL = PanelSettings()
@@ -42,7 +42,7 @@ PLOT_COLOR = "#228be6"
 
 
 class Panel:
-    """Controls of the run that is shown. The buttons `keep` and `save` are for others to listen to."""
+    """Controls of the shown run. The buttons `keep` and `save` are connected elsewhere."""
 
     def __init__(
         self,
@@ -57,9 +57,9 @@ class Panel:
         self._gui, self._loaded = client.gui, loaded
         self._changed, self._go_to, self._toggle_gizmo = changed, go_to, toggle_gizmo
         self._worst: list[int] = []
-        self._plotted: tuple[Timeline, int] | None = None  # and how many frames were known when it was shown
+        self._plotted: tuple[Timeline, int] | None = None  # and the number of scored frames in it
         self._plotted_at = 0.0
-        self._gui.main_panel.dock_right()  # or it would hide a part of the picture
+        self._gui.main_panel.dock_right()  # otherwise it would hide a part of the picture
         self.status = self._gui.add_html("")
         self._add_picture()
         self._add_recording()
@@ -68,19 +68,19 @@ class Panel:
         self._add_saving()
 
     def controls(self, overlays: Overlays) -> Controls:
-        """Values of the sliders."""
+        """Return the values of the sliders."""
         instruments = {item.name: item.controls(overlays.gizmo_pose(item.name)) for item in self.instruments}
         return Controls(self.place, instruments)
 
     @property
     def place(self) -> float:
-        """Place in the recording, in frames."""
+        """Return the position in the recording, in frames."""
         frame, last = float(self.frame.value), len(self._loaded.recorded.states) - 1
-        # a browser may say anything
+        # input from a browser is not trusted
         return min(max(frame, 0.0), float(last)) if math.isfinite(frame) else 0.0
 
     def show_timeline(self, timeline: Timeline) -> None:
-        """Draw what is known of the frames' PSNR, and list the worst."""
+        """Plot the PSNR of the frames scored so far, and list the worst."""
         so_far = timeline, timeline.count
         now = time.perf_counter()
         if so_far == self._plotted or (not timeline.done and now - self._plotted_at < PANEL.plots_every_s):
@@ -190,7 +190,7 @@ class InstrumentPanel:
         self._changed, self._toggle_gizmo = changed, toggle_gizmo
         self._joints_as_recorded = True  # until the user moves one
         self._ranges = {joint: ranges[self.name, joint] for joint in instrument.joints if (self.name, joint) in ranges}
-        # what sliders show of a reading: degrees of one that turns, mm of one that slides
+        # unit of the sliders of a reading: degrees (revolute) or mm (prismatic)
         self._per_unit = {joint: 1.0 if instrument.slides(joint) else math.degrees(1.0) for joint in instrument.joints}
         with gui.add_folder(f"Instrument {self.name}"):
             spans = self._ranges.items()
@@ -222,7 +222,7 @@ class InstrumentPanel:
         if not self._joints_as_recorded:
             for joint, slider in self._joints.items():
                 span = self._ranges[joint]
-                # a degree and back may lie a hair outside the limits
+                # conversion to degrees and back may exceed the limits by rounding
                 joints[joint] = min(max(slider.value / self._per_unit[joint], span.lower), span.upper)
         slide, *turns = (float(slider.value) for slider in self._moves)
         roll, yaw, pitch = map(math.radians, turns)
@@ -261,7 +261,7 @@ class InstrumentPanel:
 
 
 def _by_user(action: Callable[[], None]) -> Callable[[viser.GuiEvent[Any]], None]:
-    """`action` where a user moved a control, not the program."""
+    """Wrap `action` to run only when a user, not the program, moved a control."""
     return lambda event: None if event.client is None else action()
 
 
@@ -284,8 +284,7 @@ def status_html(
     notes: Sequence[str] = (),
     score: FrameScore | None = None,
 ) -> str:
-    """HTML of the status: what is shown, how well, how fast. seconds: of the rendering; notes: what else is to be
-    known."""
+    """Return the HTML of the status: content, quality and speed. seconds: of the rendering; notes: further remarks."""
     scene, recorded = loaded.scene, loaded.recorded
     frame = min(max(round(controls.frame), 0), len(recorded.names) - 1)
     count = "no Gaussians" if scene.num_gaussians is None else f"{scene.num_gaussians:,} Gaussians"

@@ -1,4 +1,4 @@
-"""The thread that renders, and one browser's session: how its sliders and camera become its picture."""
+"""The render thread, and one browser's session: from sliders and camera to its picture."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ if TYPE_CHECKING:
 class ViewerSettings:
     """Settings of what a viewer renders, and when."""
 
-    settled_s: float = 0.15  # s without a request after which the picture stands still and is rendered sharp
-    idle_s: float = 0.5  # limit on the s between two looks for something to render
-    moving_px: int = 256  # limit on the height in px while something moves
-    sharp_px: int = 720  # limit on the height in px of a sharp rendering
-    min_px: int = 32  # least height in px
-    moving_s: float = 0.15  # limit on the s of a rendering while something moves
-    sharp_s: float = 0.4  # limit on the s of a sharp rendering
-    remembered: int = 3  # number of timed renderings; a single one that computed something first does not count
-    jpeg_moving: int = 80  # JPEG quality while something moves
+    settled_s: float = 0.15  # s without a request after which a sharp picture is rendered
+    idle_s: float = 0.5  # maximum s between two checks for requests
+    moving_px: int = 256  # maximum height in px during motion
+    sharp_px: int = 720  # maximum height in px of a sharp rendering
+    min_px: int = 32  # minimum height in px
+    moving_s: float = 0.15  # maximum s of a rendering during motion
+    sharp_s: float = 0.4  # maximum s of a sharp rendering
+    remembered: int = 3  # number of timed renderings, robust to one that computed something first
+    jpeg_moving: int = 80  # JPEG quality during motion
     jpeg_sharp: int = 92  # JPEG quality of a sharp rendering
-    played_per_s: float = 10.0  # frames a second of `play`
-    status_every_s: float = 0.25  # s between two updates of the status while things move
+    played_per_s: float = 10.0  # frames per s of `play`
+    status_every_s: float = 0.25  # minimum s between two updates of the status during motion
 
 
 VIEWER = ViewerSettings()
@@ -53,8 +53,8 @@ log = logging.getLogger(__name__)
 
 
 class AdaptiveResolution:
-    """Chooses heights of renderings so that they come in time, from what the last ones took. sharp_px: how high sharp
-    ones are whatever they take; None: as `VIEWER` says."""
+    """Selects heights of renderings that meet the time limits, from the latest timings. sharp_px: fixed height of sharp
+    ones; None: as in `VIEWER`."""
 
     def __init__(self, sharp_px: int | None = None) -> None:
         self._sharp_px = sharp_px
@@ -78,10 +78,10 @@ class AdaptiveResolution:
 
 
 class RenderThread:
-    """Renders for all sessions in turn: first what moves, then sharp what stands still, then what nobody waits for.
+    """Renders for all sessions in turn: first moving pictures, then sharp static ones, then background tasks.
 
-    While it renders, further requests of one session replace each other. Any thread may request; `when_idle` is called
-    when there is nothing to render, and says whether it did something.
+    During a rendering, further requests of one session replace each other. Any thread may request; `when_idle` is
+    called when there is nothing to render, and returns whether it did something.
     """
 
     def __init__(self, when_idle: Callable[[], bool] = lambda: False) -> None:
@@ -95,16 +95,16 @@ class RenderThread:
 
     @property
     def sessions(self) -> tuple[ClientSession, ...]:
-        """The connected sessions."""
+        """Return the connected sessions."""
         with self._lock:
             return tuple(self._sessions.values())
 
     def start(self) -> None:
-        """Begin to render."""
+        """Start rendering."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End after what is being rendered."""
+        """Stop after the current rendering."""
         self._stopped = True
         self._wake.set()
         self._thread.join(timeout=10)
@@ -147,7 +147,7 @@ class RenderThread:
             self._wake.wait(max(0.0, min([VIEWER.idle_s, *(moment - now for moment in moments)])))
 
     def _tick(self) -> list[float]:
-        """Advance every session; return when each is to be called again."""
+        """Advance every session; return the time of each one's next call."""
         now, moments = time.perf_counter(), []
         for session in self.sessions:
             try:
@@ -158,7 +158,7 @@ class RenderThread:
         return [moment for moment in moments if moment is not None]
 
     def _do_most_urgent(self) -> bool:
-        """Do a job or render a picture; return whether there was one."""
+        """Run a job or render a picture; return whether there was one."""
         now = time.perf_counter()
         with self._lock:
             job = self._jobs.pop(0) if self._jobs else None
@@ -175,7 +175,7 @@ class RenderThread:
 
 
 def _attempted(work: Callable[[], T], otherwise: T) -> T:
-    """Do something; log its failure: one browser's trouble must not end the others' pictures."""
+    """Run something and log its failure: an error of one browser must not affect the others."""
     try:
         return work()
     except Exception:
@@ -215,7 +215,7 @@ class ClientSession:
         client.camera.on_update(lambda _: self._request())
 
     def render(self, sharp: bool) -> None:
-        """Render what is asked for now: coarsely, or sharp with its numbers."""
+        """Render the requested picture: coarse, or sharp with its scores."""
         if not self._connected():
             return
         began, current = time.perf_counter(), self._run.loaded
@@ -240,8 +240,8 @@ class ClientSession:
             self._show_status(controls, picture, as_recorded, seconds, sharp)
 
     def tick(self, now: float) -> float | None:
-        """Let the recording play on, and show what is newly known of its frames. now: of time.perf_counter(); returns
-        when to be called again, or None: nothing moves by itself."""
+        """Advance playback, and show new scores of frames. now: of time.perf_counter(); return when to call again, or
+        None: nothing moves by itself."""
         if not self._connected():
             return None
         self._panel.show_timeline(self._run.timeline)
@@ -281,7 +281,7 @@ class ClientSession:
         jump(self._client, camera, self._run.unit, self._run.distance)
 
     def _fit_window(self) -> None:
-        """Show all of the recorded image where the window has changed its shape and stands at its camera."""
+        """Fit the whole recorded image when the window at its camera has changed its shape."""
         window, recorded = self._client.camera, self._loaded.recorded.cameras[self._camera_frame]
         shape = aspect_of(window)
         if shape == self._shape:
@@ -305,19 +305,19 @@ class ClientSession:
         return controls
 
     def _state(self) -> State:
-        """Return the state that is shown now."""
+        """Return the displayed state."""
         loaded = self._loaded
         return controlled_state(loaded.recorded.states, loaded.shafts, self._panel.controls(self.overlays))
 
     def _pose(self) -> np.ndarray:
-        """world_from_camera [4, 4] mm of the window."""
+        """Return world_from_camera [4, 4] mm of the window."""
         return pose_of(self._client.camera.wxyz, self._client.camera.position, self._run.unit)
 
     def _toggle_gizmo(self, name: str, number: int, on: bool) -> None:
         if not on:
             self.overlays.remove_gizmo(name)
             return
-        # the gizmo is not there yet, so this is where the sliders have brought the instrument
+        # there is no gizmo yet, so this is the pose set by sliders
         pose = to_numpy(self._state().instruments[name].pose)
         self.overlays.add_gizmo(name, number, pose)
         self._panel.instruments[number].straighten()
@@ -339,11 +339,11 @@ class ClientSession:
             finally:
                 self._saving = False
 
-        # by the thread that renders: the rasteriser has the cores to itself
+        # in the render thread: the rasteriser uses all cores
         self._thread.run_job(save)
 
     def _report(self, task: Callable[[], str]) -> None:
-        """Do something, and say what became of it."""
+        """Run something, and report its result."""
         try:
             self._panel.saved.content = message_html(task())
         except NeecoError as error:
@@ -352,7 +352,7 @@ class ClientSession:
     def _send(self, picture: Picture, sharp: bool) -> None:
         depth = None
         if self.overlays.shown:
-            # 0 is nothing there: far away, not at the eye
+            # 0 means empty: far away, not at the eye
             depth = np.where(picture.depth > 0, picture.depth * self._run.unit, np.inf)
         quality = VIEWER.jpeg_sharp if sharp else VIEWER.jpeg_moving
         self._client.scene.set_background_image(picture.pixels, format="jpeg", jpeg_quality=quality, depth=depth)

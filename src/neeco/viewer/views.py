@@ -121,10 +121,10 @@ def _rendering(scene: DrawableScene, state: State, camera: Camera, view: str, la
 
 
 def _depth_picture(depth: np.ndarray) -> Picture:
-    there = depth > 0
-    if not there.any():
+    has_depth = depth > 0
+    if not has_depth.any():
         return Picture(np.zeros((*depth.shape, 3), np.uint8), depth, "nothing in view")
-    near, far = np.percentile(depth[there], DEPTH_PERCENTILES)
-    grey = np.clip((far - depth) / max(far - near, 1e-6), 0, 1) * there
+    near, far = np.percentile(depth[has_depth], DEPTH_PERCENTILES)
+    grey = np.clip((far - depth) / max(far - near, 1e-6), 0, 1) * has_depth
     note = f"white {near:.1f} mm or nearer, black {far:.1f} mm"
     return Picture(to_uint8(np.repeat(grey[..., None], 3, 2) * 255), depth, note)

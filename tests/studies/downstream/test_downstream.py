@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
-import os
+import pickle
 import re
 import shutil
-import signal
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from ctrl_c import ctrl_c_at
 from downstream_world import Pixels, bar_parts, read_grey, save_grey, write_set
 from torch import Tensor
 
@@ -28,6 +29,7 @@ from neeco.studies.downstream.experiment import (
     run_downstream,
 )
 from neeco.studies.downstream.results import Detections, failed_jobs, tables_of
+from neeco.studies.study import JobEvent
 
 TIMES = ("seconds", "machine")
 
@@ -38,13 +40,27 @@ class Corners(Pixels):
     model = "corners"
     predicts = "boxes"
 
+    @classmethod
+    def is_too_small(cls, size: tuple[int, int]) -> bool:
+        return size[0] < 48
+
     def predictions(self, module, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Detections]:
         return [Detections(np.array([[0.0, 0, w / 2, h / 2]]), np.array([1]), np.array([0.9])) for h, w in sizes]
 
 
+class Impatient(Pixels):
+    """Lacks a package."""
+
+    model = "impatient"
+
+    @classmethod
+    def missing_requirement(cls) -> str:
+        return "needs patience; pip install patience"
+
+
 @pytest.fixture(autouse=True)
 def small_models(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = models_module.find_models() | {"pixels": Pixels, "corners": Corners}
+    known = models_module.find_models() | {"pixels": Pixels, "corners": Corners, "impatient": Impatient}
     monkeypatch.setattr(models_module, "find_models", lambda: known)
 
 
@@ -236,25 +252,10 @@ def test_more_folds_sets_conditions_models_and_frames_are_added(spec: Downstream
 
 
 @pytest.mark.parametrize("stopped", [0, 3])
-def test_interrupted_it_goes_on_to_the_same_numbers(stopped, spec, tmp_path, monkeypatch):
+def test_interrupted_it_goes_on_to_the_same_numbers(stopped, spec, tmp_path):
     expected = trained(replace(spec, output=tmp_path / "whole"))
-    loss, fits = Pixels.loss, [-1]
-    fit = Pixels.fit
-
-    def counting(self, task):
-        fits[0] += 1
-        return fit(self, task)
-
-    def interrupted(self, *given):
-        if fits[0] == stopped:
-            os.kill(os.getpid(), signal.SIGINT)
-        return loss(self, *given)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Pixels, "fit", counting)
-        patched.setattr(Pixels, "loss", interrupted)
-        with pytest.raises(KeyboardInterrupt, match=rf"job {stopped + 1} of 10 \(pixels, .*run the same command again"):
-            trained(spec)
+    with pytest.raises(KeyboardInterrupt, match=rf"job {stopped + 1} of 10 \(pixels, .*run the same command again"):
+        trained(spec, ctrl_c_at(stopped))
     if stopped:
         half = json.loads((spec.output / "downstream.json").read_text())
         assert not half["complete"]
@@ -267,18 +268,12 @@ def test_interrupted_it_goes_on_to_the_same_numbers(stopped, spec, tmp_path, mon
 
 
 @pytest.mark.parametrize("failing", [2, "all"])
-def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    fit, fits = Pixels.fit, [-1]
-
-    def sometimes(self, task):
-        fits[0] += 1
-        if failing in (fits[0], "all"):
+def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamRequest) -> None:
+    def fails(event: JobEvent) -> None:
+        if event.stage == "training" and failing in (event.index, "all"):
             raise NeecoError("pixels: its loss is not finite at step 3;\n  begin anew")
-        return fit(self, task)
 
-    with monkeypatch.context() as patched:
-        patched.setattr(Pixels, "fit", sometimes)
-        result = trained(replace(spec, num_real=("0", "6")))
+    result = trained(replace(spec, num_real=("0", "6")), fails)
     failed = [index for index, job in enumerate(result["jobs"]) if "error" in job]
     assert failed == (list(range(6)) if failing == "all" else [failing])
     job = result["jobs"][failed[0]]
@@ -414,14 +409,12 @@ def test_labels_of_ones_own_are_taught_and_the_truth_is_tested(spec, tmp_path, r
     assert any(str(labels) in note for note in result["notes"])
 
 
-def test_a_model_that_lacks_something_or_sees_too_little_is_refused(spec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Pixels, "is_too_small", classmethod(lambda cls, size: size[0] < 48))
-    plan_downstream(spec)
-    with refused("--models pixels: its input of 24x16 px is too small; give a larger --size"):
-        plan_downstream(replace(spec, size=24))
-    monkeypatch.setattr(Pixels, "missing_requirement", classmethod(lambda cls: "needs patience; pip install patience"))
-    with refused("--models pixels: needs patience; pip install patience"):
-        plan_downstream(spec)
+def test_a_model_that_lacks_something_or_sees_too_little_is_refused(spec) -> None:
+    plan_downstream(replace(spec, models=("corners",)))
+    with refused("--models corners: its input of 24x16 px is too small; give a larger --size"):
+        plan_downstream(replace(spec, models=("corners",), size=24))
+    with refused("--models impatient: needs patience; pip install patience"):
+        plan_downstream(replace(spec, models=("impatient",)))
 
 
 def test_boxes_of_instruments_that_labels_do_not_tell_apart_are_refused(spec, capture):
@@ -475,8 +468,10 @@ def test_a_wrong_file_in_a_set_fails_its_jobs_alone(spec: DownstreamRequest, dra
 # files
 
 
-def test_two_workers_give_the_same_numbers(spec: DownstreamRequest, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.undo()
-    small = replace(spec, models=("unet",), conditions=("kin",), num_real=("0",), steps=2, size=32)
-    here, there = (trained(replace(small, output=tmp_path / str(workers), workers=workers)) for workers in (1, 2))
-    assert without_times(here["jobs"]) == without_times(there["jobs"])
+def test_a_job_sent_to_a_worker_gives_the_same_numbers(spec: DownstreamRequest, tmp_path: Path) -> None:
+    """Whatever random numbers that process is at; workers themselves are in test_jobs.py."""
+    (job,) = plan_downstream(replace(spec, conditions=("kin",), num_real=("0",), folds=1)).jobs
+    here = job.run()
+    torch.manual_seed(5)
+    there = replace(pickle.loads(pickle.dumps(job)), folder=tmp_path / "there").run()
+    assert without_times(there) == without_times(here)

@@ -27,12 +27,12 @@ __all__ = ["CaptureSummary", "Checked", "check_capture", "inspect_capture", "rea
 class CaptureSummary:
     """Counts and ranges of what could be read."""
 
-    splits: dict[str, int]  # name -> frames
-    points: int  # measured points
+    splits: dict[str, int]  # name -> number of frames
+    points: int  # number of measured points
     registered: bool
     joints: dict[str, tuple[float, float]]  # "instrument.joint" -> lowest and highest value, rad
     travel_mm: dict[str, float]  # instrument -> diagonal of the box its origin moves in
-    still: bool = False  # the scope stood still
+    still: bool = False  # whether the scope was still
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -48,9 +48,9 @@ class Checked:
 
 
 def check_capture(path: Path | str, transforms: str = "transforms.json") -> list[Problem]:
-    """Return everything that is wrong with a capture, errors and warnings, in the order found. Bad data never raises.
+    """Return all faults of a capture, errors and warnings, in the order found. Bad data never raises.
 
-    Training refuses a capture with errors; a warning names what may be meant but often is not.
+    Training refuses a capture with errors; a warning names a likely but not certain fault.
     """
     return inspect_capture(path, transforms).problems
 
@@ -58,7 +58,7 @@ def check_capture(path: Path | str, transforms: str = "transforms.json") -> list
 def read_checked(
     path: Path | str, transforms: str = "transforms.json", report: Callable[[str], None] | None = None
 ) -> Capture:
-    """Read a capture that can be trained on.
+    """Read a capture for training.
 
     report: receives the contradictions between states and images, which take seconds to find. Raises NeecoError with
     the first error that `check_capture` finds.
@@ -75,8 +75,8 @@ def read_checked(
 def inspect_capture(
     path: Path | str, transforms: str = "transforms.json", *, motion: bool = True, truth: bool = True
 ) -> Checked:
-    """Read and check a capture. motion: also compare cameras and states with the images, which takes seconds and finds
-    warnings only; truth: also open the masks that evaluation compares with."""
+    """Read and check a capture. motion: also compare cameras and states with the images, which takes seconds and yields
+    warnings only; truth: also open the masks used in evaluation."""
     report = ProblemReport()
     parsed = parse_capture(path, report, transforms)
     if not parsed.frames and not errors_only(report.problems):

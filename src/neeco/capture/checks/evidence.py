@@ -1,13 +1,13 @@
 """Evidence of the images on cameras and instrument poses.
 
-Colours: a sparse point has the colour of the pixel that it projects to. Lighting and exposure change from image to
-image, so the differences between a point's brightness and its neighbours' are correlated with those in the image: by
-0.3 to 0.7 where images and cameras belong together, by less than 0.1 where they do not.
+Colours: a sparse point has the colour of the pixel that it projects to. Lighting and exposure vary between images, so
+differences between a point's brightness and its neighbours' are correlated with those in the image: by 0.3 to 0.7 if
+images and cameras belong together, by less than 0.1 if not.
 
 Motion: each frame is predicted from frames of nearby cameras, warped by the sparse points' depth; where the prediction
-fails, something moves. If the poses are right, a point fixed to the instrument lies on moving pixels in all frames.
-The evidence of a moving pixel is the share of the other frames in which the point that it shows, at its best depth and
-carried along by the poses, lies on moving pixels.
+fails, something moves. If the poses are correct, a point fixed to the instrument lies on moving pixels in all frames.
+The evidence of a moving pixel is the share of other frames in which its 3D point, at the best depth and moved with the
+poses, lies on moving pixels.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project
 
-MIN_DEPTH = 1e-3  # mm; points that are less deep are not in front of a camera
-LUMA = np.array([0.299, 0.587, 0.114])  # brightness of red, green, blue
-DEPTHS = np.linspace(0.35, 1.0, 12)  # at which moving pixels may be, of the tissue's
+MIN_DEPTH = 1e-3  # mm; points with smaller depth are not in front of a camera
+LUMA = np.array([0.299, 0.587, 0.114])  # luma weights of red, green, blue
+DEPTHS = np.linspace(0.35, 1.0, 12)  # candidate depths of moving pixels relative to the tissue
 Pixels = Callable[..., tuple[np.ndarray, np.ndarray]]  # u, v, width, height -> u, v
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One mistake: what it is, what to do about it, and what is compared with the images without it."""
+    """One possible mistake: description, remedy, and the corrected data to compare with the images."""
 
     kind: str
     message: str
@@ -44,13 +44,13 @@ class Candidate:
     margin: Margin
     _: KW_ONLY
     poses: np.ndarray | None = None  # [F, 4, 4] of the instrument or the cameras (OpenCV axes); None: as recorded
-    pixels: Pixels | None = None  # where a projected point lies in the images
+    pixels: Pixels | None = None  # mapping of a projected point to the image
     available: np.ndarray | None = None  # [F] frames that have poses; None: all
     steps: int = 0  # frames by which poses are shifted
 
 
 def gain_certainty(gains: np.ndarray) -> float:
-    """Mean of gains [F] of frames in order, in standard errors over blocks of them."""
+    """Return the mean of gains [F] of frames in order, in standard errors estimated over blocks of them."""
     blocks = np.array([block.mean() for block in np.array_split(gains, min(SETTINGS.blocks, len(gains)))])
     return float(blocks.mean() / max(blocks.std(ddof=1) / np.sqrt(len(blocks)), 1e-9))
 
@@ -120,9 +120,9 @@ class ColorEvidence:
         self.rows = compared_rows(parsed)
         self.images = [image for row in self.rows if (image := pictures[row].image) is not None]
         self.grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in self.images]
-        smooth = [cv2.GaussianBlur(gray, (0, 0), 1.0) for gray in self.grays]  # less noise
+        smooth = [cv2.GaussianBlur(gray, (0, 0), 1.0) for gray in self.grays]  # noise reduction
         details = [np.abs(gray - cv2.blur(gray, (gray.shape[1] // 9,) * 2)).ravel() for gray in smooth]
-        self.contrast = float(np.median(np.concatenate(details)))  # of 255, of pixels with their surroundings
+        self.contrast = float(np.median(np.concatenate(details)))  # of 255: local contrast
         sizes = [reduced_size(frame) for frame in parsed.frames]
         self.all_cameras = CameraArrays.of([frame.camera for frame in parsed.frames], sizes)
         self.cameras = self.all_cameras[self.rows]
@@ -145,8 +145,8 @@ class ColorEvidence:
         return mean / max(recorded, 1e-9), gain_certainty((agreement - self.recorded)[both]), mean
 
     def agreement(self, candidate: Candidate | None = None, every: int = 1, *, coarse: bool = False) -> np.ndarray:
-        """[F] correlation of the points' brightness with the images', relative to their neighbours: 0 where too few
-        are visible, NaN where the candidate has no such camera. Every so many of the images."""
+        """Return [F] correlation of the points' brightness with the images', relative to their neighbours: 0 with too
+        few visible points, NaN without a camera in the candidate. Evaluated for some images only."""
         few = slice(None, None, every)
         cameras, pixels = self.cameras, None
         if candidate is not None:
@@ -202,7 +202,7 @@ class MotionEvidence:
     """Moving pixels of all frames as rays, each with points at several depths, and how well poses explain them."""
 
     recorded: np.ndarray  # float32 [R, D, F] evidence of the poses as recorded; set by `with_recorded`
-    thinned: MotionEvidence  # fewer of the rays, at fewer depths, for a first comparison
+    thinned: MotionEvidence  # a subset of rays and depths for a first comparison
 
     @classmethod
     def of(cls, parsed: Parsed, pictures: Sequence[Picture]) -> MotionEvidence | None:
@@ -238,7 +238,7 @@ class MotionEvidence:
         # [F, h, w] confidence in [0, 1] that a pixel moves
         moving = np.stack([cv2.blur(((pixels - low) / (high - low)).clip(0, 1), (3, 3)) for pixels in differences])
         self._choose_rays(moving)
-        # what moves everywhere or always is no evidence; nor is what lies outside, in a border of one pixel
+        # whatever moves everywhere or always is no evidence; nor are outside pixels, in a border of one pixel
         evidence = np.pad((moving - moving.mean(0)).astype(np.float32), ((0, 0), (1, 1), (1, 1)))
         self._evidence, self._first = evidence.ravel(), np.arange(len(valid), dtype=np.int32) * evidence[0].size
 
@@ -257,8 +257,8 @@ class MotionEvidence:
         return np.asarray(cv2.resize(coarse.astype(np.float32), (self.width, self.height)))
 
     def _difference(self, images: np.ndarray, masks: np.ndarray, index: int) -> np.ndarray:
-        """Difference [h, w] of 255 of one of images [F, h, w, 3] from what others predict of the still scene, less
-        what a shift by one pixel explains; 0 where too few observe the place, or masks [F, h, w] hide it."""
+        """Return the difference [h, w] of 255 between one of images [F, h, w, 3] and its prediction by others for a
+        still scene, less what a shift by one pixel explains; 0 if too few observe it, or masks [F, h, w] hide it."""
         image, pose, depth = images[index], self.cameras.poses[index], self.depths[index]
         fx, fy, cx, cy = self.cameras.intrinsics[index]
         v, u = np.mgrid[: self.height, : self.width] + 0.5
@@ -275,14 +275,14 @@ class MotionEvidence:
             observed += visible
         predicted = np.median(predictions, axis=0)
         valid = (observed >= 3) & (masks[index] > 0.9)
-        if valid.any():  # the camera's exposure and white balance may have changed
+        if valid.any():  # exposure and white balance may vary
             predicted = predicted * np.median(image[valid] / predicted[valid].clip(1), axis=0)
         below = cv2.erode(predicted, np.ones((3, 3))) - image
         above = image - cv2.dilate(predicted, np.ones((3, 3)))
         return np.where(valid, np.maximum(below, above).clip(0).max(-1), 0.0)
 
     def _neighbours(self, index: int) -> list[int]:
-        """Frames whose cameras are near that of `index`, spread over the time that they span."""
+        """Return frames with cameras near that of `index`, spread over the time that they span."""
         poses, pose = self.cameras.poses, self.cameras.poses[index]
         aside = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.median(self.depths[index])
         cosine = (np.einsum("ij,fij->f", pose[:3, :3], poses[:, :3, :3]) - 1) / 2
@@ -319,8 +319,8 @@ class MotionEvidence:
         return rays
 
     def without(self, others: list[np.ndarray], poses: np.ndarray) -> MotionEvidence | None:
-        """The rays but those that poses of other instruments, each [F, 4, 4], explain, and better than `poses` do:
-        mirrored, the motion of one arm is like that of another. None where too few are left."""
+        """Return the rays without those that poses of other instruments, each [F, 4, 4], explain better than `poses`
+        do: the motion of one arm may resemble the mirrored one of another. None if too few remain."""
         if not others:
             return self
         everywhere = np.ones(len(poses), dtype=bool)
@@ -359,7 +359,7 @@ class MotionEvidence:
         return np.asarray((sums / (weights.sum() - excluded).clip(1)).max(1))
 
     def mean(self, poses: np.ndarray, available: np.ndarray | None = None) -> float:
-        """Mean evidence of poses [F, 4, 4], over the rays that they explain best and the frames they are of [F]."""
+        """Return the mean evidence of poses [F, 4, 4], over the rays that they explain best and their frames [F]."""
         available = np.ones(len(poses), dtype=bool) if available is None else available
         counts = available[self.ray_views]
         if not self.enough(self.ray_views[counts]):
@@ -368,7 +368,7 @@ class MotionEvidence:
         return float(explained[int((1 - SETTINGS.compared_rays) * len(explained)) :].mean())
 
     def by_chance(self, poses: np.ndarray, available: np.ndarray | None = None) -> float:
-        """Mean evidence of poses [F, 4, 4] in random order: the instrument where it usually is, at other times."""
+        """Return the mean evidence of poses [F, 4, 4] in random order: that of the instrument's usual position."""
         rows = np.arange(len(poses)) if available is None else np.flatnonzero(available)
         generator, shuffled, means = np.random.default_rng(0), poses.copy(), []
         for _ in range(SETTINGS.shuffles):
@@ -377,8 +377,8 @@ class MotionEvidence:
         return float(np.mean(means))
 
     def travel(self, poses: np.ndarray) -> float:
-        """Median over the rays of the standard deviation, of the image's width, by which their points move over all
-        frames, as one camera would see them."""
+        """Return the median over the rays of the standard deviation, relative to the image width, of their points'
+        motion over all frames, in one camera."""
         back = np.linalg.inv(np.linalg.inv(self.cameras.poses) @ poses)[self.ray_views]
         best = self.evidence(poses).mean(-1).argmax(1)
         points = np.einsum("rij,rj->ri", back[:, :3, :3], self.points[np.arange(len(best)), best]) + back[:, :3, 3]
@@ -391,8 +391,8 @@ class MotionEvidence:
         return self.thinned.mean(candidate.poses, candidate.available)
 
     def compare(self, candidate: Candidate) -> tuple[float, float, float]:
-        """Over the rays that some poses explain best; of other rotations, over the half of those explained at all that
-        they explain most differently: on the shaft of a thin instrument any rotation explains nearly as much."""
+        """Compare poses on the rays that any of them explains best; other rotations on the half of these with the
+        largest difference: on the shaft of a thin instrument any rotation explains nearly as much."""
         poses, available = candidate.poses, candidate.available
         assert poses is not None
         available = np.ones(len(poses), dtype=bool) if available is None else available

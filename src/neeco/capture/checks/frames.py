@@ -117,7 +117,7 @@ def check_states(parsed: Parsed) -> None:
             _check_kinematics(parsed, instrument, instrument.kinematics)
         stated = [state.uncertainty for _, state in parsed.states_of(instrument.name) if state.uncertainty is not None]
         unknown = sum(uncertainty.rotation_deg[2] > SETTINGS.max_known_roll_deg for uncertainty in stated)
-        if 2 * unknown > len(stated):  # found in video, it cannot be learned
+        if 2 * unknown > len(stated):  # from video, it cannot be learned
             message = f"the roll of {name} is not known in {unknown} of {len(stated)} frames"
             parsed.header("frames").warning(message, "log it, or pose frames by hand: neeco view CAPTURE --annotate")
     _check_changes(parsed)
@@ -148,7 +148,7 @@ def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
 
 
 def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTree) -> None:
-    """Report readings that a tree takes and nobody recorded, and readings that the others explain."""
+    """Report readings of a tree that were not recorded, and readings that the others determine."""
     place, name = parsed.header("instruments"), printable(instrument.name)
     if missing := [reading for reading in tree.readings if reading not in instrument.joints]:
         recorded = ", ".join(instrument.joints) or "none"
@@ -172,17 +172,17 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
     readings = np.array([[state.joints[joint] for joint in logged] for state in states])  # [S, R]
     readings = readings - readings.mean(0)
     for index, joint in enumerate(logged):
-        reading, others = readings[:, index], np.delete(readings, index, 1)
-        if reading.std() < MIN_DEVIATION or not others.shape[1]:
+        reading, rest = readings[:, index], np.delete(readings, index, 1)
+        if reading.std() < MIN_DEVIATION or not rest.shape[1]:
             continue
-        explained = 1 - (reading - others @ np.linalg.lstsq(others, reading, rcond=1e-6)[0]).var() / reading.var()
+        explained = 1 - (reading - rest @ np.linalg.lstsq(rest, reading, rcond=1e-6)[0]).var() / reading.var()
         if explained > SETTINGS.max_explained:
             message = f"joint {printable(joint)} of {name} follows from the others ({explained:.1%} of its variance)"
             place.warning(message, "also move joints one at a time, to separate their axes")
 
 
 def _check_changes(parsed: Parsed) -> None:
-    """Report states that are the same in every frame: other states cannot be learned from them."""
+    """Report states that are the same in every frame: motion cannot be learned from them."""
     frames, moving, still = parsed.header("frames"), False, []
     for instrument in parsed.instruments:
         states, name = [state for _, state in parsed.states_of(instrument.name)], printable(instrument.name)

@@ -28,10 +28,10 @@ class Picture:
     """A frame's image and mask, decoded once. Errors name files without their folders."""
 
     digest: bytes | None = None  # of the pixels; None when not readable
-    image: np.ndarray | None = None  # uint8 [h, w, 3], at most SETTINGS.compared_width px wide; None: not compared
+    image: np.ndarray | None = None  # uint8 [h, w, 3], at most SETTINGS.compared_width px wide; None: not used
     mask: np.ndarray | None = None  # float32 [h, w], share of each pixel that counts; None: all
     uniform: bool = False  # one colour
-    hidden: Hidden | None = None  # by the mask; None: there is no usable one
+    hidden: Hidden | None = None  # content hidden by the mask; None: no usable mask
     image_error: str = ""
     mask_error: str = ""
 

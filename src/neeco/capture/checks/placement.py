@@ -1,6 +1,6 @@
-"""Check that cameras, points and instruments fit together: distances, units, and what is in view.
+"""Checks that cameras, points and instruments fit together: distances, units, and visibility.
 
-Where points or instruments are out of view, the images are asked for the mistake behind it.
+For points or instruments out of view, the images determine the mistake.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ ALL_IN_MM = "give all lengths in mm"
 
 
 def check_placement(parsed: Parsed, verdicts: ImageVerdicts) -> None:
-    """Check points, cameras against points, then instruments against both (not against cameras that are wrong)."""
+    """Check points, cameras against points, then instruments against both (unless the cameras are wrong)."""
     report = parsed.places[0].report
     before = len(errors_only(report.problems))
     points, placed = _usable_points(parsed), parsed.with_cameras()
@@ -123,7 +123,7 @@ def _check_instrument(
             places[index].child("pose").error(message, "pose and points must share frame and unit (mm)")
         if len(far):
             return
-    if not out_of_view:  # single poses far away from all others, and out of view: tracker drop-outs
+    if not out_of_view:  # single poses out of view and far away from all others: tracker drop-outs
         distances = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
         usual = max(float(np.median(distances)), SETTINGS.min_distance_mm)
         for index in np.flatnonzero((distances > SETTINGS.max_distance * usual) & ~visible):

@@ -1,4 +1,4 @@
-"""Folders of a capture's truth, for evaluation only, and the check that they hold what evaluation reads."""
+"""Folders of a capture's ground truth, for evaluation only, and the check of their content."""
 
 from __future__ import annotations
 
@@ -30,8 +30,7 @@ def stated_names(path: Path) -> dict[int, str] | None:
 
 
 def check_truth(parsed: Parsed) -> None:
-    """Warn of masks of the truth that evaluation would refuse or pass over. They keep no capture from being trained
-    on."""
+    """Warn of truth masks that evaluation would refuse or ignore. They do not prevent training."""
     root, report = parsed.root, parsed.places[0].report
     cameras = {frame.name: frame.camera for frame in parsed.with_cameras().frames}
     names = {frame.name for frame in parsed.frames}

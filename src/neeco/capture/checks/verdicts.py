@@ -1,6 +1,6 @@
 """Verdicts of the images on cameras and instruments.
 
-A mistake is named only where the images agree clearly better without it. Where they contradict what is recorded and no
+A mistake is named only if the images agree clearly better without it. If they contradict the recorded data and no
 candidate explains it, only the contradiction is reported.
 """
 
@@ -33,7 +33,7 @@ PIXELS: dict[str, Pixels] = {
 
 
 class Verdict(NamedTuple):
-    """Verdict on cameras or an instrument's states, with the fault that the images contradict."""
+    """Verdict on cameras or an instrument's states, with the fault according to the images."""
 
     status: Literal["undecided", "supported", "contradicted"]
     field: str = ""
@@ -49,12 +49,11 @@ class Verdict(NamedTuple):
 
 
 class ImageVerdicts:
-    """Verdicts on a capture. There are none while it has errors, nor on instruments where the images contradict the
-    cameras."""
+    """Verdicts on a capture. None while it has errors, nor on instruments if the images contradict the cameras."""
 
     def __init__(self, parsed: Parsed, pictures: Sequence[Picture]) -> None:
         self.parsed, self.pictures = parsed, pictures
-        self._instruments: dict[str, Verdict] = {}  # by name, of those that were asked for
+        self._instruments: dict[str, Verdict] = {}  # cache by name
 
     def report(self) -> None:
         """Report all contradictions as warnings."""
@@ -64,7 +63,7 @@ class ImageVerdicts:
 
     @cached_property
     def cameras(self) -> Verdict:
-        """Images and cameras belong together, by the sparse points' colours."""
+        """Return the verdict whether images and cameras belong together, by the sparse points' colours."""
         has_errors = bool(errors_only(self.parsed.places[0].report.problems))
         colors = None if has_errors else ColorEvidence.of(self.parsed, self.pictures)
         if colors is None:
@@ -95,7 +94,7 @@ class ImageVerdicts:
         return None if contradicted else MotionEvidence.of(self.parsed, self.pictures)
 
     def instrument(self, instrument: Instrument) -> Verdict:
-        """The instrument is where its states say, by what moves in the images. All frames must have its state."""
+        """Return the verdict whether an instrument is at its stated poses, by motion. Needs states in all frames."""
         if instrument.name not in self._instruments:
             self._instruments[instrument.name] = self._find(instrument)
         return self._instruments[instrument.name]
@@ -107,8 +106,8 @@ class ImageVerdicts:
             return Verdict("undecided")
         rows, (recorded, root_from_recorded) = self._motion.rows, recorded_poses
         roots = recorded @ root_from_recorded
-        others = [(other[0] @ other[1])[rows] for other in poses.values() if other is not None]
-        motion = self._motion.without(others, roots[rows])
+        other_paths = [(other[0] @ other[1])[rows] for other in poses.values() if other is not None]
+        motion = self._motion.without(other_paths, roots[rows])
         if motion is None:
             return Verdict("undecided")
         name, motion = printable(instrument.name), motion.with_recorded(roots[rows])
@@ -119,7 +118,7 @@ class ImageVerdicts:
             return Verdict("supported")
         by_chance = motion.by_chance(roots[rows])
         factor = SETTINGS.by_chance_few if len(rows) < SETTINGS.few_frames else SETTINGS.by_chance
-        mostly_others = len(motion.ray_views) < len(self._motion.ray_views) / 2  # these explain most of what moves
+        mostly_others = len(motion.ray_views) < len(self._motion.ray_views) / 2  # others explain most of the motion
         if evidence > factor * by_chance or mostly_others or motion.travel(roots[rows]) < SETTINGS.min_travel:
             return Verdict("undecided")
         message = (
@@ -131,8 +130,8 @@ class ImageVerdicts:
 
     @cached_property
     def _poses(self) -> dict[str, tuple[np.ndarray, np.ndarray] | None]:
-        """Recorded poses [N, 4, 4] of each instrument, and what makes them those of the root [N, 4, 4], which shows
-        most; None where a frame has no state."""
+        """Return recorded poses [N, 4, 4] of each instrument, and root_from_recorded [N, 4, 4], as the root is best
+        visible; None if a frame has no state."""
         poses: dict[str, tuple[np.ndarray, np.ndarray] | None] = {}
         for item in self.parsed.instruments:
             poses[item.name], tree = None, item.kinematics
@@ -143,7 +142,7 @@ class ImageVerdicts:
         return poses
 
     def _mistake(self, name: str, recorded: np.ndarray, back: np.ndarray, motion: MotionEvidence) -> Candidate | None:
-        """The mistake in the poses [N, 4, 4] of an instrument that the images confirm."""
+        """Return the mistake in the poses [N, 4, 4] of an instrument that the images confirm."""
         rows, roots = motion.rows, recorded @ back
         turns = Rotation.from_matrix(roots[rows, :3, :3])
         turning = np.degrees(np.sqrt(((turns.mean().inv() * turns).magnitude() ** 2).mean()))
@@ -166,13 +165,13 @@ class ImageVerdicts:
         common = np.prod([shift.available for shift in shifts if shift.available is not None], axis=0, dtype=bool)
         agreement = [motion.mean(shift.poses, common) for shift in shifts if shift.poses is not None]
         best = shifts[int(np.argmax(agreement))] if max(agreement) > 0 else best
-        # at the end of the range that was tried another shift may be the right one
+        # at the end of the search range, another shift may be correct
         return None if abs(best.steps) >= longest else best
 
 
 def likeliest(candidates: Sequence[Candidate], evidence: ColorEvidence | MotionEvidence) -> Candidate | None:
-    """The candidate that agrees clearly better with the images than what is recorded, and better than any of another
-    kind; None where there is none, or several are as likely."""
+    """Return the candidate that agrees clearly better with the images than the recorded data, and better than any of
+    another kind; None without one, or if several are equally likely."""
     compared = []
     for kind in dict.fromkeys(candidate.kind for candidate in candidates):
         alike = [candidate for candidate in candidates if candidate.kind == kind]
@@ -197,7 +196,7 @@ def likeliest(candidates: Sequence[Candidate], evidence: ColorEvidence | MotionE
 
 
 def _pose_candidates(poses: np.ndarray, name: str, factors: Sequence[float] = ()) -> Iterator[Candidate]:
-    """Rotations, world axes, units and `factors` of scale in which poses [F, 4, 4] may have been written."""
+    """Return candidates of rotation formats, world axes, units and scale `factors` of poses [F, 4, 4]."""
     rotations = poses[:, :3, :3]
     quaternions = Rotation.from_matrix(rotations).as_quat()  # x y z w
     turned = {f"rotations of {name} are transposed": rotations.transpose(0, 2, 1)}
@@ -226,7 +225,7 @@ def _pose_candidates(poses: np.ndarray, name: str, factors: Sequence[float] = ()
 
 
 def instrument_candidates(poses: np.ndarray, world_from_camera: np.ndarray, name: str) -> Iterator[Candidate]:
-    """Mistakes in instrument poses [F, 4, 4]; cameras [F, 4, 4] have OpenCV axes."""
+    """Return candidate mistakes in instrument poses [F, 4, 4]; cameras [F, 4, 4] have OpenCV axes."""
     yield from _pose_candidates(poses, name, SETTINGS.scales)
     message, remedy = f"poses of {name} are instrument-from-world", "invert them: world_from_instrument is expected"
     yield Candidate("pose", message, remedy, SETTINGS.pose, poses=np.linalg.inv(poses))
@@ -243,8 +242,8 @@ def instrument_candidates(poses: np.ndarray, world_from_camera: np.ndarray, name
 def resampled(
     poses: np.ndarray, rows: np.ndarray, times: np.ndarray, name: str, *, steps: int = 0, rate: float = 1.0
 ) -> Candidate:
-    """States of frames `rows` [F], of poses [N, 4, 4], so many frames later, or of a clock of another rate. Where time
-    goes back, another recording begins."""
+    """Return the states of frames `rows` [F], of poses [N, 4, 4], shifted by a number of frames, or of a clock with
+    another rate. A new recording starts where time decreases."""
     recording = np.concatenate([[0], np.cumsum(np.diff(times) < 0)])
     wanted = np.rint(rate * rows).astype(int) + steps
     source = wanted.clip(0, len(poses) - 1)
@@ -264,10 +263,10 @@ def resampled(
 
 
 def camera_candidates(poses: np.ndarray) -> Iterator[Candidate]:
-    """Mistakes in camera poses [F, 4, 4] (OpenCV axes) and images."""
-    for what, pixels in PIXELS.items():
+    """Return candidate mistakes in camera poses [F, 4, 4] (OpenCV axes) and images."""
+    for condition, pixels in PIXELS.items():
         remedy = "turn their pixels, not only an EXIF tag"
-        yield Candidate("image", f"the images are {what}", remedy, SETTINGS.camera, pixels=pixels)
+        yield Candidate("image", f"the images are {condition}", remedy, SETTINGS.camera, pixels=pixels)
     written = swap_camera_axes(poses)  # as transform_matrix has them
     message, inverse = "camera matrices are world-to-camera", np.linalg.inv(written)
     for words, moved in (
@@ -282,7 +281,7 @@ def camera_candidates(poses: np.ndarray) -> Iterator[Candidate]:
 
 
 def offset_candidates(poses: np.ndarray, rows: np.ndarray) -> Iterator[Candidate]:
-    """Images of `rows` [F] listed with cameras, of poses [N, 4, 4], of other frames."""
+    """Return candidate offsets between images of `rows` [F] and cameras, of poses [N, 4, 4]."""
     for steps in range(-SETTINGS.max_offset, SETTINGS.max_offset + 1):
         if steps:
             at = (rows + steps).clip(0, len(poses) - 1)

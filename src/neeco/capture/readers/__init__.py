@@ -63,8 +63,8 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
 
 
 def capture_of(parsed: Parsed) -> Capture:
-    """Build the capture from what was read without errors. Poses of articulated instruments become their roots'.
-    Raises NeecoError for an image whose name is not in UTF-8."""
+    """Build the capture from what was read without errors. Poses of articulated instruments are converted to their
+    roots'. Raises NeecoError for an image whose name is not in UTF-8."""
     frames, instruments = tuple(parsed.frames), parsed.instruments
     for frame in frames:
         require_utf8(frame.image_path)
@@ -93,8 +93,8 @@ def capture_of(parsed: Parsed) -> Capture:
 
 
 def _completed(state: State, instruments: Sequence[Instrument], parsed: Parsed) -> State:
-    """The state with every joint that nobody recorded half way between its limits, and with poses of other links of an
-    instrument made those of its root, by its kinematics as stated."""
+    """Return the state with every unrecorded joint half way between its limits, and poses of other links of an
+    instrument converted to its root's, by its stated kinematics."""
     completed = dict(state.instruments)
     for item in (item for item in instruments if item.name in completed):
         recorded, tree = completed[item.name], item.kinematics
@@ -119,8 +119,8 @@ def parse_capture(
     *,
     as_source: bool = False,
 ) -> Parsed:
-    """Read as much of a capture as can be read; what is wrong with it goes to `report`. as_source: see `Parsed`. Raises
-    NeecoError for a path that is not in UTF-8."""
+    """Parse as much of a capture as possible; faults go to `report`. as_source: see `Parsed`. Raises NeecoError for a
+    path that is not in UTF-8."""
     parsed = _parse(Path(path), report, transforms, background, as_source)
     lenses = [Lens.of(frame.camera) for frame in parsed.with_cameras().frames]
     if parsed.lens is not None:

@@ -1,6 +1,6 @@
 """Read COLMAP sparse models, binary and text (format: COLMAP's documentation, "Output Format").
 
-Not by pycolmap, which an installation may lack and which ends in a traceback for damaged files.
+Without pycolmap, which is optional and fails with a traceback for damaged files.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MODELS = {
     12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4), 16: ("EUCM", 6),
     17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
-MAX_MODEL_ID = 100  # that a COLMAP to come may write; more: damaged
+MAX_MODEL_ID = 100  # future COLMAP versions may add models; a larger id indicates damage
 _COEFFICIENTS = {  # in a model's parameters, behind the focal lengths and the principal point
     "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
     "OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
@@ -86,7 +86,7 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
 
     Images are in the capture's `images/`; sorted by name, every 8th is a test frame, and time is the order.
     """
-    model, *others = models
+    model, *unused_models = models
     parsed = Parsed(root, timed=False, as_source=as_source)
     suffix = _suffix(model)
     parse_cameras, parse_images, parse_points = _PARSERS[suffix]
@@ -109,7 +109,7 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
-    _note_left_out(model, others, images, root, Node(None, file, "", report))
+    _note_left_out(model, unused_models, images, root, Node(None, file, "", report))
     images.sort(key=lambda item: natural_order(item.name))
     orders = instants([image.name for image in images], [image.camera_id for image in images])
     orders = orders or list(range(len(images)))
@@ -184,7 +184,7 @@ def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:
 
 
 class _Stream:
-    """Little-endian values of a binary file, one after the other."""
+    """Sequential little-endian values of a binary file."""
 
     def __init__(self, content: bytes) -> None:
         self.content, self.offset = content, 0

@@ -179,13 +179,13 @@ def _parse_frames(
 def _count_shared(report: ProblemReport, first: int, frames: int) -> None:
     """Merge problems, from the `first` on, of the camera at the file's top level: each once, before those of frames,
     with the number of frames it concerns."""
-    found = report.problems[first:]
-    shared = Counter(problem for problem in found if not problem.field.startswith("frames["))
+    new_problems = report.problems[first:]
+    shared = Counter(problem for problem in new_problems if not problem.field.startswith("frames["))
     merged = []
     for problem, count in shared.items():
         concerned = "" if frames == 1 else f", for {count} of {frames} frames"
         merged.append(replace(problem, message=problem.message + concerned))
-    report.problems[first:] = [*merged, *(problem for problem in found if problem not in shared)]
+    report.problems[first:] = [*merged, *(problem for problem in new_problems if problem not in shared)]
 
 
 def _time(node: Node) -> float:

@@ -132,8 +132,8 @@ def fit_rational(
     beyond = bent > math.hypot(max(cx, width - cx) / fl_x, max(cy, height - cy) / fl_y)
     used = slice(int(np.argmax(beyond)))
     if not beyond.any() or (np.diff(bent[used]) <= 0).any():
-        what = f"covers more than {math.degrees(MAX_ANGLE):.0f} degrees off its axis, or folds the image over"
-        raise NeecoError(f"this lens {what}; crop the images, or calibrate again")
+        problem = f"covers more than {math.degrees(MAX_ANGLE):.0f} degrees off its axis, or folds the image over"
+        raise NeecoError(f"this lens {problem}; crop the images, or calibrate again")
     radius, share = np.tan(theta[used]), bent[used] / np.tan(theta[used])
     powers = (radius[:, None] ** 2) ** np.arange(1, 4)  # [N, 3]
     weight = radius

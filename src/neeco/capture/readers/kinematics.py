@@ -190,17 +190,17 @@ def read_urdf(
                 )
     carried = {joint.child for joint in robot.joints}
     tops = [name for name in by_name if name not in carried]
-    for what, name in (("root", root), ("pose_of", pose_of)):
+    for key, name in (("root", root), ("pose_of", pose_of)):
         if name is not None and name not in by_name:
-            raise NeecoError(f"{path}: {what}: there is no link {name!r}; name one of {', '.join(by_name)}")
+            raise NeecoError(f"{path}: {key}: there is no link {name!r}; name one of {', '.join(by_name)}")
     if root is None and len(tops) != 1:
         raise NeecoError(f"{path}: one link has no parent, the root; found {', '.join(tops) or 'none'}; name `root`")
     first = tops[0] if root is None else root
     assert first is not None
     reached = [(first, None), *((joint.child, joint) for joint in _below(first, children, path))]
-    for what, defined in (("link", [link.name for link in robot.links]), ("joint", [j.name for j in robot.joints])):
+    for key, defined in (("link", [link.name for link in robot.links]), ("joint", [j.name for j in robot.joints])):
         if twice := next((name for name in defined if defined.count(name) > 1), None):
-            raise NeecoError(f"{path}: {what} {twice!r} is defined twice; rename one of them")
+            raise NeecoError(f"{path}: {key} {twice!r} is defined twice; rename one of them")
     moving = {joint.name for _, joint in reached if joint is not None and TYPES.get(joint.type) != FIXED}
     for named in names:
         if named not in moving:

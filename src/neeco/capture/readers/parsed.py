@@ -1,4 +1,4 @@
-"""Captures as far as a reader could read them, and the files that they name."""
+"""Captures as far as a reader could parse them, and the files that they name."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ NOWHERE = "put it there or correct the path"
 
 @dataclass(kw_only=True)
 class Parsed:
-    """A capture as far as it could be read.
+    """A partially parsed capture.
 
-    Frames without image, split, time or states that could be read are left out (and reported); where only the camera is
-    wrong they stay, so that the rest of them can be checked. `as_source`: it is read to be converted; then distorted
-    images (whose cameras say how) and absent ones (listed as `absent`) are no errors.
+    Frames without readable image, split, time or states are left out (and reported); those with only a wrong camera are
+    kept, so that the rest of them can be checked. `as_source`: parsed for conversion; then distorted images (with a
+    lens model) and absent ones (listed as `absent`) are no errors.
     """
 
     root: Path = field(kw_only=False)
@@ -52,7 +52,7 @@ class Parsed:
         return Node(None, self.places[0].file, field, self.places[0].report)
 
     def with_cameras(self) -> Parsed:
-        """The same without the frames whose camera is a placeholder."""
+        """Return the capture without the frames that have a placeholder camera."""
         return self.of_rows([row for row in range(len(self.frames)) if row not in self.without_camera])
 
     def of_rows(self, rows: Sequence[int]) -> Parsed:
@@ -124,9 +124,9 @@ def natural_order(name: str) -> list[tuple[int, int, str]]:
 
 
 def instants(names: Sequence[str], lenses: Sequence[Hashable]) -> list[int] | None:
-    """Rank in time of images by the numbers in their names; None where the names do not count alike.
+    """Return the rank in time of images by the numbers in their names; None if the names have different patterns.
 
-    The same name in several folders is one instant where no two folders share a lens: cameras of a rig.
+    The same name in several folders is one instant unless two folders share a lens: cameras of a rig.
     """
     parts = [PurePosixPath(name.replace("\\", "/")) for name in names]
     folders: dict[str, set[Hashable]] = {}
@@ -148,7 +148,7 @@ def relative_name(file: Path, root: Path) -> str:
 
 
 def missing_file(folder: Path, text: str) -> Fault:
-    """Return what is wrong with a path, relative to `folder`, at which there is no file, and what to do."""
+    """Return the fault of a path, relative to `folder`, without a file, and its remedy."""
     message, similar = f"no such file: {printable(text)}", similar_file(folder, text)
     if similar is None:
         return message, NOWHERE

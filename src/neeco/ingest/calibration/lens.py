@@ -60,8 +60,8 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
     if source.suffix.lower() == ".json" and not cameras:
         return _nerfstudio(source, document)
     if not cameras:
-        what = "camera_matrix: missing" if isinstance(document, dict) else "no keys"
-        raise NeecoError(f"{source}: {what}; expected {EXPECTED}")
+        problem = "camera_matrix: missing" if isinstance(document, dict) else "no keys"
+        raise NeecoError(f"{source}: {problem}; expected {EXPECTED}")
     return lens_of(source, cameras[0])
 
 

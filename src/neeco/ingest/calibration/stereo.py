@@ -191,8 +191,8 @@ def _of_ini(path: Path) -> dict[str, Any]:
             try:
                 numbers[stem] = [float(text) for text in texts]
             except ValueError:
-                what = f"{printable(', '.join(texts))} are not all numbers; save the calibration again"
-                raise NeecoError(f"{path}: [{section}] {stem}_: {what}") from None
+                problem = f"{printable(', '.join(texts))} are not all numbers; save the calibration again"
+                raise NeecoError(f"{path}: [{section}] {stem}_: {problem}") from None
             if stem in ("fc", "cc") and len(numbers[stem]) != 2:
                 raise NeecoError(f"{path}: [{section}] {stem}_x, {stem}_y: missing; save the calibration again")
         size = numbers["res"] if len(numbers["res"]) == 2 else [None, None]
@@ -200,8 +200,8 @@ def _of_ini(path: Path) -> dict[str, Any]:
         if side == "left" and (
             any(numbers["t"]) or not np.allclose(numbers["r"], np.eye(3).ravel()[: len(numbers["r"])], atol=1e-6)
         ):
-            what = "the left camera must be the origin; give the right one's from it"
-            raise NeecoError(f"{path}: [StereoLeft] R, T: {what}")
+            problem = "the left camera must be the origin; give the right one's from it"
+            raise NeecoError(f"{path}: [StereoLeft] R, T: {problem}")
     return converted | {"R": numbers["r"], "T": numbers["t"]}
 
 

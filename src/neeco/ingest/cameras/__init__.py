@@ -1,1 +1,1 @@
-"""Cameras of the chosen frames: structure from motion, or a scope that does not move, and the tissue they observe."""
+"""Cameras of the chosen frames: structure from motion, or a still scope; and the tissue they observe."""

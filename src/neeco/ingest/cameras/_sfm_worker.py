@@ -25,14 +25,14 @@ import pycolmap
 class AdjustmentSettings:
     """Settings of matching and adjustment."""
 
-    min_trials: int = 20  # of RANSAC: nearly all matches are right, COLMAP's 100 take twice as long
-    sweeps: int = 4  # over frames that have no camera yet
+    min_trials: int = 20  # RANSAC trials: nearly all matches are correct, and COLMAP's 100 take twice as long
+    sweeps: int = 4  # passes over frames without a camera
     misfit_px: float = 3.0
-    steps: tuple[int, int] = (15, 30)  # of the adjustment, before and after misfits are dropped
+    steps: tuple[int, int] = (15, 30)  # of the adjustment, before and after outliers are removed
     lens_steps: tuple[int, int] = (30, 100)
-    # up to which the cameras' equations are factorised; beyond, conjugate gradients take half the time
+    # number of cameras up to which their equations are factorised; beyond, conjugate gradients are twice as fast
     direct_images: int = 100
-    parallax_points: int = 500  # points looked at
+    parallax_points: int = 500  # number of points sampled
 
 
 SETTINGS = AdjustmentSettings()
@@ -43,8 +43,8 @@ def say(stage: str, **facts: Any) -> None:
 
 
 def extract_and_match(job: dict[str, Any], database: Path) -> None:
-    """Features of every image, matched in the pairs listed by the caller; one camera for all, its intrinsics given or
-    to be estimated."""
+    """Extract features of every image and match the listed pairs; one camera for all, its intrinsics given or to be
+    estimated."""
     say("features")
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -103,7 +103,7 @@ def pipeline_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions
 
 
 def set_focal_length(database: Path, focal: float) -> None:
-    """One focal length, px, as where every estimate begins; no distortion."""
+    """Set the initial focal length, px, of every estimate, without distortion."""
     with pycolmap.Database.open(str(database)) as opened:
         (camera,) = opened.read_all_cameras()
         camera.params = [focal, camera.width / 2, camera.height / 2, 0.0]
@@ -112,8 +112,7 @@ def set_focal_length(database: Path, focal: float) -> None:
 
 
 def map_keyframes(job: dict[str, Any], database: Path) -> None:
-    """One attempt at the keyframes: the largest model goes to the folder `model`, what is to be said of it to
-    `attempt.json`."""
+    """Map the keyframes once: writes the largest model to the folder `model`, its description to `attempt.json`."""
     folder = Path(job["model"])
     folder.mkdir()
     if job["focal"]:
@@ -165,7 +164,7 @@ def incremental_mapping(
 
 
 def global_mapping(job: dict[str, Any], database: Path, folder: Path) -> dict[int, pycolmap.Reconstruction]:
-    """All keyframes at once, rotations first (GLOMAP, Pan et al. 2024): needs no first pair."""
+    """Map all keyframes at once, rotations first (GLOMAP, Pan et al. 2024), without an initial pair."""
     options = pycolmap.GlobalPipelineOptions()
     options.image_names = job["keyframes"]
     options.num_threads = job["threads"]
@@ -183,8 +182,7 @@ def global_mapping(job: dict[str, Any], database: Path, folder: Path) -> dict[in
 def estimate_lens(
     job: dict[str, Any], database: Path, folder: Path, model: pycolmap.Reconstruction
 ) -> pycolmap.Reconstruction:
-    """Focal length and distortion by adjusting a whole model. Where it was mapped with others held, its points are
-    found again through the new lens, and it is adjusted again."""
+    """Estimate focal length and distortion by adjusting a whole model, retriangulated if mapped with a fixed lens."""
     say("estimating the lens")
     adjust(model, job, SETTINGS.lens_steps, free=True)
     if job["free_lens"]:
@@ -199,7 +197,7 @@ def estimate_lens(
 
 
 def parallax(model: pycolmap.Reconstruction) -> float:
-    """Median over points of the widest angle, degrees, between the first view of a point and its others."""
+    """Return the median over points of the largest angle, degrees, between a point's first view and its others."""
     places = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
     angles = []
     points = list(model.points3D.values())
@@ -224,9 +222,9 @@ def save_matches(job: dict[str, Any], database: Path, path: Path) -> None:
 
 
 def register_others(job: dict[str, Any], database: Path, model: pycolmap.Reconstruction) -> None:
-    """Cameras of all other frames from the points the keyframes gave: mapping them too would take ten times as long.
+    """Register all other frames to the keyframes' points: mapping them would take ten times as long.
 
-    Frames the keyframes do not reach are tried again after their neighbours have brought points of their own.
+    Frames out of the keyframes' reach are retried after their neighbours have added points.
     """
     options = pipeline_options(job)
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
@@ -251,8 +249,8 @@ def register_others(job: dict[str, Any], database: Path, model: pycolmap.Reconst
 
 
 def adjust(model: pycolmap.Reconstruction, job: dict[str, Any], steps: Sequence[int], *, free: bool = False) -> None:
-    """Bundle adjustment under a robust loss, misfits dropped, and again: highlights and edges make outliers. free: of
-    the lens, too."""
+    """Run bundle adjustment under a robust loss twice, removing outliers (highlights, edges) in between. free: of the
+    lens, too."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = free
     options.print_summary = False
@@ -328,7 +326,7 @@ def main(job_file: str) -> int:
 
 
 def end_with_parent() -> None:
-    """End this process once the one that started it has gone and so closed our stdin, however it ended."""
+    """End this process when its parent has ended in any way, which closes our stdin."""
 
     def wait() -> None:
         os.read(sys.stdin.fileno(), 1)

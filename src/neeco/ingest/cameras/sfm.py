@@ -1,5 +1,5 @@
-"""Cameras and tissue points from images alone, by pycolmap on the CPU, in a process of its own: strategies are tried in
-turn, then a result is chosen, or the reasons are given why none is good."""
+"""Cameras and tissue points from images alone, by pycolmap on the CPU in a separate process: strategies are tried in
+turn, then a result is chosen, or the reasons of failure are given."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from neeco.ingest.recording.model import MIN_FRAMES, IngestSettings
 
 @dataclass(frozen=True, kw_only=True)
 class SfmSettings:
-    """Thresholds of structure from motion: of its pairs of images, its attempts, and the reasons why it fails."""
+    """Thresholds of structure from motion: image pairs, attempts, and reasons of failure."""
 
-    fields_of_view: tuple[float, float] = (70.0, 100.0)  # degrees, across the round image: laparoscopes, wide ones
+    fields_of_view: tuple[float, float] = (70.0, 100.0)  # degrees across the round image: laparoscopes, wide-angle ones
     min_field_of_view: float = 30.0  # degrees, of an estimated lens
     max_field_of_view: float = 140.0  # degrees
-    max_distortion: float = 0.35  # share of its radius by which an estimated lens shifts the farthest pixel
-    complete_share: float = 0.9  # share of the keyframes with a camera that ends the search
-    rank_step: float = 0.05  # share of the keyframes by which one attempt outranks another whatever its error
+    max_distortion: float = 0.35  # share of its radius by which an estimated lens shifts the outermost pixel
+    complete_share: float = 0.9  # share of the keyframes with a camera at which the search ends
+    rank_step: float = 0.05  # share of the keyframes by which one attempt is preferred whatever its error
     max_error_px: float = 2.5  # mean reprojection error
     min_parallax_deg: float = 1.0  # between the views of a point
-    still_share: float = 0.02  # of the image's width, by which a still scope's features move (tissue breathes)
+    still_share: float = 0.02  # of the image width: maximum motion of a still scope's features (tissue breathes)
     homography_share: float = 0.004  # of the image's width: inlier threshold of a homography
     min_explained: float = 0.9  # share of the epipolar inliers that a homography explains without parallax
     min_matches: int = 30  # minimum number of matched features of a pair of views
     min_pairs: int = 5  # minimum number of pairs of views
     key_neighbours: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16)  # offsets of keyframes that are matched
     near_keyframes: int = 3  # keyframes on each side that another frame is matched with
-    loop_stride: int = 4  # keyframes between those that are all matched with each other: closes loops
-    large_px: int = 1280  # image size from which features are not detected at twice the size: takes four times as long
+    loop_stride: int = 4  # stride of keyframes that are all matched with each other, for loop closure
+    large_px: int = 1280  # image size above which features are not detected at double size (four times as slow)
     dense_factor: int = 3  # factor on the number of features in the attempt with more of them
     peak: float = 0.004  # minimum contrast of a feature: tissue is smooth, COLMAP's 0.0067 leaves too few
     dense_peak: float = 0.002  # minimum contrast in the attempt with more features
@@ -57,9 +57,9 @@ SETTINGS = SfmSettings()
 
 @dataclass(frozen=True)
 class Strategy:
-    """A strategy. words: its description; focal: px where the estimate begins, 0 for a given lens; free_lens: estimated
-    with each frame added, not held until the keyframes are mapped; first_angle: degrees between the first two frames;
-    several_models: begin again where a model ends; global_mapping: all frames at once; dense: from more features."""
+    """A strategy. words: its description; focal: initial px, 0 for a given lens; free_lens: estimated with every added
+    frame, not only after mapping the keyframes; first_angle: degrees between the first two frames; several_models:
+    start again where a model ends; global_mapping: all frames at once; dense: with more features."""
 
     words: str
     focal: float = 0.0
@@ -73,8 +73,8 @@ class Strategy:
 
 @dataclass(frozen=True)
 class Attempt:
-    """Result of a strategy. models: keyframes in each model, the largest first, which the rest describes; error: px;
-    parallax: median degrees between the views of a point; fault: why it is not used, in words, or empty."""
+    """Result of a strategy. models: keyframes in each model, largest first, to which the rest refers; error: px;
+    parallax: median degrees between the views of a point; fault: why it is rejected, or empty."""
 
     strategy: Strategy
     keyframes: int
@@ -94,7 +94,7 @@ class Attempt:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is gained by trying further."""
+        """Whether further attempts are unnecessary."""
         return not self.fault and self.placed >= SETTINGS.complete_share * self.keyframes
 
     def sentence(self) -> str:
@@ -109,8 +109,7 @@ class Attempt:
 
 
 def strategies(radius: float | None) -> tuple[Strategy, ...]:
-    """Return what to try, the likeliest first. radius: px from the image's middle to its farthest visible pixel; None
-    where the lens is given."""
+    """Return the strategies, likeliest first. radius: px from image centre to the farthest visible pixel, or None."""
     if radius is None:
         dense = Strategy("with more features", first_angle=3.0, several_models=True, dense=True)
         return (
@@ -136,7 +135,7 @@ def strategies(radius: float | None) -> tuple[Strategy, ...]:
 
 
 def judge(attempt: Attempt, size: tuple[int, int], least: int) -> Attempt:
-    """Return the attempt with its fault, if it has one. size: of the images; least: frames that a capture needs."""
+    """Return the attempt with its fault, if any. size: of the images; least: minimum number of frames of a capture."""
     fault = ""
     if not attempt.models:
         fault = "no first pair of frames fits"
@@ -169,14 +168,12 @@ def _lens_fault(attempt: Attempt, size: tuple[int, int]) -> str:
 
 
 def estimated_lens(focal: float, distortion: float, size: tuple[int, int]) -> Lens:
-    """A lens of one focal length px, one radial term (k1), and the principal point in the middle: more cannot be
-    estimated from a video of tissue that moves."""
+    """Return a lens of one focal length px and k1: a video of moving tissue determines no more parameters."""
     return Lens(focal, focal, size[0] / 2, size[1] / 2, (distortion, 0.0, 0.0, 0.0))
 
 
 def best_attempt(attempts: Sequence[Attempt]) -> Attempt | None:
-    """Return the attempt without a fault that places most keyframes (in steps of `rank_step`), then fits best, then
-    has most parallax; the earlier of equals. None when all have a fault."""
+    """Return the faultless attempt with most keyframes, then least error, then most parallax; None without any."""
     usable = [attempt for attempt in attempts if not attempt.fault]
 
     def rank(attempt: Attempt) -> tuple[int, float, float]:
@@ -186,10 +183,10 @@ def best_attempt(attempts: Sequence[Attempt]) -> Attempt | None:
 
 
 def motion_fault(matches: np.ndarray, width: int) -> str:
-    """Explain why there is no parallax, where the features that match between views show it; else return nothing.
+    """Explain missing parallax from matched features of views; empty if there is parallax.
 
-    matches [N, 5]: number of the pair of views, x, y, x', y' px. A homography explains all of two views from one place
-    (Hartley & Zisserman 2004, section 13.6), and of a plane.
+    matches [N, 5]: number of the pair of views, x, y, x', y' px. A homography explains all matches of two views from
+    one position (Hartley & Zisserman 2004, section 13.6), and of a plane.
     """
     moved, explained = [], []
     for pair in np.unique(matches[:, 0]):
@@ -217,10 +214,10 @@ WORKER = Path(__file__).with_name("_sfm_worker.py")
 
 
 def image_pairs(count: int, keys: Sequence[int], episodes: np.ndarray | None = None) -> list[tuple[int, int]]:
-    """Choose which of `count` images to match: keyframes `keys` with keyframes near in time, sparser farther off and in
-    loops; every other frame with the keyframes around it and the frame before.
+    """Return the pairs among `count` images to match: keyframes `keys` with keyframes close in time, sparser for larger
+    gaps and in loops; other frames with the adjacent keyframes and the previous frame.
 
-    episodes [count]: which of several recordings each is of; half of all pairs of keyframes of two of them are matched.
+    episodes [count]: which of several recordings each is of; half of all keyframe pairs of two recordings are matched.
     """
     pairs = {(keys[i], keys[i + step]) for step in SETTINGS.key_neighbours for i in range(len(keys) - step)}
     anchors = keys[:: SETTINGS.loop_stride]
@@ -267,7 +264,7 @@ class StructureFromMotion:
         self.work, self.source, self.names, self.size, self.settings = work, source, list(names), size, settings
         self.pinhole, self.masks, self.episodes = pinhole, masks, episodes
         self.attempts: list[Attempt] = []  # in the order tried
-        self.stopped = False  # the time was up before all strategies were tried
+        self.stopped = False  # the time limit was reached before all strategies were tried
         self.seconds = 0.0  # of processor time used so far
         self.job: dict[str, Any] = {
             "images": str(folder),
@@ -284,12 +281,12 @@ class StructureFromMotion:
         self.pairs = image_pairs(count, self.keys, episodes)
 
     def reconstruct(self, progress: StageProgress) -> SfmResult:
-        """Cameras and points, not yet adjusted together. Raises NeecoError when too few images get a camera."""
+        """Return cameras and points before joint adjustment. Raises NeecoError if too few images get a camera."""
         best = self._search(progress)
         return self._run(self.job | self._parameters(best.strategy) | {"task": "register"}, progress, best)
 
     def adjust(self, result: SfmResult, outliers: np.ndarray, progress: StageProgress) -> SfmResult:
-        """The same after bundle adjustment without the observations marked in `outliers` [Q]."""
+        """Return the reconstruction after bundle adjustment without the observations marked in `outliers` [Q]."""
         rows = result.observations[outliers]
         names = [self.names[index] for index in result.indices]
         drop = [(names[int(row)], int(number)) for row, number in zip(rows[:, 0], rows[:, 4], strict=True)]
@@ -310,8 +307,8 @@ class StructureFromMotion:
         return (*sentences, *([f"taken: {best.strategy.words}"] if best else []))
 
     def _search(self, progress: StageProgress) -> Attempt:
-        """Try one strategy after another until one places nearly all keyframes; the best of them. Features and matches
-        are shared. Raises NeecoError, saying what was tried, when none is of use."""
+        """Try strategies until one places nearly all keyframes; return the best. Raises NeecoError if none is
+        usable."""
         matched: set[str] = set()
         for strategy in strategies(None if self.pinhole else self._radius()):
             self.stopped = bool(self.attempts) and self.seconds > 60 * self.settings.sfm_minutes
@@ -348,11 +345,11 @@ class StructureFromMotion:
 
     @property
     def _least(self) -> int:
-        """Keyframes that a model needs, so that with the frames between them a capture has enough."""
+        """Return the number of keyframes of a model that suffices for a capture."""
         return max(3, -(-MIN_FRAMES * len(self.keys) // len(self.names)))
 
     def _radius(self) -> float:
-        """px from the image's middle to its farthest visible pixel."""
+        """Return the px from the image centre to the farthest visible pixel."""
         width, height = self.size
         if self.masks is None:
             return float(np.hypot(width, height) / 2)
@@ -360,7 +357,7 @@ class StructureFromMotion:
         return float(np.hypot(columns + 0.5 - width / 2, rows + 0.5 - height / 2).max())
 
     def _match(self, strategy: Strategy, progress: StageProgress) -> None:
-        """Features and matches of all frames, into the database that strategies like this one share."""
+        """Extract and match features of all frames, into the database shared by similar strategies."""
         pairs = [(self.names[a], self.names[b]) for a, b in self.pairs]
         features = self.settings.sfm_features
         job = {"task": "match", "pairs": pairs, "features": features, "peak": SETTINGS.peak}
@@ -372,14 +369,14 @@ class StructureFromMotion:
     def _try(self, strategy: Strategy, parameters: dict[str, Any], progress: StageProgress) -> Attempt:
         try:
             self._work(self.job | parameters | {"task": "map"}, progress)
-        except NeecoError as error:  # the others may do with less memory
+        except NeecoError as error:  # others may need less memory
             return Attempt(strategy, len(self.keys), fault=str(error).removeprefix(f"{self.source}: "))
         facts = read_json(Path(parameters["model"]) / "attempt.json")
         facts["models"] = tuple(facts["models"])
         return judge(Attempt(strategy, len(self.keys), **facts), self.size, self._least)
 
     def _failure(self, progress: StageProgress) -> str:
-        """Explain why no strategy was of use, and what to do."""
+        """Explain why no strategy succeeded, and the remedy."""
         apart = max(1, len(self.keys) // SETTINGS.motion_pairs)
         pairs = [(self.keys[i], self.keys[i + step]) for step in (2, 8) for i in range(0, len(self.keys) - step, apart)]
         names = [(self.names[a], self.names[b]) for a, b in pairs if (a, b) in set(self.pairs)]
@@ -429,7 +426,7 @@ class StructureFromMotion:
 
 
 def run_worker(job_file: Path, source: Path, progress: StageProgress) -> float:
-    """Run the worker, pass its events on, and return the processor seconds that it took; kill it when interrupted.
+    """Run the worker, forward its events, and return its processor seconds; kill it when interrupted.
 
     Raises NeecoError naming `source` when it fails.
     """

@@ -1,7 +1,7 @@
-"""A scope that stands still: how it is recognised, the tissue behind the instruments, their rough shapes, and a stereo
-scope's second camera.
+"""A still scope: its detection, the tissue behind the instruments, their rough shapes, and a stereo scope's second
+camera.
 
-The world is the scope's own frame (OpenCV axes, mm), which for a stereo scope is its left camera's.
+The world is the scope's own frame (OpenCV axes, mm), for a stereo scope its left camera's.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from neeco.ingest.recording.model import IngestSettings, Recording, VideoFile
 
 @dataclass(frozen=True, kw_only=True)
 class StillScopeSettings:
-    """Settings of the test whether a scope stands still, and of its second camera."""
+    """Settings of the detection of a still scope, and of its second camera."""
 
-    n_frames: int = 24  # frames, spread over the recording, that are compared with each other
-    n_cells: int = 20  # cells across an image, with a feature each
+    n_frames: int = 24  # compared frames, spread over the recording
+    n_cells: int = 20  # cells across an image, with one feature each
     min_texture: float = 2e-5  # minimum texture of a feature: lesser eigenvalue of its slopes' covariance, white is 1
     min_features: int = 30  # minimum number of features of an image
     in_place: float = 0.0125  # share of the image's width within which a feature is in place (tissue breathes)
-    max_return_px: float = 1.0  # maximum error of a feature that is tracked forwards and back
+    max_return_px: float = 1.0  # maximum error of a feature tracked forwards and back
     still_share: float = 0.2  # minimum share of features in place between two frames of a still scope
     still_pairs: float = 0.85  # minimum share of the pairs of frames for which this holds
     max_epipolar: float = 0.004  # maximum distance from epipolar lines, share of the image's width: 0.25 degrees
@@ -53,7 +53,7 @@ Tracked = Mapping[str, PosesAt]  # instrument -> camera_from_instrument [K, 4, 4
 
 
 def stands_still(load: Callable[[int], np.ndarray], count: int) -> bool:
-    """Return whether a scope stood still while it took `count` images: most features stay in place in other frames.
+    """Return whether a scope was still over `count` images: most features stay in place in other frames.
 
     load: one of the images, uint8 [H, W, 3].
     """
@@ -83,22 +83,21 @@ def _share_in_place(first: np.ndarray, second: np.ndarray) -> float | None:
     features = _features(first)
     if len(features) < STILL_SCOPE.min_features:
         return None
-    there, seen, _ = cv2.calcOpticalFlowPyrLK(first, second, features, features.copy(), **TRACKING)
-    back, seen_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, there.copy(), **TRACKING)
+    tracked, seen, _ = cv2.calcOpticalFlowPyrLK(first, second, features, features.copy(), **TRACKING)
+    back, seen_back, _ = cv2.calcOpticalFlowPyrLK(second, first, tracked, tracked.copy(), **TRACKING)
     returns = np.linalg.norm(back - features, axis=-1)[:, 0] < STILL_SCOPE.max_return_px
-    near = np.linalg.norm(there - features, axis=-1)[:, 0] < STILL_SCOPE.in_place * first.shape[1]
+    near = np.linalg.norm(tracked - features, axis=-1)[:, 0] < STILL_SCOPE.in_place * first.shape[1]
     return float((returns & near & (seen[:, 0] > 0) & (seen_back[:, 0] > 0)).mean())
 
 
 def _even_light(grey: np.ndarray) -> np.ndarray:
-    """Return an image uint8 [H, W] relative to its local brightness, which exposure and shadows change."""
+    """Return an image uint8 [H, W] relative to its local brightness, compensating exposure and shadows."""
     around = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), grey.shape[1] / STILL_SCOPE.n_cells)
     return np.clip(128.0 * grey / np.maximum(around, 8), 0, 255).astype(np.uint8)
 
 
 def _features(grey: np.ndarray) -> np.ndarray:
-    """The best feature float32 [K, 1, 2] px of every cell of an image uint8 [H, W] that has one. The best of the whole
-    image would be highlights, which come and go."""
+    """Return the best feature float32 [K, 1, 2] px per cell of an image uint8 [H, W]; highlights are unstable."""
     strength = cv2.cornerMinEigenVal(grey, 7)
     side = max(1, grey.shape[1] // STILL_SCOPE.n_cells)
     places = []
@@ -113,13 +112,13 @@ def _features(grey: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class StillScene:
-    """The tissue, the instruments and the remarks that a still scope's images give."""
+    """Tissue, instruments and remarks from a still scope's images."""
 
     points: np.ndarray  # [P, 3] mm, of the tissue
     colors: np.ndarray  # uint8 [P, 3]
     shapes: dict[str, RoughShape]  # by instrument
-    lags: dict[str, float]  # by instrument, s at which its poses fit what moves better (0: none)
-    how: str  # the tissue's depth was found, in words
+    lags: dict[str, float]  # by instrument, s, lag at which its poses fit motion better (0: none)
+    how: str  # source of the tissue's depth, in words
     notes: tuple[str, ...]  # one sentence each
     doubt: str  # about the second camera's calibration, in a sentence; "" without
 
@@ -186,10 +185,10 @@ def read_right_camera(
 
 
 def _pairs(right: np.ndarray, left: np.ndarray, selected: np.ndarray, one_clock: bool) -> dict[int, int]:
-    """Return the right camera's frame, by row of the `selected` frames of the left one, that was taken with it.
+    """Return the simultaneous frame of the right camera, by row of the `selected` frames of the left one.
 
-    right [R], left [V] s: times of all frames, on one clock or, of videos that begin together, each on its own; these
-    are paired by number where there are equally many. A right frame that two rows are nearest to is of the nearer one.
+    right [R], left [V] s: times of all frames, on one clock or, for videos that start together, each on its own; with
+    equal counts, these are paired by number. A right frame nearest to two rows is assigned to the nearer one.
     """
     if not one_clock and len(right) == len(left):
         return dict(enumerate(selected.tolist()))
@@ -207,18 +206,24 @@ def _pairs(right: np.ndarray, left: np.ndarray, selected: np.ndarray, one_clock:
 def still_cameras(count: int) -> SfmResult:
     """Return a reconstruction without points: all `count` cameras in one place."""
     return SfmResult(
-        indices=np.arange(count), world_from_camera=np.tile(np.eye(4), (count, 1, 1)), points=np.zeros((0, 3)),
-        colors=np.zeros((0, 3), np.uint8), errors=np.zeros(0), lengths=np.zeros(0), observations=np.zeros((0, 5)),
-        lens=None, reprojection_px=0.0,
-    )  # fmt: skip
+        indices=np.arange(count),
+        world_from_camera=np.tile(np.eye(4), (count, 1, 1)),
+        points=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
+        errors=np.zeros(0),
+        lengths=np.zeros(0),
+        observations=np.zeros((0, 5)),
+        lens=None,
+        reprojection_px=0.0,
+    )
 
 
 def look_behind(
     views: Views, tracked: Tracked, longest_lag: float, settings: IngestSettings, right: RightCamera | None
 ) -> StillScene:
-    """Find the instruments' rough shapes in the views of a still scope, and the tissue behind them.
+    """Estimate the instruments' rough shapes in the views of a still scope, and the tissue behind them.
 
-    tracked: instruments whose poses in front of it are known; longest_lag: s that their logs may be off.
+    tracked: instruments with known poses in its frame; longest_lag: maximum clock error of their logs, s.
     """
     shapes, lags = _rough_shapes(views, tracked, longest_lag, settings.shape_frames)
     poses = {name: poses_at(0.0) for name, poses_at in tracked.items()}
@@ -262,8 +267,7 @@ def look_behind(
 def _by_stereo(
     left: Background, right: Background, views: Views, other: RightCamera
 ) -> tuple[TissueSurface | None, str]:
-    """Return the surface from two cameras' backgrounds, None where they match too little or differ in size; and a doubt
-    about their calibration."""
+    """Return the surface from two backgrounds (None with too few matches), and doubts about the calibration."""
     visible = left.seen > 0 if views.visible is None else (left.seen > 0) & views.visible
     if right.colors.shape != left.colors.shape:
         return None, ""
@@ -284,8 +288,7 @@ def _by_stereo(
 def _rough_shapes(
     views: Views, tracked: Tracked, longest_lag: float, n_frames: int
 ) -> tuple[dict[str, RoughShape], dict[str, float]]:
-    """Carve the rough shape of every tracked instrument that moves in the images; return the lag of every one's poses,
-    too."""
+    """Carve every tracked instrument that moves in the images; return the shapes and the lags of all poses."""
     if not tracked:
         return {}, {}
     count, small = len(views.times), views.reduced_pinhole

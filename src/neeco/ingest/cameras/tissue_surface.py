@@ -1,8 +1,8 @@
-"""Depth of the tissue behind a still scope: from a second camera, else from the instruments before it.
+"""Depth of the tissue behind a still scope: from a second camera, else from the instruments in front of it.
 
-One camera observes no depth. With a second one it is measured by semi-global matching of the two backgrounds
-(Hirschmueller 2008). Otherwise the tissue lies behind every place where an instrument was recorded: the surface is the
-smoothest one that does. Surfaces are smooth in inverse depth, which is linear in the image for a plane.
+One camera observes no depth. A second one permits semi-global matching of the two backgrounds (Hirschmueller 2008).
+Otherwise the tissue is behind every recorded position of an instrument: the surface is the smoothest one with this
+property. Surfaces are smooth in inverse depth, which is linear in the image for a plane.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from neeco.ingest.foreground.rough_shape import RoughShape
 class SurfaceSettings:
     """Settings of the surface of tissue behind instruments."""
 
-    spacing_px: int = 3  # px, of a reduced image, between points of the tissue
-    cell_px: int = 4  # px, of a reduced image, of the grid on which surfaces are smoothed
-    stiffness: float = 30.0  # weight of bending against that of what was measured in a cell
+    spacing_px: int = 3  # px of a reduced image between tissue points
+    cell_px: int = 4  # px of a reduced image, cell size of the smoothing grid
+    stiffness: float = 30.0  # weight of bending relative to a cell's measurement
     # depth of the tissue over that of an instrument, whose rough shape lacks what opens and closes
     behind_ratio: float = 1.5
     min_inverse_ratio: float = 0.75  # of the least inverse depth at which an instrument was
-    pull_weight: float = 1e-3  # towards the instruments, in cells where the tissue may be farther
-    max_rounds: int = 30  # in which instruments behind the surface are found
-    min_depth_mm: float = 20.0  # mm from a stereo scope, where the tissue is not
-    min_matched: float = 0.2  # share of the image, for depth from stereo
-    max_features: int = 2000  # of two backgrounds, for their epipolar geometry
+    pull_weight: float = 1e-3  # towards the instruments, in cells where the tissue may be deeper
+    max_rounds: int = 30  # iterations of detecting instruments behind the surface
+    min_depth_mm: float = 20.0  # minimum distance in mm of tissue from a stereo scope
+    min_matched: float = 0.2  # minimum matched share of the image for depth from stereo
+    max_features: int = 2000  # features of both backgrounds for epipolar geometry
     min_matches: int = 30  # of these features
-    max_distance_ratio: float = 0.75  # of the best match's descriptor to the second best's (Lowe 2004)
-    max_deviation: float = 0.15  # of a matched depth from its surroundings', relative
+    max_distance_ratio: float = 0.75  # ratio of descriptor distances, best to second best match (Lowe 2004)
+    max_deviation: float = 0.15  # maximum relative deviation of a matched depth from its surroundings
 
 
 SETTINGS = SurfaceSettings()
@@ -85,17 +85,17 @@ def surface_behind(
     bound = _deepest_instrument(shapes, pinhole)
     if not bound.any():
         flat = (otherwise if deepest is None else SETTINGS.behind_ratio * deepest) * np.ones((height, width))
-        how = (
+        source = (
             f"not known and taken to be {otherwise:.0f} mm, as nothing says where an instrument was"
             if deepest is None
             else f"not known; a plane well behind the deepest recorded pose ({deepest:.0f} mm) stands for it"
         )
-        return TissueSurface(flat, how)
+        return TissueSurface(flat, source)
     inverse = _smoothest_behind(1 / (SETTINGS.behind_ratio * np.where(bound > 0, bound, np.inf)))
     depth = 1 / cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
     low, high = np.quantile(depth, (0.05, 0.95))
-    how = f"not measured: a smooth surface well behind all places of the instruments ({low:.0f} to {high:.0f} mm)"
-    return TissueSurface(depth, how)
+    source = f"not measured: a smooth surface well behind all places of the instruments ({low:.0f} to {high:.0f} mm)"
+    return TissueSurface(depth, source)
 
 
 def _deepest_instrument(shapes: Iterable[tuple[RoughShape, np.ndarray]], pinhole: Lens) -> np.ndarray:
@@ -119,9 +119,8 @@ def _deepest_instrument(shapes: Iterable[tuple[RoughShape, np.ndarray]], pinhole
 
 
 def _smoothest_behind(most: np.ndarray) -> np.ndarray:
-    """Inverse depths [rows, columns] that bend least, nowhere more than `most` (0: nothing is known there), and near
-    it, or near the least of all: cells at which the surface would come before an instrument hold it back, until none
-    does."""
+    """Return the inverse depths [rows, columns] that bend least, nowhere above `most` (0: unknown), and near it, or
+    near the minimum: cells where the surface would be in front of an instrument are constrained, until none is."""
     bound = most > 0
     wanted, weight = np.where(bound, most, most[bound].min()), np.full(most.shape, SETTINGS.pull_weight)
     for _ in range(SETTINGS.max_rounds):
@@ -135,7 +134,7 @@ def _smoothest_behind(most: np.ndarray) -> np.ndarray:
 
 
 def _smoothed(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Smooth values [rows, columns] by their `weight`: a thin plate on springs."""
+    """Return values [rows, columns] smoothed by their `weight`: a thin plate on springs."""
     rows, columns = values.shape
     across, down = (sparse.kron(sparse.eye(rows), _bend(columns)), sparse.kron(_bend(rows), sparse.eye(columns)))
     twist = sparse.kron(_step(rows), _step(columns))
@@ -194,7 +193,7 @@ def epipolar_error(
     the vertical, which only make the depth another one. pinholes, right_from_left as in `surface_from_stereo`.
     """
     sift: Any = cv2.SIFT.create(SETTINGS.max_features)
-    (points, descriptors), (others, of_right) = (
+    (points, descriptors), (right_points, of_right) = (
         sift.detectAndCompute(cv2.cvtColor(np.clip(image, 0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY), None)
         for image in (left, right)
     )
@@ -205,7 +204,7 @@ def epipolar_error(
     if len(good) < SETTINGS.min_matches:
         return None
     # OpenCV counts from the first pixel's centre
-    seen = np.array([[*points[match.queryIdx].pt, *others[match.trainIdx].pt] for match in good]) + 0.5
+    seen = np.array([[*points[match.queryIdx].pt, *right_points[match.trainIdx].pt] for match in good]) + 0.5
     rays = [
         np.column_stack(
             [(seen[:, k] - lens.cx) / lens.fl_x, (seen[:, k + 1] - lens.cy) / lens.fl_y, np.ones(len(seen))]

@@ -1,1 +1,1 @@
-"""The frames of a recording that are kept: chosen, written as images, and looked at with their cameras."""
+"""The frames of a recording that are kept: chosen, written as images, and analysed with their cameras."""

@@ -31,7 +31,7 @@ StageProgress = Callable[[str, int, int], None]  # what, how many done, of how m
 class SfmResult:
     """A reconstruction by structure from motion, in a frame and unit of its own."""
 
-    indices: np.ndarray  # [M] which of the images given got a camera
+    indices: np.ndarray  # [M] which of the given images got a camera
     world_from_camera: np.ndarray  # [M, 4, 4] OpenCV axes
     points: np.ndarray  # [P, 3]
     colors: np.ndarray  # [P, 3] uint8
@@ -57,7 +57,7 @@ class Views:
     world_from_camera: np.ndarray  # [M, 4, 4] OpenCV axes
     load: Callable[[int], np.ndarray]  # image uint8 [H, W, 3] of a row of these arrays, as `pinhole` projects it
     pinhole: Lens
-    visible: np.ndarray | None = None  # bool [H, W], the field of view, where it has a border
+    visible: np.ndarray | None = None  # bool [H, W], the field of view, if it has a border
 
     @property
     def reduced_pinhole(self) -> Lens:
@@ -71,7 +71,7 @@ class Views:
 
 
 def reduced(image: np.ndarray) -> np.ndarray:
-    """Return an image uint8 [H, W, 3] (or [H, W]) scaled down to REFERENCE_PIXELS, in which motion is looked for."""
+    """Return an image uint8 [H, W, 3] (or [H, W]) scaled down to REFERENCE_PIXELS for motion detection."""
     height, width = image.shape[:2]
     whole = Lens(width, width, width / 2, height / 2, (), (width, height)).camera(np.eye(4))
     small = whole.within(REFERENCE_PIXELS)
@@ -86,7 +86,7 @@ class ChoiceSettings:
     neighbours: int = 7  # frames on each side with which a frame's sharpness is compared
     noise: float = 0.004  # mean absolute change of the picture, in [0, 1], caused by sensor noise alone
     noise_at_a_place: float = 0.06  # the same at one place of a thumbnail
-    noise_mm: float = 0.3  # of the state, within the tracker's noise
+    noise_mm: float = 0.3  # change of the state within the tracker's noise
     noise_rad: float = 0.005  # the same, of rotation
     max_ranges: int = 3  # maximum number of ranges of frames in a note
     thumbnail_px: int = 64  # width of thumbnails
@@ -104,7 +104,7 @@ class DropReason:
     """Why a video frame is not in the capture."""
 
     why: str
-    frame_usable: bool = False  # it could have been in it as well
+    frame_usable: bool = False  # it could have been used as well
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class FrameFeatures:
 
     sharpness: np.ndarray  # [N]
     thumbnails: np.ndarray  # [N, h, w] grey in [0, 1]
-    repeats: np.ndarray  # [N] bool: the picture is that of the frame before
+    repeats: np.ndarray  # [N] bool: the picture repeats the previous one
 
 
 def frame_features(images: Iterable[np.ndarray]) -> FrameFeatures:
@@ -202,8 +202,7 @@ def _embedding(features: FrameFeatures, states: np.ndarray) -> np.ndarray:
 
 
 def _farthest_points(rows: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of `count` rows [N, D], each the farthest from those before it, first and last in time among
-    them."""
+    """Return indices of `count` rows [N, D] by farthest-point sampling, with the first and last in time."""
     chosen = [0, len(rows) - 1]
     distance = np.minimum(*(np.linalg.norm(rows - rows[i], axis=1) for i in chosen))
     while len(chosen) < count:
@@ -222,7 +221,7 @@ class ChosenImages:
     selected: np.ndarray  # [K] video frames
     dropped: Mapping[int, DropReason]  # of other video frames, why
     border: Border | None = None  # the endoscope's, in the frames as recorded
-    overlay: np.ndarray | None = None  # bool [H, W], what a console draws over the frames as recorded
+    overlay: np.ndarray | None = None  # bool [H, W], console overlay in the frames as recorded
 
     @property
     def names(self) -> list[str]:
@@ -242,14 +241,19 @@ class ChosenImages:
         assert self.lens is not None
         frames = self.selected[rows]
         return Views(
-            rows=rows, frames=frames, times=data.times[frames], episodes=data.episode_of(frames),
-            world_from_camera=world_from_camera, load=self.loader(rows), pinhole=self.lens.pinhole(self.size),
+            rows=rows,
+            frames=frames,
+            times=data.times[frames],
+            episodes=data.episode_of(frames),
+            world_from_camera=world_from_camera,
+            load=self.loader(rows),
+            pinhole=self.lens.pinhole(self.size),
             visible=self.field_of_view,
-        )  # fmt: skip
+        )
 
     @property
     def field_of_view(self) -> np.ndarray | None:
-        """Pixels within the border and beside what is drawn, bool [H, W], undistorted as the images are; None: all."""
+        """Return pixels within the border and outside the overlay, bool [H, W], undistorted; None: all."""
         visible = None if self.border is None else visible_mask(self.border, self.size)
         if self.overlay is not None:
             visible = ~self.overlay if visible is None else visible & ~self.overlay
@@ -265,8 +269,7 @@ class ChosenImages:
         return None if self.masks is None else self.masks / f"{frame:06d}.png.png"
 
     def rename(self, frame: int, name: str) -> Path:
-        """Give the image of a video frame the name that it has in the capture (until now by number: SfM orders images
-        by name); return its path."""
+        """Rename a video frame's image to its name in the capture (SfM orders images by name); return its path."""
         image = self.folder / "raw" / f"{frame:06d}.png"
         return image.rename(image.with_name(f"{name}.png"))
 
@@ -288,15 +291,15 @@ def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> Chos
         visible = visible_mask(border, size)
         data.notes.add(f"the endoscope's dark border ({1 - visible.mean():.0%} of the image) is masked")
     if (overlay := find_overlay(sampled[::2], visible)) is not None:
-        what = "text, icons or bars drawn over the video"
-        data.notes.add(f"what never moves while the scene does ({what}; {overlay.mean():.1%} of the image) is masked")
+        kinds = "text, icons or bars drawn over the video"
+        data.notes.add(f"what never moves while the scene does ({kinds}; {overlay.mean():.1%} of the image) is masked")
     images = replace(images, border=border, overlay=overlay)
     _write_masks(images)
     return images
 
 
 def undistort_images(images: ChosenImages, lens: Lens, video: VideoSource, progress: StageProgress) -> ChosenImages:
-    """Write images and masks anew, undistorted by a lens that was estimated."""
+    """Rewrite images and masks, undistorted by an estimated lens."""
     images = replace(images, lens=lens)
     _write(images, video, progress)
     _write_masks(images)
@@ -317,9 +320,9 @@ def _write_masks(images: ChosenImages) -> None:
     if visible is None or folder is None:
         return
     folder.mkdir(exist_ok=True)
-    first, *others = (folder / f"{name}.png" for name in images.names)
+    first, *later = (folder / f"{name}.png" for name in images.names)
     write_labels(first, torch.from_numpy(visible.astype(np.uint8) * 255))
-    for other in others:
+    for other in later:
         shutil.copyfile(first, other)
 
 
@@ -339,7 +342,7 @@ def read_lens(data: Episodes) -> Lens | None:
 
 def _check_pixels(video: VideoSource, lens: Lens | None, where: str, data: Episodes) -> None:
     """Note a lens whose focal lengths contradict the pixels' shape. Raises NeecoError for pixels that are not square
-    and an unknown lens: structure from motion finds one focal length."""
+    with an unknown lens: structure from motion estimates one focal length."""
     if lens is None and video.pixel_aspect != 1:
         raise NeecoError(
             f"{video.path}: its pixels are not square ({video.pixel_aspect:.3g} times as wide as high); give the "

@@ -1,4 +1,4 @@
-"""Overlays of a console: text, icons and bars over the images of a scope that moves, which never move with them."""
+"""Console overlays: text, icons and bars over the images of a moving scope, which never move with the scene."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from scipy import ndimage
 
 @dataclass(frozen=True, kw_only=True)
 class OverlaySettings:
-    """Thresholds of what is drawn over a scene. Brightness is of 255."""
+    """Thresholds for overlays. Brightness is of 255."""
 
     min_images: int = 8
-    percentiles: tuple[float, float] = (5.0, 95.0)  # of a pixel's brightness; their distance is its spread
-    min_motion: float = 12.0  # median spread from which the scene moves; else nothing tells the two apart
-    max_spread: float = 8.0  # of what is drawn: compression alone changes it
-    min_edge: float = 30.0  # step of the median image among neighbours; what moves has no sharp edges there
-    reach: int = 4  # px from such an edge, within which compression makes what is drawn waver; masks are larger by that
-    min_sharp: float = 0.6  # share of a region's surroundings that are near one; a shaft's are sharp at one end
-    min_region_px: int = 6  # of a stroke or bar
-    min_share: float = 2e-4  # of the image; less is a coincidence
-    max_share: float = 0.4  # of the image; more is a picture beside the scene, or a scene that stands still
+    percentiles: tuple[float, float] = (5.0, 95.0)  # percentiles of a pixel's brightness whose difference is its spread
+    min_motion: float = 12.0  # minimum median spread of a moving scene
+    max_spread: float = 8.0  # maximum spread of an overlay, by compression alone
+    min_edge: float = 30.0  # minimum step of the median image; moving content has no sharp edges there
+    reach: int = 4  # px of compression artefacts around such an edge, by which masks are dilated
+    min_sharp: float = 0.6  # minimum share of a region's boundary with a sharp edge; a shaft's is sharp at one end
+    min_region_px: int = 6  # minimum size of a stroke or bar
+    min_share: float = 2e-4  # of the image; smaller ones are coincidences
+    max_share: float = 0.4  # of the image; larger ones are side panels, or a still scene
 
 
 OVERLAY = OverlaySettings()

@@ -26,17 +26,17 @@ from neeco.geometry.projection import project
 
 @dataclass(frozen=True, kw_only=True)
 class TextureSettings:
-    """Measures of unrolled textures and of their comparison.
+    """Settings of unrolled textures and of their comparison.
 
-    Frames nearer than those of `near_frames` turn by less than a column, and residual shading holds the peak at 0
+    Frames closer than those of `near_frames` rotate by less than a column, and residual shading biases the peak to 0
     (gains of 0.3 to 0.6 against the truth at 1 to 3 frames, about 1 from 5 on).
     """
 
     column_rad: float = math.radians(3.0)  # spacing of columns of the unrolled texture
     max_azimuth: float = math.radians(63.0)  # maximum azimuth from the view; beyond, the surface is too oblique
     row_mm: float = 0.3  # spacing of rows
-    band: tuple[float, float] = (-0.1, 0.4)  # of the working length, from the origin: beyond it jaws move on their own
-    max_columns: int = 20  # maximum shift of two textures against each other: they still overlap by half
+    band: tuple[float, float] = (-0.1, 0.4)  # of the working length, from the origin: beyond it jaws move independently
+    max_columns: int = 20  # maximum relative shift of two textures, which then overlap by half
     max_rows: int = 4  # maximum shift along the shaft, whose end is known to 0.5 mm
     row_step: int = 2  # step of these shifts
     min_visible: float = 0.9  # minimum share of a texture in the image
@@ -44,9 +44,9 @@ class TextureSettings:
     shading_frames: float = 15.0  # standard deviation of the window over which shading is averaged
     min_score: float = 0.3  # minimum correlation of a hypothesis
     max_hypotheses: int = 3  # maximum number of hypotheses per pair
-    near_frames: tuple[int, ...] = (5, 6, 8, 10, 12, 15, 20, 30, 60)  # distances of frames always compared
-    far_frames: int = 20  # distance beyond which similar frames are compared: where a view comes back, drift ends
-    far_pairs: int = 8  # number of these for every frame
+    near_frames: tuple[int, ...] = (5, 6, 8, 10, 12, 15, 20, 30, 60)  # frame distances that are always compared
+    far_frames: int = 20  # distance beyond which similar frames are compared, to bound drift
+    far_pairs: int = 8  # number of these per frame
     block: int = 256  # number of frames compared with all others at a time
     nearest_mm: float = 1.0  # minimum depth in front of the camera
 
@@ -72,8 +72,8 @@ class Shafts:
 
     @classmethod
     def of(cls, capture: Capture, instrument: Instrument) -> Shafts:
-        """Return those of an instrument found in the video. Raises NeecoError for one that was not, or not in every
-        frame."""
+        """Return the shafts of an instrument found in the video. Raises NeecoError for another, or without poses in
+        every frame."""
         shaft_video = instrument.from_video
         if shaft_video is None:
             raise NeecoError(
@@ -108,7 +108,7 @@ class Shafts:
         return np.arctan2((x_axes * across).sum(-1), (x_axes * towards).sum(-1))
 
     def x_axes(self, rolls: np.ndarray) -> np.ndarray:
-        """The inverse of `rolls`: [F, 3] in the camera's axes."""
+        """Return the inverse of `rolls`: [F, 3] in the camera's axes."""
         towards, across = self.view_axes
         return np.cos(rolls)[:, None] * towards + np.sin(rolls)[:, None] * across
 
@@ -133,8 +133,8 @@ class Shafts:
         return np.arctan2((moved * across[1:]).sum(-1), (moved * towards[1:]).sum(-1))
 
     def project(self, points: np.ndarray, frames: np.ndarray) -> np.ndarray:
-        """Pixels [N, ..., 2] (centres at +0.5) of points [N, ..., 3] in the camera's axes of `frames` [N]; far outside
-        the image where a point is not in front of the camera."""
+        """Return pixels [N, ..., 2] (centres at +0.5) of points [N, ..., 3] in the camera's axes of `frames` [N]; far
+        outside the image for points behind the camera."""
         fx, fy, cx, cy = (value.reshape(-1, *[1] * (points.ndim - 2)) for value in self.intrinsics[frames].T)
         pixels = np.stack(project(points, fx, fy, cx, cy, nearest=SETTINGS.nearest_mm), -1)
         return np.where(points[..., 2:] < SETTINGS.nearest_mm, -1e4, pixels)
@@ -199,7 +199,7 @@ def unrolled_textures(shafts: Shafts, load: Load) -> tuple[np.ndarray, np.ndarra
 
 
 def _take_out_shading(textures: np.ndarray, visible: np.ndarray) -> None:
-    """Subtract from each texture the mean of those about it in time, in which the instrument has turned."""
+    """Subtract from each texture the temporal mean, over which the instrument has rotated."""
     frames = np.arange(len(textures))
     weights = np.exp(-0.5 * ((frames[:, None] - frames) / SETTINGS.shading_frames) ** 2) * visible
     # a frame without neighbours: the mean over the whole video
@@ -209,8 +209,8 @@ def _take_out_shading(textures: np.ndarray, visible: np.ndarray) -> None:
 
 
 def _correlations(textures: np.ndarray, rows: slice) -> np.ndarray:
-    """Normalised cross-correlation [R, F, 2 M + 1] of some textures with all of [F, A, B, C]; at [i, j, M + q] the
-    second is the first shifted by q columns, and by the number of rows within `max_rows` that fits best."""
+    """Return the normalised cross-correlation [R, F, 2 M + 1] of some textures with all of [F, A, B, C]; at [i, j, M +
+    q] for a shift by q columns, and the best shift within `max_rows` rows."""
     height, width = textures.shape[1:3]
     chosen = textures[rows]
     scores = np.full((len(chosen), len(textures), 2 * SETTINGS.max_columns + 1), -1.0, np.float32)
@@ -231,7 +231,7 @@ def _normalised(textures: np.ndarray) -> np.ndarray:
 
 
 def roll_pairs(textures: np.ndarray, visible: np.ndarray) -> RollPairs:
-    """Compare frames near in time, and every frame with the most similar ones long after it; only those `visible`."""
+    """Compare frames close in time, and every frame with the most similar distant ones; only `visible` ones."""
     blocks = [
         RollPairs(
             *(
@@ -265,8 +265,8 @@ def _chosen(best: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _peaks(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Highest local maxima of correlations [P, 2 M + 1] over the shift, at subcolumn precision: turns rad and scores
-    [P, K] of K hypotheses."""
+    """Return the highest local maxima of correlations [P, 2 M + 1] over the shift, at subcolumn precision: rotations
+    rad and scores [P, K] of K hypotheses."""
     before, middle, after = scores[:, :-2], scores[:, 1:-1], scores[:, 2:]
     is_peak = (middle >= before) & (middle > after)
     ranked = np.where(is_peak, middle, 0.0)

@@ -1,7 +1,7 @@
-"""Roll and joints of all frames at once, from texture pairs, silhouettes, smoothness and hand-posed frames.
+"""Roll and joints of all frames jointly, from texture pairs, silhouettes, smoothness and hand-posed frames.
 
 Each is a Gaussian process over the frames (Rasmussen and Williams 2006), whose posterior gives standard deviations. A
-pair of frames has several hypotheses of how the roll differs, each with a probability. They are weighed together with
+pair of frames has several hypotheses of the difference in roll, each with a probability. They are weighted jointly with
 the rolls, by expectation maximisation with deterministic annealing.
 """
 
@@ -19,18 +19,18 @@ from neeco.ingest.posing.measurements import Shapes
 
 @dataclass(frozen=True, kw_only=True)
 class AngleSettings:
-    """Thresholds and standard deviations by which roll and joints are solved."""
+    """Thresholds and standard deviations for solving roll and joints."""
 
     correlation_s: float = 0.72  # s, time scale of a hand's motion
     roll_sd: float = 0.7  # rad, standard deviation of the roll's changes over longer times
     joint_sd: float = 0.2  # rad, standard deviation of a joint's changes, beyond what silhouettes show
     mean_sd: float = 1.4  # rad, standard deviation of the mean of either
-    texture_sd_deg: float = 4.0  # standard deviation of the roll that one frame's texture shows: the axis is 0.2 mm off
+    texture_sd_deg: float = 4.0  # standard deviation of the roll from one frame's texture: the axis is off by 0.2 mm
     pair_sd_deg: float = 3.0  # standard deviation of a pair of correlation 1
     uncorrelated_sd_deg: float = 8.0  # added to that at correlation 0
-    even_score: float = 0.5  # correlation at which a hypothesis is as likely right as wrong
-    score_scale: float = 0.08  # scale of the correlation over which this likelihood changes
-    pair_weight: float = 0.01  # residual shading shifts some hundred pairs of the same two moments by the same angle
+    even_score: float = 0.5  # correlation at which a hypothesis has probability 1/2
+    score_scale: float = 0.08  # scale of the correlation in this probability
+    pair_weight: float = 0.01  # low, as residual shading biases some hundred pairs of the same two instants equally
     gain_range: tuple[float, float] = (0.4, 1.2)  # range of the gain of a turn in textures
     gain_prior: float = 0.02  # weight of the prior of that gain, which is 1
     min_gain_answers: int = 3  # minimum number of hand-posed frames from which that gain is estimated
@@ -147,8 +147,8 @@ def solve_joint(
     covariance += 0.5
     answered = covariance[np.ix_(frames, frames)] + np.eye(len(frames)) * np.radians(SETTINGS.hand_sd_deg) ** 2
     gain = np.linalg.solve(answered, covariance[frames]).T
-    left = covariance - gain @ covariance[frames]
-    return AnglePosterior(_within(center + gain @ (angles - center), limits), SETTINGS.joint_sd_scale**2 * left)
+    posterior = covariance - gain @ covariance[frames]
+    return AnglePosterior(_within(center + gain @ (angles - center), limits), SETTINGS.joint_sd_scale**2 * posterior)
 
 
 def chain_breaks(pairs: RollPairs, rolls: AnglePosterior) -> list[int]:

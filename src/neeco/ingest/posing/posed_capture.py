@@ -210,19 +210,19 @@ class SolvedPosing:
         """Answers that differ from an earlier one of the same frame; and of roll and of each joint the one that differs
         most from the others' prediction, as a wrong one makes others look wrong, too."""
         outliers = []
-        for what, solved in self.angles.items():
+        for which, solved in self.angles.items():
             worst, least = None, POSING.outlier_sd
             for position, (frame, answer) in enumerate(self.answers):
-                angle = _angle(answer, what)
+                angle = _angle(answer, which)
                 earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
-                if earlier is not None and abs(apart := half_turn(angle - _angle(earlier, what))) > POSING.outlier_deg:
-                    outliers.append(OutlierAnswer(frame, what, apart, "an earlier answer"))
+                if earlier is not None and abs(apart := half_turn(angle - _angle(earlier, which))) > POSING.outlier_deg:
+                    outliers.append(OutlierAnswer(frame, which, apart, "an earlier answer"))
                 # leaving one answer out of a Gaussian posterior
-                left = max(1 - (float(solved.deviations[frame]) / math.radians(SETTINGS.hand_sd_deg)) ** 2, 0.02)
-                apart = half_turn(angle - math.degrees(solved.values[frame])) / left
-                far = abs(apart) * math.sqrt(left) / SETTINGS.hand_sd_deg
+                share = max(1 - (float(solved.deviations[frame]) / math.radians(SETTINGS.hand_sd_deg)) ** 2, 0.02)
+                apart = half_turn(angle - math.degrees(solved.values[frame])) / share
+                far = abs(apart) * math.sqrt(share) / SETTINGS.hand_sd_deg
                 if len(self.answers) >= POSING.min_answers and abs(apart) > POSING.outlier_deg and far > least:
-                    worst, least = OutlierAnswer(frame, what, half_turn(apart), "what its neighbours say"), far
+                    worst, least = OutlierAnswer(frame, which, half_turn(apart), "what its neighbours say"), far
             outliers += [] if worst is None else [worst]
         return outliers
 

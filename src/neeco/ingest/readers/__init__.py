@@ -161,26 +161,26 @@ class RecordingFormat(ABC):
         return ()
 
     def choose(self, path: Path, wanted: str | None, *kinds: Kind, streams: Sequence[Stream] | None = None) -> Stream:
-        """Return the stream that is wanted, or the only one of these kinds. streams: all that there are. Raises
-        NeecoError listing them."""
+        """Return the requested stream, or the only one of these kinds. streams: all existing ones. Raises NeecoError
+        listing them."""
         streams = self.streams(path) if streams is None else streams
         of_kind = [stream for stream in streams if stream.kind in kinds]
         fitting = [stream for stream in of_kind if stream.problem is None]
         named = [stream for stream in streams if stream.name == wanted][:1]
         candidates = named if wanted is not None else fitting or of_kind[:1]
-        if len(candidates) == 1 and (found := candidates[0]).problem is not None:
-            raise NeecoError(f"{path}: {found.name}: {found.problem}")
+        if len(candidates) == 1 and (only := candidates[0]).problem is not None:
+            raise NeecoError(f"{path}: {only.name}: {only.problem}")
         if len(candidates) == 1 and candidates[0] in fitting:
             return candidates[0]
         listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
         sought = " or ".join(kinds)
         if wanted is None:
-            what = f"holds {len(fitting)} streams of {sought}; name one as `stream` in the recording: {listed}"
-            raise NeecoError(f"{path}: {what}")
-        what = f"holds no {printable(wanted)}"
+            problem = f"holds {len(fitting)} streams of {sought}; name one as `stream` in the recording: {listed}"
+            raise NeecoError(f"{path}: {problem}")
+        problem = f"holds no {printable(wanted)}"
         if candidates:
-            what = f"{printable(wanted)} is {candidates[0].type}, not {sought}"
-        raise NeecoError(f"{path}: stream: {what}; name one of {listed}")
+            problem = f"{printable(wanted)} is {candidates[0].type}, not {sought}"
+        raise NeecoError(f"{path}: stream: {problem}; name one of {listed}")
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         """Return poses or readings as a table. stream: the name of one, where there are several."""
@@ -264,10 +264,10 @@ def one_line(where: Path | str, problem: str, remedy: str) -> Iterator[None]:
 def compare_counts(
     file: Path, images: int, rows: int, noun: str, unlike: float = 0.0, remedy: str = "give the whole video of this log"
 ) -> tuple[str, ...]:
-    """A note where images and the rows of a log that belong to them one by one are not equally many.
+    """Return a note if images and the rows of a log that belong to them one by one differ in number.
 
-    file: of the images; noun: what a row is; unlike: share by which the numbers may differ, in addition to one. Raises
-    NeecoError, with the remedy, when they differ by more.
+    file: of the images; noun: name of a row; unlike: share by which the numbers may differ, in addition to one. Raises
+    NeecoError, with the remedy, if they differ by more.
     """
     counts = f"has {images} images for {rows} {noun}"
     if abs(images - rows) > unlike * rows + 1:
@@ -285,7 +285,7 @@ def compare_lengths(file: Path, video: VideoSource, rows: int, image_hz: float) 
 
 
 def numbers(table: Table, columns: Sequence[str]) -> np.ndarray:
-    """Return columns as numbers [R, C], NaN where a value is missing or none. Raises NeecoError when a column does not
+    """Return columns as numbers [R, C], NaN for missing or invalid ones. Raises NeecoError if a column does not
     exist."""
     return to_numbers(table.rows[:, [column_index(table, name) for name in columns]])
 

@@ -415,8 +415,8 @@ class Survey:
         stamps, received = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
         none, notes = stamps == 0, []
         if none.any():
-            what = "its headers have no times" if none.all() else f"{int(none.sum())} headers have no time"
-            notes.append(f"{what}; those of receipt are taken")
+            missing = "its headers have no times" if none.all() else f"{int(none.sum())} headers have no time"
+            notes.append(f"{missing}; those of receipt are taken")
         late = 0.0 if none.all() else float(np.median((received - stamps)[~none])) * 1e-9
         if abs(late) > LIMITS.other_clock_s:
             why = f"its headers' times are {late:.2f} s before those of receipt, on another clock"

@@ -25,13 +25,13 @@ UNITS = {
     "angle": {"rad": 1.0, "deg": 0.017453292519943295},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
 }  # kind -> unit -> its scale to mm, rad or s
-_ALIASES = {
-    "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",
-    "meter": "m", "meters": "m", "metre": "m", "metres": "m", "centimeters": "cm", "centimetres": "cm",
-    "radian": "rad", "radians": "rad", "degree": "deg", "degrees": "deg", "°": "deg",
-    "sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "millis": "ms", "milliseconds": "ms",
-    "usec": "us", "microseconds": "us", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanoseconds": "ns",
-}  # fmt: skip
+_ALIASES = dict.fromkeys(("millimeter", "millimeters", "millimetre", "millimetres"), "mm")
+_ALIASES |= dict.fromkeys(("meter", "meters", "metre", "metres"), "m")
+_ALIASES |= dict.fromkeys(("centimeters", "centimetres"), "cm")
+_ALIASES |= dict.fromkeys(("radian", "radians"), "rad") | dict.fromkeys(("degree", "degrees", "°"), "deg")
+_ALIASES |= dict.fromkeys(("sec", "secs", "second", "seconds"), "s")
+_ALIASES |= dict.fromkeys(("msec", "millis", "milliseconds"), "ms") | dict.fromkeys(("usec", "microseconds"), "us")
+_ALIASES |= dict.fromkeys(("nsec", "nsecs", "nanosec", "nanoseconds"), "ns")
 _UNIT_SUFFIX = re.compile(r"^(?P<base>.*?)(?:[\s_\-/]+|[\s_]*[\[(]\s*)(?P<unit>[a-zµ°]+)\s*[\])]?$")
 
 
@@ -155,9 +155,8 @@ def scale_of(
 
 
 # column names without their unit, in order of preference; a name also matches behind a prefix ("tool_timestamp")
-_TIMES = (
-    "header_stamp", "timestamp", "time_stamp", "stamp", "time", "t", "elapsed", "secs", "sec", "seconds", "__time",
-)  # fmt: skip
+_TIMES: tuple[str, ...] = ("header_stamp", "timestamp", "time_stamp", "stamp", "time", "t", "elapsed")
+_TIMES += ("secs", "sec", "seconds", "__time")
 _Given = Mapping[str, Sequence[str]]  # columns by what they mean
 _NOTHING: _Given = MappingProxyType({})
 _Choices = list[tuple[bool, list[str]]]  # (may all stand behind one prefix, names)
@@ -207,16 +206,16 @@ def recognise_time(header: Sequence[str]) -> RecognisedColumns:
 def recognise_pose(header: Sequence[str], named: _Given = _NOTHING) -> RecognisedColumns:
     """The columns of time, position and rotation in a log of poses, none of them for two things. named: the columns of
     those that the recording names, by meaning: these are not looked for."""
-    left = _left(header, named)
-    when = RecognisedColumns() if "time" in named else recognise_time(left)
-    left = [name for name in left if name not in (when.time or ())]
+    free = _left(header, named)
+    when = RecognisedColumns() if "time" in named else recognise_time(free)
+    free = [name for name in free if name not in (when.time or ())]
     unclear: dict[str, str] = {}
     matrix, position, rotation, form = None, None, None, None
     if "rotation" not in named:
-        matrix = _matrix(left)
-        rotation, form = _rotation(left, matrix, unclear)
+        matrix = _matrix(free)
+        rotation, form = _rotation(free, matrix, unclear)
     if "position" not in named and not (matrix and len(matrix) > 9):
-        position = _group(left, _POSITIONS, "length", "position", unclear)
+        position = _group(free, _POSITIONS, "length", "position", unclear)
     if shared := [name for name in position or () if name in (rotation or ())]:
         why = f"{', '.join(shared)} may be the position's or the quaternion's; name both under columns"
         unclear |= {"position": why, "rotation": why}
@@ -224,7 +223,7 @@ def recognise_pose(header: Sequence[str], named: _Given = _NOTHING) -> Recognise
     lower = [_plain(name) for name in header]
     ndi = {"state", "q0", "tx", "ty", "tz"} <= set(lower)
     ros = bool(position and _ROS.search(position[0].lower()))
-    states = [name for name in left if (ndi and _plain(name) == "state") or name.endswith("TransformStatus")]  # of PLUS
+    states = [name for name in free if (ndi and _plain(name) == "state") or name.endswith("TransformStatus")]  # of PLUS
     state = next(iter(states), None)
     unit = "mm" if ndi else "m" if ros else None
     return replace(
@@ -262,14 +261,14 @@ def _first_choice(plain: Mapping[str, str], choices: _Choices) -> tuple[list[str
 
 
 def recognise_value(header: Sequence[str], named: _Given = _NOTHING) -> tuple[str | None, RecognisedColumns]:
-    """Return the one column, other than the time, that can be a joint's reading; None when there are none or several.
-    named: as for `recognise_pose`."""
+    """Return the only column, besides time, that can be a joint's reading; None without one, or with several. named: as
+    for `recognise_pose`."""
     header = _left(header, named)
     when = RecognisedColumns() if "time" in named else recognise_time(header)
     counters = {"frame", "seq", "index", "header_seq", "field_header_seq", "frame_id", "header_frame_id", "state"}
-    others = [name for name in header if name and name not in (when.time or ()) and _plain(name) not in counters]
-    others = [name for name in others if not _plain(name).startswith(("field_header", "header_"))]
-    return (others[0] if len(others) == 1 else None), when
+    values = [name for name in header if name and name not in (when.time or ()) and _plain(name) not in counters]
+    values = [name for name in values if not _plain(name).startswith(("field_header", "header_"))]
+    return (values[0] if len(values) == 1 else None), when
 
 
 def joint_columns(header: Sequence[str], bodies: Mapping[str, Sequence[str]]) -> list[str]:

@@ -163,17 +163,17 @@ def _header(path: Path, text: Cells) -> tuple[list[str], int]:
     above = plain[plain < starts[0]]
     places = above[named[above]].tolist()
     if places:
-        place, others = places[-1], above[above < places[-1]].tolist()
+        place, higher = places[-1], above[above < places[-1]].tolist()
         units = [canonical_unit(cell.strip("[]() ")) for cell in text.cells[place]]
         units = [unit if any(unit in scales for scales in UNITS.values()) else "" for unit in units]
         stated = [unit for unit, cell in zip(units, text.cells[place], strict=True) if cell.strip("[]()- ")]
-        if others and others[-1] in places and sum(map(bool, stated)) > 0.5 * len(stated) > 0:  # a line of units
-            place = others.pop()
+        if higher and higher[-1] in places and sum(map(bool, stated)) > 0.5 * len(stated) > 0:  # a line of units
+            place = higher.pop()
         else:
             units = [""] * len(units)
         names = text.names(place)
-        if others:  # names of groups, where these tell columns of one name apart
-            groups = accumulate(text.cells[others[-1]].tolist(), lambda last, group: str(group or last))
+        if higher:  # names of groups, where these tell columns of one name apart
+            groups = accumulate(text.cells[higher[-1]].tolist(), lambda last, group: str(group or last))
             joined = ["_".join(filter(None, pair)) for pair in zip(groups, names, strict=False)]
             names = joined if len(set(names)) < len(set(joined)) else names
         named_units = zip(names, units, strict=False)
@@ -234,10 +234,10 @@ def _find_tools(header: Sequence[str], rows: np.ndarray) -> tuple[_Tool, ...]:
             words = [word for word in (name, port or cell, plain[start], cell) if word]
             tools.append((range(start, start + length), words))
     counts = Counter(word for _, words in tools for word in {_canonical(word) for word in words})
-    own = [[word for word in words if counts[_canonical(word)] == 1] for _, words in tools]
+    unique = [[word for word in words if counts[_canonical(word)] == 1] for _, words in tools]
     return tuple(
         _Tool((words or [f"tool {number}"])[0], columns, frozenset(map(_canonical, words)))
-        for number, ((columns, _), words) in enumerate(zip(tools, own, strict=True), 1)
+        for number, ((columns, _), words) in enumerate(zip(tools, unique, strict=True), 1)
     )
 
 

@@ -87,10 +87,11 @@ class DvrkSession(RecordingFormat):
         )
         usable = np.flatnonzero(keep[: len(video.times)])
         width, height = video.size
+        size, frames = (width if film.half is None else width // 2, height), tuple(usable.tolist())
+        notes, aspect = (*video.notes, *notes), video.pixel_aspect
         return ChosenFrames(
-            path, (width if film.half is None else width // 2, height), (*video.notes, *notes), times[usable],
-            video=video, frames=tuple(usable.tolist()), half=film.half, pixel_aspect=video.pixel_aspect,
-        )  # fmt: skip
+            path, size, notes, times[usable], video=video, frames=frames, half=film.half, pixel_aspect=aspect
+        )
 
 
 def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:

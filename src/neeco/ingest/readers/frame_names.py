@@ -48,8 +48,8 @@ class NamedFrame:
             return ""
         meanings = {name: f"the camera's, {axes.words}" for name, axes in CAMERA_FRAMES.items()}
         meanings |= {BASE: "a robot's base or a tracker"}
-        *others, last = [f"frame: {name} ({meanings[name]})" for name in self.choices]
-        return f"{self.why}; say so in the recording, under poses: {', '.join(others)}, or {last}"
+        *choices, last = [f"frame: {name} ({meanings[name]})" for name in self.choices]
+        return f"{self.why}; say so in the recording, under poses: {', '.join(choices)}, or {last}"
 
     @property
     def hints(self) -> tuple[str, ...]:
@@ -61,8 +61,8 @@ class NamedFrame:
         """The same as a line of a template."""
         if self.frame is not None:
             return ()
-        first, *others = self.choices
-        return (f"frame: {first}   # or {', '.join(others)}: {self.why}",)
+        first, *alternatives = self.choices
+        return (f"frame: {first}   # or {', '.join(alternatives)}: {self.why}",)
 
 
 def meaning_of(name: str, images: Collection[str] = (), *, dvrk: bool = False) -> NamedFrame:
@@ -120,10 +120,10 @@ def meaning_in(names: Sequence[str], *, dvrk: bool = False) -> NamedFrame | None
 
 def without_frame(name: str) -> str:
     """A name without the frame in it: `psm1` of `psm1_in_ecm`."""
-    left = name
+    remainder = name
     for pattern in (_CAMERA_IN, _BASE_IN):
-        left = pattern.sub(lambda match: "_" if match.end() < len(match.string) else "", left)
-    return name if left == name else left.strip("_") or name
+        remainder = pattern.sub(lambda match: "_" if match.end() < len(match.string) else "", remainder)
+    return name if remainder == name else remainder.strip("_") or name
 
 
 def unsaid(*, dvrk: bool = False) -> NamedFrame:

@@ -139,8 +139,8 @@ class _Series:
         if not len(inner):
             return 0.0
         chosen = inner[evenly_spaced(len(inner), SETTINGS.validated, floor=True)]
-        first, *others = (steps * self.step for steps in SETTINGS.widths)
-        widths = [0.0, first, *(width for width in others if width <= SETTINGS.max_width_s)]
+        first, *wider = (steps * self.step for steps in SETTINGS.widths)
+        widths = [0.0, first, *(width for width in wider if width <= SETTINGS.max_width_s)]
         fitted = [self.fit(self.times[chosen], width, chosen) for width in widths]
         errors = [np.linalg.norm(values - self.values[chosen], axis=1) for values in fitted]
         # outliers do not count for one width or another
@@ -210,9 +210,9 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
 
 def _lagrange(samples: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Weights [N, K] of values at samples [N, K] s in the polynomial through them, at times [N] s."""
-    others = ~np.eye(samples.shape[1], dtype=bool)
-    steps = np.where(others, samples[:, :, None] - samples[:, None], 1)
-    return np.asarray(np.where(others, (times[:, None] - samples)[:, None] / steps, 1).prod(axis=-1))
+    off_diagonal = ~np.eye(samples.shape[1], dtype=bool)
+    steps = np.where(off_diagonal, samples[:, :, None] - samples[:, None], 1)
+    return np.asarray(np.where(off_diagonal, (times[:, None] - samples)[:, None] / steps, 1).prod(axis=-1))
 
 
 def _noise(values: np.ndarray) -> float:

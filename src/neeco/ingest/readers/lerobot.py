@@ -66,10 +66,8 @@ class LeRobot(RecordingFormat):
         names, name = data.features[key].names, f"episode {episode.number}/{key}"
         times, order, _, notes = _times(data, episode)
         rows = np.column_stack([times, data.columns(episode, {key: len(names)})[key][order]])
-        return Table(
-            path, (TIME, *names), rows, np.arange(len(rows)), stream=name, record="frame", notes=notes,
-            meaning=_meaning(key, names),
-        )  # fmt: skip
+        lines, meaning = np.arange(len(rows)), _meaning(key, names)
+        return Table(path, (TIME, *names), rows, lines, stream=name, record="frame", notes=notes, meaning=meaning)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         data = self._data_set(path)
@@ -89,15 +87,15 @@ class LeRobot(RecordingFormat):
         if count > len(times):
             notes = (*notes, f"{film.name}: by timestamps, not all images have {noun}; the others are left out")
             noun, n_images = f"that the timestamps of episode {episode.number} reach", min(n_images, count)
-        notes = (*notes, *compare_counts(film, n_images, count, noun, remedy=remedy))
+        notes = (*notes, *compare_counts(film, n_images, count, noun, remedy=remedy), *video.notes)
         row = np.full(max(int(numbers[-1]) + 1, count), -1)
         row[places] = np.arange(len(times))
         usable = row[numbers] >= 0
         frames = tuple(np.flatnonzero(usable).tolist())
+        times = times[row[numbers[usable]]]
         return ChosenFrames(
-            video.path, video.size, (*notes, *video.notes), times[row[numbers[usable]]], video=video, frames=frames,
-            pixel_aspect=video.pixel_aspect,
-        )  # fmt: skip
+            video.path, video.size, notes, times, video=video, frames=frames, pixel_aspect=video.pixel_aspect
+        )
 
     def clock(self, path: Path, stream: str | None) -> str:
         match = _NAME.fullmatch(stream or "")
@@ -124,8 +122,8 @@ class LeRobot(RecordingFormat):
         ]
         if stream is None and len(data.records) > 1:
             examples = ", ".join(candidate.name for candidate in streams if candidate.kind in kinds)[:300]
-            what = f"missing, and there are {data.range_words}; name one, as in {examples}"
-            raise NeecoError(f"{data.path}: stream: {what}")
+            problem = f"missing, and there are {data.range_words}; name one, as in {examples}"
+            raise NeecoError(f"{data.path}: stream: {problem}")
         key = self.choose(data.path, wanted, *kinds, streams=streams).name.partition("/")[2]
         return data.episode(number), key
 
@@ -143,12 +141,9 @@ def _bodies(feature: Feature, stream: Stream) -> list[Stream]:
             continue
         of_body = [name for name in readings if len(bodies) == 1 or body in re.split(r"[_.\-/]", name)]
         posed = replace(plain, kind=Kind.POSES, offered=True, body=body or UNNAMED, hints=meaning.hints)
-        streams.append(
-            replace(
-                posed, columns=tuple(name for name in columns if name not in readings), asks=meaning.asks,
-                joints=tuple((_joint_name(name, body), name) for name in of_body),
-            )
-        )  # fmt: skip
+        of_poses = tuple(name for name in columns if name not in readings)
+        joints = tuple((_joint_name(name, body), name) for name in of_body)
+        streams.append(replace(posed, columns=of_poses, asks=meaning.asks, joints=joints))
     return streams or [plain]
 
 
@@ -159,8 +154,8 @@ def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.
     order = np.argsort(table["frame_index"][:, 0], kind="stable")
     frames, stamps = table["frame_index"][order, 0], table["timestamp"][order, 0]
     if len(frames) != episode.length:
-        what = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}"
-        raise NeecoError(f"{episode.data}: {what}; download the data set again")
+        problem = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}"
+        raise NeecoError(f"{episode.data}: {problem}; download the data set again")
     rows = np.arange(len(frames))
     if not np.array_equal(frames, rows):
         raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")

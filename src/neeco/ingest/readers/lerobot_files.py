@@ -134,8 +134,8 @@ class DataSet:
 
     def absent(self, episode: Episode) -> dict[str, str]:
         """Return why features of an episode cannot be read, by key: their column or their camera's file is missing."""
-        there, where = {*self.films, *parquet_names(episode.data)}, f"{episode.data}: has no column"
-        columns = [key for key in self.features if key not in there]
+        stored, where = {*self.films, *parquet_names(episode.data)}, f"{episode.data}: has no column"
+        columns = [key for key in self.features if key not in stored]
         return {key: f"{where} {printable(key)}; download the data set again" for key in columns} | {**episode.absent}
 
     def columns(self, episode: Episode, widths: Mapping[str, int]) -> dict[str, np.ndarray]:
@@ -177,11 +177,11 @@ def _described(path: Path, state: tuple[object, ...]) -> DataSet:
             version.fail(f"{printable(version.value)} is not read", "convert the data set to v2.1 or v3.0")
         if not isinstance(features.value, dict) or not features.value:
             features.fail("expected an object of features", "download it again")
-        known = {key: _feature(features.child(key), key) for key in features.value}
+        feature_of = {key: _feature(features.child(key), key) for key in features.value}
         fps = info.child("fps").number(above=0, below=1e5)
         data_path = info.child("data_path").text("correct it")
         chunks_size = info.child("chunks_size").integer(1) if info.has("chunks_size") else 1000
-    films = [key for key, feature in known.items() if feature.dtype == "video"]
+    films = [key for key, feature in feature_of.items() if feature.dtype == "video"]
     records = _records_3(path, films) if match[2] is not None else _records_2(path)
     if not records:
         raise NeecoError(f"{path}: holds no episode; download the data set again, with all of meta")
@@ -189,7 +189,7 @@ def _described(path: Path, state: tuple[object, ...]) -> DataSet:
         path=path,
         version=2 if match[2] is None else 3,
         fps=fps,
-        features=known,
+        features=feature_of,
         data_path=data_path,
         video_path=str(info.child("video_path").value or ""),
         chunks_size=chunks_size,
@@ -220,8 +220,8 @@ def _records_3(path: Path, films: Sequence[str]) -> dict[int, Record]:
     of_films = [f"videos/{key}/{name}" for key in films for name in FILM_COLUMNS]
     records: dict[int, Record] = {}
     for file in visible_entries(path / EPISODES_3, "chunk-*/*.parquet"):
-        there = parquet_names(require_inside(file, _boundary(path)))
-        names = [*columns, *(name for name in of_films if name in there)]
+        stored = parquet_names(require_inside(file, _boundary(path)))
+        names = [*columns, *(name for name in of_films if name in stored)]
         table = read_columns(file, dict.fromkeys(names, 1))
         for row, values in enumerate(np.concatenate([table[name] for name in names], 1).tolist()):
             record = dict(zip(names, values, strict=True))
@@ -242,8 +242,8 @@ def parquet_names(path: Path) -> list[str]:
 
 
 def read_columns(path: Path, widths: Mapping[str, int], episode: int | None = None) -> dict[str, np.ndarray]:
-    """Return columns of numbers, or of lists of them, as float64 [R, C], NaN of what is null, only of the rows of an
-    episode where one is given. widths: how many numbers a row of each has. Raises NeecoError."""
+    """Return columns of numbers, or of lists of them, as float64 [R, C], NaN for null; only the rows of an episode, if
+    given. widths: numbers per row of each. Raises NeecoError."""
     import pyarrow.dataset
 
     file = _fragment(path)

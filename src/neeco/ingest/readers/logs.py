@@ -99,11 +99,10 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     if frame != named.BASE and source.frame is None and table.meaning is not None:
         rows.repairs.append(f"poses are stated in {table.meaning.why}")
     positions, quats = in_opencv(frame, positions[order], quats)
-    return PoseLog(
-        table.path, source.clock, times, positions, quats, gaps=gaps, notes=rows.notes(), image_hz=table.image_hz,
-        frame=named.BASE if frame == named.BASE else named.CAMERA,
-        stated_in=table.stated_in if source.frame is None else None,
-    )  # fmt: skip
+    stated_in = table.stated_in if source.frame is None else None
+    frame = named.BASE if frame == named.BASE else named.CAMERA
+    log = PoseLog(table.path, source.clock, times, positions, quats, frame=frame, stated_in=stated_in)
+    return replace(log, gaps=gaps, notes=rows.notes(), image_hz=table.image_hz)
 
 
 def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -144,8 +143,8 @@ def _frame_names(table: Table) -> list[str]:
 
 
 def _frame_of(table: Table, source: PoseColumns) -> str:
-    """Return the frame of poses that the recording states, else the file. Raises NeecoError where neither does, or they
-    contradict each other."""
+    """Return the frame of poses stated by the recording, else by the file. Raises NeecoError if neither states one, or
+    they contradict each other."""
     if source.frame is None:
         if table.meaning is not None and table.frame is None:
             raise NeecoError(f"{table.where}: frame: {table.meaning.question}")
@@ -224,8 +223,8 @@ def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tu
     if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
         rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
     quats, good = to_quaternions(form, turns, source.euler_convention, angle)
-    what = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
-    rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {what}; name the right columns")
+    expected = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
+    rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {expected}; name the right columns")
     distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
     if distance > SETTINGS.max_distance_mm:
         raise NeecoError(
@@ -305,8 +304,8 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     values = numbers(table, (count_name, angle_name))
     if np.isnan(values).any():
         row, slot = np.argwhere(np.isnan(values))[0].tolist()
-        what = f"{(count_name, angle_name)[slot]}: a number is missing"
-        raise NeecoError(f"{path}: line {table.lines[row]}: {what}; repair or remove the line")
+        problem = f"{(count_name, angle_name)[slot]}: a number is missing"
+        raise NeecoError(f"{path}: line {table.lines[row]}: {problem}; repair or remove the line")
     order = np.argsort(values[:, 0], kind="stable")
     counts, angles, lines = values[order, 0], values[order, 1] * named.UNITS["angle"][unit], table.lines[order]
     turning = (np.diff(counts) <= 0) | (np.diff(angles) * np.sign(angles[-1] - angles[0]) <= 0)
@@ -334,8 +333,8 @@ def _calibrated(rows: Rows, name: str, readings: np.ndarray, path: Path, angle_u
     clamped = (excess > 0) & ~outside
     if clamped.any():
         by = f"{low:g} to {high:g}, by at most {excess[clamped].max():g}"
-        what = f"{counted(int(clamped.sum()), 'row')} with {name} just outside the table {path.name} ({by})"
-        rows.repairs.append(f"{what}: read as its end ({rows.table.list_rows(rows.table.lines[clamped])})")
+        clamped_rows = f"{counted(int(clamped.sum()), 'row')} with {name} just outside the table {path.name} ({by})"
+        rows.repairs.append(f"{clamped_rows}: read as its end ({rows.table.list_rows(rows.table.lines[clamped])})")
     reason = f"{name} lies far outside the calibration table {path.name}"
     rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
     return np.asarray(values)

@@ -35,9 +35,8 @@ GOOD = "ok"
 _ENDS = re.compile(r"(\w+?)To([A-Z0-9]\w*)")
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w{1,200})")
 _UCHAR = ("uchar", "unsigned char", "uint8", "uint8_t", "met_uchar")
-_META_READ = {
-    "ElementType": _UCHAR, "BinaryData": ("", "true"), "HeaderSize": ("", "0"), "CompressedData": ("", "true", "false"),
-}  # fmt: skip
+_META_READ = {"ElementType": _UCHAR, "BinaryData": ("", "true"), "HeaderSize": ("", "0")}
+_META_READ |= {"CompressedData": ("", "true", "false")}
 _SKIPS = dict.fromkeys(("line skip", "lineskip", "byte skip", "byteskip"), ("", "0"))
 _NRRD_READ = {"type": _UCHAR, "encoding": ("raw", "gzip", "gz"), **_SKIPS}  # the values of fields that can be read
 
@@ -143,15 +142,15 @@ class FrameSequence:
 
 @read_once
 def read_sequence(path: Path) -> FrameSequence:
-    """Read the header of a sequence. Raises NeecoError where it is none, is damaged, or says what the file does not
-    hold."""
+    """Read the header of a sequence. Raises NeecoError if it is none, is damaged, or promises more than the file
+    holds."""
     require_content(path)
     is_nrrd = path.suffix.lower() in NRRD
     with one_line(path, "cannot read", "correct the path"), open_file(path, "a sequence") as stream:
         plain, frames, start = _read_header(path, stream, is_nrrd)
     if not frames:
-        what = "holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence"
-        raise NeecoError(f"{path}: {what}; give one, or another file")
+        problem = "holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence"
+        raise NeecoError(f"{path}: {problem}; give one, or another file")
     sizes = _integers(path, plain, "sizes" if is_nrrd else "DimSize")
     usual = "" if is_nrrd else " ".join(["domain"] * (len(sizes) - 1) + ["list"])
     size, count, channels = _dimensions(path, sizes, plain.get("kinds", usual).lower().split())
@@ -168,8 +167,8 @@ def read_sequence(path: Path) -> FrameSequence:
     if name.upper() != "LOCAL":
         file, start = path.parent / name, 0
         if Path(name).name != name or not file.is_file():
-            what = f"{printable(name)} is no file next to {path.name}"
-            raise NeecoError(f"{path}: {what}; put there what was written with it")
+            problem = f"{printable(name)} is no file next to {path.name}"
+            raise NeecoError(f"{path}: {problem}; put there what was written with it")
     packed = plain.get("encoding", "raw").lower() != "raw" or plain.get("compresseddata", "").lower() == "true"
     sequence = FrameSequence(
         path=path, size=size, count=count, channels=channels, fields=frames, data=(file, start), packed=packed
@@ -295,8 +294,8 @@ class PlusSequence(RecordingFormat):
     def read(self, path: Path, stream: str | None = None) -> Table:
         sequence = read_sequence(path)
         if not sequence.transforms:
-            what = "holds no transforms (Seq_Frame0000_StylusToTrackerTransform)"
-            raise NeecoError(f"{path}: {what}; name a log of poses")
+            problem = "holds no transforms (Seq_Frame0000_StylusToTrackerTransform)"
+            raise NeecoError(f"{path}: {problem}; name a log of poses")
         wanted = None if stream is None else stream.removesuffix(TRANSFORM)
         name = self.choose(path, wanted, Kind.POSES).name
         statuses, texts = sequence.statuses(name), sequence.fields[name + TRANSFORM]
@@ -307,10 +306,8 @@ class PlusSequence(RecordingFormat):
             if frame in sequence.times and len(words) == len(HEADER) - 1:
                 row[:-1] = [repr(sequence.times[frame]), *words]
             row[-1] = statuses[frame]
-        return Table(
-            path, (*HEADER, name + TRANSFORM + STATUS), rows, np.array(sorted(texts), np.int64), stream=name,
-            record="frame", stated_in=stated_in, meaning=meaning,
-        )  # fmt: skip
+        header, lines = (*HEADER, name + TRANSFORM + STATUS), np.array(sorted(texts), np.int64)
+        return Table(path, header, rows, lines, stream=name, record="frame", stated_in=stated_in, meaning=meaning)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         sequence = read_sequence(path)

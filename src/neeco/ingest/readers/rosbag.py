@@ -100,8 +100,8 @@ class RosBag(RecordingFormat):
             topic = _info_topic(stream)
             camera = _camera(survey, topic, stream or "")
             if camera is None:
-                what = f"{topic}: is not calibrated" if topic in survey.lenses else f"holds no {topic or 'camera_info'}"
-                raise NeecoError(f"{path}: {what}; give a calibration of both cameras as stereo.calibration")
+                why = f"{topic}: is not calibrated" if topic in survey.lenses else f"holds no {topic or 'camera_info'}"
+                raise NeecoError(f"{path}: {why}; give a calibration of both cameras as stereo.calibration")
             cameras.append(camera)
         return from_projections(*cameras)
 
@@ -141,8 +141,8 @@ def _pose_stream(survey: Survey, name: str, meanings: Mapping[str, NamedFrame], 
     frame, bases = ", ".join(sorted(log.frames)) or "no named frame", ""
     hints = meaning.hints or (f"poses are stated in {frame}",)
     if name in arms and _body(name) == DVRK_CAMERA:
-        others = (topic for topic in arms if topic != name and meanings[topic].frame not in CAMERA_FRAMES)
-        of_arms = {base for topic in others for base in survey.poses[topic].frames}
+        rest = (topic for topic in arms if topic != name and meanings[topic].frame not in CAMERA_FRAMES)
+        of_arms = {base for topic in rest for base in survey.poses[topic].frames}
         if of_arms - log.frames:  # these would not register them
             offered, bases = False, f", the arms' in {', '.join(sorted(of_arms))}"
     elif name in arms:
@@ -224,10 +224,10 @@ def _chained(survey: Survey, stream: str) -> Table:
     quats[known_rows] = Rotation.from_matrix(frame_from_child[known_rows, :3, :3]).as_quat()
     rows = np.column_stack([seconds, frame_from_child[:, :3, 3], quats])
     meaning = meaning_of(frame, _image_frames(survey), dvrk=of_dvrk(child))
+    lines = np.arange(1, len(rows) + 1)
     return Table(
-        survey.path, CHAIN_HEADER, rows, np.arange(1, len(rows) + 1), stream=stream, record="message",
-        stated_in=frame, meaning=meaning,
-    )  # fmt: skip
+        survey.path, CHAIN_HEADER, rows, lines, stream=stream, record="message", stated_in=frame, meaning=meaning
+    )
 
 
 def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str], list[str]]:
@@ -240,8 +240,8 @@ def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str]
             parents = sorted(survey.poses[key].frames)
             if len(parents) > 1 or chain[-1] in chain[:-1]:
                 several = f"has several parents ({', '.join(parents[:4])})"
-                what = several if len(parents) > 1 else "is its own parent"
-                raise NeecoError(f"{where}: {chain[-1]} {what}; name another, or record the transforms anew")
+                fault = several if len(parents) > 1 else "is its own parent"
+                raise NeecoError(f"{where}: {chain[-1]} {fault}; name another, or record the transforms anew")
             chain.append(parents[0])
         chains.append(chain)
     ups, downs = chains

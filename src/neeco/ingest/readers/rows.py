@@ -93,26 +93,26 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, recognised: Recog
     table, names, rate = rows.table, source.time or recognised.time, source.rate_hz
     if names is None and rate is not None:
         if headers := _headers(table, range(len(table.rows))):
-            what = f"line {headers[0]} repeats the header, and its rows have no times"
-            raise NeecoError(f"{table.where}: {what}; keep those of one run in a file")
+            problem = f"line {headers[0]} repeats the header, and its rows have no times"
+            raise NeecoError(f"{table.where}: {problem}; keep those of one run in a file")
         return np.arange(len(table.rows)) / rate
     if names is None:
-        what = "no column of times found; name it as columns.time (or add t_s), or say rate_hz"
-        raise NeecoError(f"{table.where}: header: {what} where its rows come at a fixed rate")
+        problem = "no column of times found; name it as columns.time (or add t_s), or say rate_hz"
+        raise NeecoError(f"{table.where}: header: {problem} where its rows come at a fixed rate")
     cells, meaning = read_cells(rows, names), named.recognise_time(names)
     if rate is not None and (len(names) == 2 or meaning.time_unit or named.split_unit(names[0], "time")[1]):
-        what = f"{', '.join(names)} holds times and counts no frames"
+        problem = f"{', '.join(names)} holds times and counts no frames"
         raise NeecoError(
-            f"{table.where}: rate_hz: {what}; leave rate_hz out, or name the column that counts as columns.time"
+            f"{table.where}: rate_hz: {problem}; leave rate_hz out, or name the column that counts as columns.time"
         )
     if len(names) == 2:
         return cells[:, 0] + cells[:, 1] * 1e-9
     if rate is not None:
         return cells[:, 0] / rate
     if meaning.counts_frames:
-        what = "counts frames, and nothing says how many a second; say rate_hz in the recording"
+        problem = "counts frames, and nothing says how many a second; say rate_hz in the recording"
         raise NeecoError(
-            f"{table.where}: {names[0]}: {what} (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
+            f"{table.where}: {names[0]}: {problem} (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
         )
     return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, meaning.time_unit, "")
 
@@ -124,18 +124,18 @@ def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
     lacking, unreadable = dict[int, str](), dict[int, str]()  # the first such cell of each row, in words
     for row, slot in np.argwhere(np.isnan(values) & rows.keep[:, None]).tolist():
         cell = str(table.rows[row, column_index(table, names[slot])])
-        for found in (lacking, unreadable) if not _is_readable(cell) else (lacking,):
-            found.setdefault(row, f"{names[slot]} is {printable(cell, 24)}, not a number")
+        for faults in (lacking, unreadable) if not _is_readable(cell) else (lacking,):
+            faults.setdefault(row, f"{names[slot]} is {printable(cell, 24)}, not a number")
     rows.drop(list(lacking), f"values are missing, first: {next(iter(lacking.values()), '')}")
     too_many = len(unreadable) > max(3, SETTINGS.max_unreadable * (len(unreadable) + rows.keep.sum()))
     if too_many or (lacking and not rows.keep.any()):
         row, first = next(iter((unreadable if too_many else lacking).items()))
-        what = f"{table.where}: {table.record} {table.lines[row]}: {first}"
+        problem = f"{table.where}: {table.record} {table.lines[row]}: {first}"
         if too_many:
             similar = f"{len(unreadable)} of {counted(len(table.rows), 'row')} like it"
-            raise NeecoError(f"{what} ({similar}); name other columns or repair the file")
-        what = f"{what}, and no row has values of {', '.join(names)}"
-        raise NeecoError(f"{what}; name other columns or another file in the recording")
+            raise NeecoError(f"{problem} ({similar}); name other columns or repair the file")
+        problem = f"{problem}, and no row has values of {', '.join(names)}"
+        raise NeecoError(f"{problem}; name other columns or another file in the recording")
     return values
 
 
@@ -148,8 +148,8 @@ def _is_readable(cell: str) -> bool:
 
 
 def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
-    """Drop the rows of a tracker that repeats its last pose [R, 7] after it lost its tool: exactly the same pose for
-    long, and a jump at an end. What comes to rest slows down before."""
+    """Drop the rows of a tracker that repeats its last pose [R, 7] after losing its tool: identical poses for long, and
+    a jump at an end. A tool that comes to rest decelerates before."""
     used = np.flatnonzero(rows.keep)
     steps = np.linalg.norm(np.diff(poses[used, :3], axis=0), axis=1)
     if not (steps > 0).any():
@@ -165,8 +165,8 @@ def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
 
 
 def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left, and where
-    time begins anew. rate_hz: of a column that counts frames."""
+    """Return increasing times [T] and the rows [T] that they come from. Raises NeecoError if too few remain, or if time
+    restarts. rate_hz: of a column that counts frames."""
     table, usable = rows.table, np.flatnonzero(rows.keep)
     times = _continued(rows, times, usable, rate_hz)
     order = usable[np.argsort(times[usable], kind="stable")]
@@ -192,8 +192,8 @@ def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tup
 
 
 def restarts(times: np.ndarray) -> tuple[float, list[int]]:
-    """Return the usual step of times [T], and after which of them time begins anew: a step back by far more than it,
-    which no single time out of its place explains."""
+    """Return the usual step of times [T], and the rows after which time restarts: a backward step far larger than it
+    that no single misplaced time explains."""
     steps = np.diff(times)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
     far = np.flatnonzero(steps < -SETTINGS.restart_steps * usual).tolist()
@@ -202,8 +202,8 @@ def restarts(times: np.ndarray) -> tuple[float, list[int]]:
 
 
 def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float | None) -> np.ndarray:
-    """Return times [R] that go on where a counter, or the time of day, begins anew. Raises NeecoError where time does
-    for another reason: one step back by far more than a usual step, between rows in order."""
+    """Return times [R] that continue after a counter, or the time of day, wraps around. Raises NeecoError for other
+    restarts: one backward step far larger than the usual step, between rows in order."""
     table, taken = rows.table, times[usable]
     usual, places = restarts(taken)
     units = [1.0, 1e-3, 1e-6, 1e-9, *([] if rate_hz is None else [1 / rate_hz])]

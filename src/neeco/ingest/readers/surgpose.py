@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -71,10 +72,8 @@ class SurgPose(RecordingFormat):
             header = ("t_s", *JOINT_NAMES[: values.shape[1]])
         rows = np.column_stack([frames / FRAMES_PER_SECOND, values])
         stated_in = f"{chosen.name}_base" if chosen.kind == Kind.POSES else None
-        return Table(
-            path, header, rows, frames, stream=chosen.name, record="frame", stated_in=stated_in,
-            image_hz=FRAMES_PER_SECOND,
-        )  # fmt: skip
+        table = Table(path, header, rows, frames, stream=chosen.name, record="frame", stated_in=stated_in)
+        return replace(table, image_hz=FRAMES_PER_SECOND)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         return open_video(path / self.choose(path, stream, Kind.IMAGES).name)
@@ -93,8 +92,8 @@ class SurgPose(RecordingFormat):
 
 def _videos(path: Path) -> list[str]:
     """Videos, the left one in usual light first."""
-    found = [file.relative_to(path).as_posix() for file in visible_entries(path, "**/*_video.mp4")]
-    return sorted(found, key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
+    videos = [file.relative_to(path).as_posix() for file in visible_entries(path, "**/*_video.mp4")]
+    return sorted(videos, key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
 
 
 def _read(path: Path) -> tuple[_ByArm, _ByArm]:

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -135,8 +135,8 @@ def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarr
     missing = int(places[-1]) + 1 - len(files)
     if missing:
         first = files[int(np.flatnonzero(steps != step)[0])].name
-        what = f"{missing} images are missing by their numbers (first after {first})"
-        notes.append(f"{folder.name}: {what}; a gap in time")
+        gap = f"{missing} images are missing by their numbers (first after {first})"
+        notes.append(f"{folder.name}: {gap}; a gap in time")
     return places
 
 
@@ -233,8 +233,8 @@ class _Scan:
                 raise NeecoError(f"{self.path}: holds no video stream; give the recording's video")
             # what players show as a file's cover is a video stream, too
             films = [film for film in container.streams.video if not film.disposition & Disposition.attached_pic]
-            stream, *others = films or container.streams.video
-            self.others = tuple(f"{film.width}x{film.height}" for film in others)
+            stream, *unused = films or container.streams.video
+            self.others = tuple(f"{film.width}x{film.height}" for film in unused)
             aspect = float(stream.sample_aspect_ratio or 1)
             self.pixel_aspect = 1.0 if abs(aspect - 1) < SETTINGS.square else aspect
             stream.thread_type = self.threads
@@ -317,26 +317,27 @@ class _Scan:
             if fps is None:
                 notes.append(f"its frames have no times; taken as {stated:g} a second")
             times = np.array(order) / stated
-        return _Video(
-            self.path, self.size, tuple(f"{self.path.name}: {note}" for note in notes), times, stamps=tuple(order),
-            numbered=numbered, threads=self.threads, part=self.part, own_fps=own_rate, pixel_aspect=self.pixel_aspect,
-            buffered=tuple(self.buffered) if len(self.buffered) == len(self.stamps) else (),
-        )  # fmt: skip
+        notes = [f"{self.path.name}: {note}" for note in notes]
+        buffered = tuple(self.buffered) if len(self.buffered) == len(self.stamps) else ()
+        video = _Video(
+            self.path, self.size, tuple(notes), times, stamps=tuple(order), numbered=numbered, threads=self.threads
+        )
+        return replace(video, part=self.part, own_fps=own_rate, pixel_aspect=self.pixel_aspect, buffered=buffered)
 
     def _notes(self, stamps: list[int]) -> list[str]:
         notes, read = [], len(self.stamps)
         if self.failure or self.corrupt:
-            what = f"{self.failure or 'corrupt frames'}; {read} frames could be read, the others are left out"
-            notes.append(f"is damaged: {what}")
+            damage = f"{self.failure or 'corrupt frames'}; {read} frames could be read, the others are left out"
+            notes.append(f"is damaged: {damage}")
         elif self.promised > max(read, self.packets) and self.part is None:
             # unless frames reach the end that the file states: those missing are decoded and not shown (edit list)
             step = float(np.median(np.diff(sorted(stamps)))) if len(stamps) > 1 else 0.0
             if self.end is None or not self.time_base or not stamps or max(stamps) + 1.5 * step < self.end:
                 notes.append(f"ends early: {read} of {self.promised} frames are there")
         if self.others:
-            others = f"the first is read (others: {', '.join(self.others)})"
+            which = f"the first is read (others: {', '.join(self.others)})"
             remedy = "copy another into a file of its own: ffmpeg -map 0:v:1 -c copy"
-            notes.append(f"holds {1 + len(self.others)} video streams; {others}; {remedy}")
+            notes.append(f"holds {1 + len(self.others)} video streams; {which}; {remedy}")
         if self.pixel_aspect != 1:
             shape = f"are not square ({self.pixel_aspect:.3g} times as wide as high); its frames are used as stored"
             notes.append(f"its pixels {shape}, so fl_x / fl_y is {1 / self.pixel_aspect:.3g}")
@@ -368,17 +369,17 @@ def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[
     columns = [[Path(str(cell)).name for cell in table.rows[:, index]] for index in range(len(table.header))]
     names = next((cells for cells in columns if sum(cell in by_name for cell in cells) > 0.5 * len(cells)), None)
     if names is not None:
-        there = np.array([cell in by_name for cell in names])
-        absent = np.flatnonzero(~there)
+        in_folder = np.array([cell in by_name for cell in names])
+        absent = np.flatnonzero(~in_folder)
         if not _are_few(len(absent), len(names)):
-            what = f"{names[absent[0]]!r} is not in {folder.name} ({len(absent)} of {len(names)} like it)"
-            raise NeecoError(f"{table_path}: line {lines[absent[0]]}: {what}; correct the names")
+            problem = f"{names[absent[0]]!r} is not in {folder.name} ({len(absent)} of {len(names)} like it)"
+            raise NeecoError(f"{table_path}: line {lines[absent[0]]}: {problem}; correct the names")
         notes += _left_out(folder, "are listed and not there", [folder / names[row] for row in absent])
-        files, times, lines = [by_name[name] for name in names if name in by_name], times[there], lines[there]
+        files, times, lines = [by_name[name] for name in names if name in by_name], times[in_folder], lines[in_folder]
     if len(times) != len(files):
         raise NeecoError(f"{table_path}: has {len(times)} times for {len(files)} images; add a column of names")
     wrong = ~(np.diff(times, prepend=-np.inf) > 0)  # NaN compares false
     if wrong.any():
-        what = f"line {lines[wrong][0]}: {column}: expected a time after the one before"
-        raise NeecoError(f"{table_path}: {what}; keep the rows of one run, in order")
+        problem = f"line {lines[wrong][0]}: {column}: expected a time after the one before"
+        raise NeecoError(f"{table_path}: {problem}; keep the rows of one run, in order")
     return files, times

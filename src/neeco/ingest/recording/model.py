@@ -141,8 +141,8 @@ class InstrumentLogs(StatedBases):
         return self.poses is not None or self.from_video is not None
 
     def completed(self, file: Path | None, stated: StatedBases, shared: Sequence[str]) -> InstrumentLogs:
-        """Return it with the clocks and the base that nothing states. file: of the images; stated: the base of all
-        instruments that state none; shared: joints that several have."""
+        """Return a copy with default clocks and base. file: of the images; stated: the base of all instruments that
+        state none; shared: joints that several have."""
         poses = None if self.poses is None else with_clock(self.poses, TRACKER_CLOCK, file)
         joints = {
             joint: with_clock(log, f"{self.name}.{joint}" if joint in shared else joint, file, poses)
@@ -150,15 +150,13 @@ class InstrumentLogs(StatedBases):
         }
         roll = None if self.roll is None else with_clock(self.roll, "roll", file, poses)
         bases = StatedBases() if poses is None or poses.frame in CAMERA_FRAMES else self if self.base else stated
-        return replace(
-            self, poses=poses, joints=joints, roll=roll, camera_from_base=bases.camera_from_base,
-            world_from_base=bases.world_from_base,
-        )  # fmt: skip
+        logs = replace(self, poses=poses, joints=joints, roll=roll)
+        return replace(logs, camera_from_base=bases.camera_from_base, world_from_base=bases.world_from_base)
 
 
 def with_clock(log: Log, own: str, file: Path | None, poses: PoseColumns | None = None) -> Log:
-    """Return a log with its clock, where nothing states one: that of the poses or the images (`file`) in whose file it
-    is, else its own."""
+    """Return a log with its clock; by default that of the poses or the images (`file`) in the same file, else its
+    own."""
     theirs = poses.clock if poses is not None and log.path == poses.path else VIDEO_CLOCK if log.path == file else own
     return replace(log, clock=log.clock or theirs)
 
@@ -339,7 +337,7 @@ class Recording(RecordingKeys):
         return *calibration, file
 
     def read_lens(self) -> tuple[Lens | None, str]:
-        """Return the lens given, else that which the images' file states (None: to be estimated), and its source.
+        """Return the given lens, else the one stated by the images' file (None: to be estimated), and its source.
         Raises NeecoError."""
         if self.intrinsics is None and self.stereo is not None:
             left, _, _, file = self.read_stereo()

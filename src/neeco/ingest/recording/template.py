@@ -134,8 +134,8 @@ class _FolderFiles:
     episodes: str | None = None
 
     def leave_out(self, what: str, why: NeecoError | str = "", path: Path | None = None, images: bool = False) -> None:
-        """List something as not used. why: what is wrong with it, where anything is, in a message that may begin with
-        the file; images: may they be in it?"""
+        """List something as unused. why: its fault, if any, in a message that may begin with the file; images: whether
+        it may contain images."""
         name = what.rpartition(": ")[2]
         reason = str(why).removeprefix(f"{path}: ").removeprefix(f"{name}: ")
         reason = reason if path is None else reason.replace(str(path), path.name)
@@ -407,7 +407,7 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     if log.stream is not None and log.stream.columns is not None:  # others are recognised again when read
         stated = (("position", columns.position), (columns.form, columns.rotation))
         lines += ["columns:", *(f"  {key}: [{', '.join(map(_scalar, names))}]" for key, names in stated if names)]
-    lines += [f"# columns: {what} is not clear: {why}" for what, why in columns.unclear.items()]
+    lines += [f"# columns: {meaning} is not clear: {why}" for meaning, why in columns.unclear.items()]
     return lines + _unit_lines(columns, {"length": of_length})
 
 

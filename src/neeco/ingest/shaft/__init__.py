@@ -1,1 +1,1 @@
-"""Instruments that nothing tracked: the axis of a shaft of known diameter, found in the video."""
+"""Untracked instruments: the axis of a shaft of known diameter, estimated from the video."""

@@ -1,8 +1,8 @@
-"""The axis of a shaft of known diameter from its two edges: of one image in closed form, of all images together.
+"""The axis of a shaft of known diameter from its two edges: per image in closed form, then jointly for all images.
 
-In one image the edges are the planes through the camera that touch the cylinder. They give its axis and its depth, but
-neither its place along the axis nor its roll. All images together are solved under two priors: a hand moves smoothly,
-and where there is a trocar, the axis keeps passing one point.
+In one image the edges define the planes through the camera tangent to the cylinder. They determine its axis and depth,
+but neither the position along the axis nor the roll. All images are solved jointly under two priors: a hand moves
+smoothly, and with a trocar, the axis passes through one point.
 """
 
 from __future__ import annotations
@@ -19,52 +19,52 @@ from neeco.geometry.lines import places_nearest_to_rays, robust_nearest_point, u
 
 @dataclass(frozen=True, kw_only=True)
 class AxisSettings:
-    """Standard deviations of what is known of a shaft and its cameras, and how all axes are solved."""
+    """Standard deviations of shaft and cameras, and settings of the joint solution."""
 
-    turn_acceleration: float = 3.0  # rad/s^2, standard deviation of a hand's turns
-    move_acceleration: float = 300.0  # mm/s^2, of its motion
-    play_mm: float = 2.0  # standard deviation of the distance from axis to fixed trocar; camera errors add to it
-    min_trocar_scale_mm: float = 0.3  # minimum scale of the robust loss that finds the trocar
-    inset_px: float = 0.2  # standard deviation of a common inward shift of all edges
-    scale_drift: float = 0.05  # standard deviation of the cameras' scale, by their own drift
+    turn_acceleration: float = 3.0  # rad/s^2, standard deviation of a hand's rotational acceleration
+    move_acceleration: float = 300.0  # mm/s^2, of its translational acceleration
+    play_mm: float = 2.0  # standard deviation of the distance from axis to trocar, excluding camera errors
+    min_trocar_scale_mm: float = 0.3  # minimum scale of the robust loss for estimating the trocar
+    inset_px: float = 0.2  # standard deviation of a common inward bias of all edges
+    scale_drift: float = 0.05  # standard deviation of the cameras' scale due to drift
     scale_prior: float = 0.5  # standard deviation of the prior on the logarithm of the cameras' scale
     edge_loss_sd: float = 2.0  # scale of the Cauchy loss on edges, standard deviations
     max_steps: int = 30  # maximum Levenberg-Marquardt steps
     tolerance: float = 1e-4  # minimum share of the cost by which a step must reduce it
     damping: float = 1e-3  # initial damping
     epsilon: float = 1e-5  # step of numerical derivatives, rad and mm
-    min_slope: float = 1e-6  # minimum absolute derivative; less is rounding
+    min_slope: float = 1e-6  # minimum absolute derivative; smaller ones are rounding errors
 
 
 SETTINGS = AxisSettings()
 
-LOCAL = 4  # parameters of an axis: two turns (rad), two shifts across (mm)
+LOCAL = 4  # parameters of an axis: two rotations (rad), two shifts across (mm)
 
 Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy, px
 
 
 @dataclass(frozen=True, eq=False)
 class ShaftEdges:
-    """Places on both edges of the shaft in every frame: pixels [F, 2, M, 2] and their standard deviations across the
-    edge [F, 2, M] px, infinite where there is none."""
+    """Points on both edges of the shaft in every frame: pixels [F, 2, M, 2] and their standard deviations across the
+    edge [F, 2, M] px, infinite if absent."""
 
     pixels: np.ndarray
     deviations: np.ndarray
 
     @property
     def observed(self) -> np.ndarray:
-        """Frames [F] bool with places on both edges."""
+        """Frames [F] bool with points on both edges."""
         return np.asarray(np.isfinite(self.deviations).any(2).all(1))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShaftAxes:
-    """The shaft's axis in every frame, in the camera's frame: a point [F, 3] mm on it and its direction [F, 3] towards
-    the tip.
+    """The shaft's axis in every frame, in the camera's frame: a point [F, 3] mm and the direction [F, 3] towards the
+    tip.
 
-    covariance [F, 4, 4] of turns (rad) and shifts (mm) along `across_axes` of the directions; trocar [3] mm in the
-    world: the point that all pass, or None; inset: px by which all edges are detected too far inside; scale: mm per
-    unit of the cameras' positions, and scale_sd of its logarithm (None: it was given).
+    covariance [F, 4, 4] of rotations (rad) and shifts (mm) along `across_axes` of the directions; trocar [3] mm in the
+    world, through which all axes pass, or None; inset: px by which all edges are detected too far inside; scale: mm per
+    unit of the cameras' positions, and scale_sd of its logarithm (None: given).
     """
 
     points: np.ndarray
@@ -77,8 +77,8 @@ class ShaftAxes:
 
 
 def contour_normals(points: np.ndarray, directions: np.ndarray, radius: float) -> np.ndarray:
-    """Unit normals [..., 2, 3] of the two planes through the camera that touch cylinders with axes through points
-    [..., 3] along unit directions [..., 3]. They point inwards: the axis is at +radius of both."""
+    """Return unit normals [..., 2, 3] of the two planes through the camera tangent to cylinders with axes through
+    points [..., 3] along unit directions [..., 3]. They point inwards: the axis is at +radius of both."""
     foot = points - (points * directions).sum(-1, keepdims=True) * directions
     distance = np.linalg.norm(foot, axis=-1, keepdims=True)
     towards = foot / distance
@@ -89,8 +89,8 @@ def contour_normals(points: np.ndarray, directions: np.ndarray, radius: float) -
 
 
 def image_lines(normals: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
-    """Lines [..., 3] in which planes through the camera, with normals [..., 3], meet the image: the first two numbers
-    are a unit normal, the product with (x, y, 1) the signed distance in px."""
+    """Return the image lines [..., 3] of planes through the camera with normals [..., 3]: the first two numbers are a
+    unit normal, the product with (x, y, 1) is the signed distance in px."""
     fx, fy, cx, cy = intrinsics
     a, b = normals[..., 0] / fx, normals[..., 1] / fy
     lines = np.stack([a, b, normals[..., 2] - a * cx - b * cy], -1)
@@ -100,8 +100,8 @@ def image_lines(normals: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
 def axis_between(
     lines: np.ndarray, inside: np.ndarray, along: np.ndarray, radius: float, intrinsics: Intrinsics
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The axis whose edges are two image lines [2, 3]: the point on it nearest to the pixel `inside` [2], between them,
-    and its direction, which goes along [2] in the image. NaN where the lines are one."""
+    """Return the axis with two image lines [2, 3] as edges: the point on it nearest to the pixel `inside` [2] between
+    them, and its direction, along [2] in the image. NaN for identical lines."""
     fx, fy, cx, cy = intrinsics
     ray = unit(np.array([(inside[0] - cx) / fx, (inside[1] - cy) / fy, 1.0]))
     normals = unit(np.stack([lines[:, 0] * fx, lines[:, 1] * fy, lines[:, 0] * cx + lines[:, 1] * cy + lines[:, 2]], 1))
@@ -119,23 +119,21 @@ def axis_between(
 
 
 def across_axes(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across unit directions [F, 3], and across each other: in the image first, then towards the
-    camera (of its frame)."""
+    """Return two orthogonal unit vectors across unit directions [F, 3]: one in the image, one towards the camera."""
     first = unit(np.cross(directions, np.array([0.0, 0.0, 1.0])) + 1e-9 * np.array([1.0, 0.0, 0.0]))
     return first, np.cross(directions, first)
 
 
 def edge_distances(axes: ShaftAxes, edges: ShaftEdges, radius: float, intrinsics: Intrinsics) -> np.ndarray:
-    """Distances [F, 2, M] px of the edges' places from the contours of the axes, inside positive."""
+    """Return distances [F, 2, M] px of the edge points from the contours of the axes, positive inside."""
     lines = image_lines(contour_normals(axes.points, axes.directions, radius), intrinsics)  # [F, 2, 3]
     return np.asarray(np.einsum("fsmi,fsi->fsm", edges.pixels, lines[..., :2]) + lines[..., 2:])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShaftVideo:
-    """Data of all frames: world_from_camera [F, 4, 4], in units of which one is `ShaftAxes.scale` mm; times [F] s;
-    episodes [F]: motion is smooth within each; radius mm; trocar: is there a fixed one; scaled: is that unit mm, so
-    that the scale is 1."""
+    """Data of all frames: world_from_camera [F, 4, 4], in units of `ShaftAxes.scale` mm; times [F] s; episodes [F],
+    within which motion is smooth; radius mm; trocar: whether it is fixed; scaled: whether the scale is 1."""
 
     world_from_camera: np.ndarray
     times: np.ndarray
@@ -146,15 +144,15 @@ class ShaftVideo:
     scaled: bool
 
     def world_lines(self, axes: ShaftAxes) -> tuple[np.ndarray, np.ndarray]:
-        """Points [F, 3] mm and directions [F, 3] of the axes in the world."""
+        """Return points [F, 3] mm and directions [F, 3] of the axes in the world."""
         rotations = self.world_from_camera[:, :3, :3]
         points = np.einsum("fij,fj->fi", rotations, axes.points) + axes.scale * self.world_from_camera[:, :3, 3]
         return points, np.einsum("fij,fj->fi", rotations, axes.directions)
 
 
 def solve_axes(video: ShaftVideo, start: ShaftAxes, edges: ShaftEdges, *, covariance: bool = False) -> ShaftAxes:
-    """Solve the axes of all frames together, from `start`: they fit the edges, move as smoothly as a hand does, and
-    pass the trocar. covariance: whether to compute it."""
+    """Solve the axes of all frames jointly from `start`, fitting the edges, smoothness of motion and the trocar.
+    covariance: whether to compute it."""
     axes = start
     if video.trocar and axes.trocar is None:
         points, directions = (item[edges.observed] for item in video.world_lines(axes))
@@ -173,8 +171,8 @@ def solve_axes(video: ShaftVideo, start: ShaftAxes, edges: ShaftEdges, *, covari
 
 @dataclass(frozen=True, eq=False)
 class _AxesProblem:
-    """Residuals of all axes, in standard deviations, by LOCAL parameters of every frame and those that frames share:
-    the trocar [3], the inset, the scale's logarithm."""
+    """Residuals of all axes, in standard deviations, by LOCAL parameters of every frame and shared ones: trocar [3],
+    inset, logarithm of the scale."""
 
     video: ShaftVideo
     edges: ShaftEdges
@@ -210,7 +208,7 @@ class _AxesProblem:
         return np.concatenate([part.ravel() for part in parts])
 
     def move(self, axes: ShaftAxes, step: np.ndarray) -> ShaftAxes:
-        """The axes after a step [P] of all parameters."""
+        """Return the axes after a step [P] of all parameters."""
         count = len(axes.points)
         a, b, c, d = step[: LOCAL * count].reshape(-1, LOCAL).T[..., None]
         first, second = across_axes(axes.directions)
@@ -229,8 +227,8 @@ class _AxesProblem:
         )
 
     def jacobian(self, axes: ShaftAxes, base: np.ndarray) -> sparse.csr_matrix:
-        """[R, P] by finite differences. A residual depends on one frame and its neighbours, so every third frame is
-        moved at once."""
+        """Return [R, P] by finite differences. A residual depends on one frame and its neighbours, so every third frame
+        is moved at once."""
         count, steps = len(axes.points), []
         frames, middle = np.arange(count), self.middle
         per_frame = [np.repeat(frames, self.edges.deviations[0].size), np.tile(np.repeat(middle, 3), 2)]
@@ -253,18 +251,18 @@ class _AxesProblem:
         return sparse.csr_matrix((values, (rows, columns)), shape=(len(base), LOCAL * count + self.shared))
 
     def cost(self, axes: ShaftAxes) -> float:
-        """Half the sum of squares; a Cauchy loss on the edges."""
+        """Return half the sum of squares; with a Cauchy loss on the edges."""
         return self._cost(self.residuals(axes))
 
     def _cost(self, residuals: np.ndarray) -> float:
-        edges, others = np.split(residuals, [self.edges.deviations.size])
+        edges, prior_residuals = np.split(residuals, [self.edges.deviations.size])
         return float(
             0.5 * SETTINGS.edge_loss_sd**2 * np.log1p((edges / SETTINGS.edge_loss_sd) ** 2).sum()
-            + 0.5 * (others**2).sum()
+            + 0.5 * (prior_residuals**2).sum()
         )
 
     def linearise(self, axes: ShaftAxes) -> Linearisation[ShaftAxes]:
-        """Normal equations under the robust weights of the edges."""
+        """Return the normal equations under the robust weights of the edges."""
         base = self.residuals(axes)
         slopes = self.jacobian(axes, base)
         weights = 1 / (1 + (base / SETTINGS.edge_loss_sd) ** 2)
@@ -273,7 +271,7 @@ class _AxesProblem:
         return Linearisation(slopes.T @ weighted, weighted.T @ base, self._cost(base), self.cost)
 
     def with_covariance(self, axes: ShaftAxes) -> ShaftAxes:
-        """The axes with the covariance of each, and of the scale, at the minimum."""
+        """Return the axes with the covariance of each, and of the scale, at the minimum."""
         information = sparse.csc_matrix(self.linearise(axes).information)
         solver = splu((information + sparse.diags(1e-12 * information.diagonal() + 1e-12)).tocsc())
         size, blocks = information.shape[0], []

@@ -1,8 +1,8 @@
 """The two edges of a shaft in an image: roughly from its mask, then at subpixel precision from its shading.
 
-On a dark limb next to a shadow no threshold finds the edge: under a lamp at the lens, the limb of a cylinder fades as
-its surface turns away. So the profile across an edge is fitted as a whole: a cylinder's shading, blurred as the lens
-blurs, against tissue that may darken towards it. The edge lies where that fits best.
+A threshold cannot detect the edge of a dark limb next to a shadow: with a lamp at the lens, the limb of a cylinder
+fades as its surface turns away. So the profile across an edge is fitted as a whole: a cylinder's shading, blurred by
+the lens, against tissue that may darken towards it. The edge is at the best fit.
 """
 
 from __future__ import annotations
@@ -21,46 +21,46 @@ from neeco.ingest.shaft.axis import Intrinsics, ShaftAxes, ShaftEdges, axis_betw
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeSettings:
-    """Settings of how a shaft's edges, and the end between them, are detected."""
+    """Settings of the detection of a shaft's edges, and of its end."""
 
     # from masks
-    strip_width: int = 160  # px of the strip along the shaft that a mask is resampled to
+    strip_width: int = 160  # px, width of the strip along the shaft to which a mask is resampled
     strip_length: int = 720  # px, the same along the shaft
-    ransac_samples: int = 200  # of two places each
-    inlier_px: float = 1.2  # distance from their line
-    max_slope: float = 0.35  # of an edge against the middle of the mask
-    min_length_px: int = 12  # of shaft, for an edge to be detected
-    head_margin_px: float = 2.0  # before its end, from which the edges count
-    places: int = 12  # on an edge
+    ransac_samples: int = 200  # samples of two points
+    inlier_px: float = 1.2  # distance from the line of an inlier
+    max_slope: float = 0.35  # of an edge relative to the mask's centre line
+    min_length_px: int = 12  # minimum visible length of the shaft
+    head_margin_px: float = 2.0  # margin at the distal end that is ignored
+    places: int = 12  # points per edge
     outline_sd_px: float = 0.7  # standard deviation of a mask's edge as a whole
     # from shading
-    block_px: int = 5  # along the shaft, of one place
-    reach_px: float = 3.0  # about the prediction in which an edge is searched for
-    step_px: float = 0.1  # of that search
-    inside_px: float = 9.0  # to the inner side that is fitted
-    outside_px: float = 6.0  # to the outer side
-    max_radius_share: float = 0.6  # that is fitted: the middle has reflections
+    block_px: int = 5  # length of shaft per point
+    reach_px: float = 3.0  # search range about the predicted edge
+    step_px: float = 0.1  # step of the search
+    inside_px: float = 9.0  # fitted range inside
+    outside_px: float = 6.0  # fitted range outside
+    max_radius_share: float = 0.6  # maximum fitted share of the radius, excluding reflections in the middle
     sample_px: float = 0.25  # spacing of samples of images
     fine_px: float = 0.05  # spacing of samples of models
-    blurs: tuple[float, ...] = (0.5, 0.7, 0.9, 1.2)  # standard deviations px of lenses
+    blurs: tuple[float, ...] = (0.5, 0.7, 0.9, 1.2)  # candidate standard deviations of the lens's blur, px
     common_sd_px: float = 0.15  # of an edge as a whole, in addition to its noise
-    min_misfit: float = 1.0  # sum of squares of a profile, from noise alone
-    max_places: int = 60  # along an edge
-    max_diameters: int = 30  # behind the shaft's end, up to which it is searched for
-    margin_radii: float = 0.4  # behind the shaft's end, from which on it is searched for
+    min_misfit: float = 1.0  # minimum sum of squares of a profile, due to noise
+    max_places: int = 60  # points per edge
+    max_diameters: int = 30  # search range behind the shaft's end
+    margin_radii: float = 0.4  # margin behind the shaft's end
     # Where a shaft ends and the wrist begins their colours differ, and neither is known. But what enters at the image's
     # border is shaft in most images that show much of the instrument, and what lies near the tip is not.
-    shaft_share: float = 0.3  # of a long mask's length from the border, at first
-    head_share: float = 0.3  # of its length from the tip, at first
-    long_share: float = 0.5  # of the images, those with the longest masks, from which the colours are learned first
-    border_px: float = 2.0  # from the mask's or the image's ends, within which a tip or an end does not count
+    shaft_share: float = 0.3  # share of a long mask's length at the border that is initially shaft
+    head_share: float = 0.3  # share at the tip that is initially head
+    long_share: float = 0.5  # share of the images (longest masks) from which colours are initially learned
+    border_px: float = 2.0  # margin at the mask's or image's ends
     n_rounds: int = 4
-    end_margin_px: float = 3.0  # about the end found, that belongs to neither colour
-    max_odds: float = 3.0  # absolute logarithm, of one place
+    end_margin_px: float = 3.0  # margin about the estimated end, excluded from both colours
+    max_odds: float = 3.0  # absolute logarithm, per point
     dark: float = 12.0  # of 255, added before logarithms
     # logarithms: red of green, green of blue, lightness
     tint_ranges: tuple[tuple[float, float], ...] = ((-0.5, 0.9), (-0.3, 0.5), (2.4, 5.6))
-    min_contrast: float = 0.5  # difference of the mean odds of shaft and head
+    min_contrast: float = 0.5  # minimum difference of the mean odds of shaft and head
 
 
 EDGE = EdgeSettings()
@@ -72,9 +72,9 @@ def outline_edges(
     masks: np.ndarray, ends: np.ndarray, directions: np.ndarray, radius: float, intrinsics: Intrinsics
 ) -> tuple[ShaftAxes, ShaftEdges, np.ndarray]:
     """Fit the shaft of each mask [F, h, w], between two lines through its outline up to its `ends` [F, 2] px, about
-    which it goes along `directions` [F, 2].
+    `directions` [F, 2].
 
-    Returns the axes, each from its own image, their points where the shaft ends; places on both edges; and which frames
+    Returns the axes, each from its own image, with points at the shaft's end; points on both edges; and which frames
     have them [F].
     """
     random = np.random.default_rng(0)
@@ -148,7 +148,7 @@ def _outline(mask: np.ndarray, point: np.ndarray, direction: np.ndarray) -> tupl
 
 
 def _line(x: np.ndarray, y: np.ndarray, weights: np.ndarray, random: np.random.Generator) -> tuple[float, float] | None:
-    """Slope and offset of the line through most of the places x, y [N] px, by weight (RANSAC); None: there is none."""
+    """Return slope and offset of the line through most points x, y [N] px, by weight (RANSAC); or None."""
     if len(x) < 6:
         return None
     pairs = random.integers(0, len(x), (EDGE.ransac_samples, 2))
@@ -249,8 +249,8 @@ def _visible(
 def _edge(
     light: np.ndarray, ends: np.ndarray, line: np.ndarray, radius_px: float, blur: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places [N, 2] px of an edge near an image line, next to the stretch of the axis between `ends` [2, 2] px; their
-    standard deviations [N] px and mean squared misfits [N]."""
+    """Return points [N, 2] px of an edge near an image line, along the axis between `ends` [2, 2] px; their standard
+    deviations [N] px and mean squared misfits [N]."""
     length = int(np.linalg.norm(ends[1] - ends[0]))
     middle = ends[0] + (np.arange(length) / max(length, 1))[:, None] * (ends[1] - ends[0])
     foot = middle - (middle @ line[:2] + line[2])[:, None] * line[:2]
@@ -288,12 +288,12 @@ def _edge(
 
 
 def _offsets() -> np.ndarray:
-    """Offsets [U] px across an edge, outwards, at which images are sampled."""
+    """Return offsets [U] px across an edge, outwards, at which images are sampled."""
     return np.arange(-EDGE.inside_px, EDGE.outside_px + EDGE.sample_px / 2, EDGE.sample_px)
 
 
 def _candidates() -> np.ndarray:
-    """Offsets [E] px at which an edge may lie."""
+    """Return candidate offsets [E] px of an edge."""
     return np.arange(-EDGE.reach_px, EDGE.reach_px + EDGE.step_px / 2, EDGE.step_px)
 
 
@@ -378,7 +378,7 @@ def shaft_ends(images: np.ndarray, masks: np.ndarray, points: np.ndarray, direct
             bins = np.floor(along - first).astype(int)
             count = np.bincount(bins)
             mean = np.bincount(bins, odds[tints]) / np.maximum(count, 1)
-            # the end that explains the colours of all places best
+            # maximum likelihood of the colours of all points
             gained = np.concatenate([[0.0], np.cumsum(mean)])
             best = int(gained.argmax())
             ends[frame] = first + best

@@ -1,5 +1,5 @@
-"""Poses of a rigid instrument from its masks, the cameras and its shaft's diameter, all but its roll; then used as if a
-tracker had logged them."""
+"""Poses of a rigid instrument from its masks, the cameras and its shaft's diameter, without roll; then used like logged
+poses."""
 
 from __future__ import annotations
 
@@ -30,42 +30,42 @@ from neeco.ingest.timing.episodes import Episodes
 
 @dataclass(frozen=True, kw_only=True)
 class ShaftSearchSettings:
-    """Thresholds of instruments found in a video."""
+    """Thresholds for instruments found in a video."""
 
-    # what is asked of a recording
+    # requirements
     min_diameters: float = 2.0  # minimum length of visible shaft
     min_share: float = 0.6  # minimum share of the frames that show as much
-    min_frames_share: float = 0.3  # minimum share of the frames that show an instrument with a shaft at all
+    min_frames_share: float = 0.3  # minimum share of the frames with a visible shaft
     min_frames: int = 10  # minimum number of these frames
-    second_area: float = 0.3  # share of the largest piece's area, from which another is a second instrument
-    second_share: float = 0.4  # share of the frames with such a piece, above which there are two instruments
-    # first guess
-    default_head_diameters: float = 5.0  # length of a head, where nothing measures it
-    depth_range: tuple[float, float] = (0.4, 2.5)  # depths of an accepted shaft, ratio to the median depth
-    window_frames: int = 5  # frames on each side with which a frame's direction is compared
-    max_jump: float = 0.35  # maximum difference from their median direction; more is an outlier
-    head_range: tuple[float, float] = (0.4, 1.6)  # of the median length of the head, for an end to be accepted
-    closed_quantile: float = 0.8  # quantile of the heads' lengths that is taken for that of closed jaws
+    second_area: float = 0.3  # ratio of areas above which another component is a second instrument
+    second_share: float = 0.4  # share of frames with such a component, above which there are two instruments
+    # initial estimate
+    default_head_diameters: float = 5.0  # length of the head, if it cannot be measured
+    depth_range: tuple[float, float] = (0.4, 2.5)  # range of depths of an accepted shaft, relative to the median depth
+    window_frames: int = 5  # frames on each side for the median direction
+    max_jump: float = 0.35  # maximum difference from the median direction; larger ones are outliers
+    head_range: tuple[float, float] = (0.4, 1.6)  # range of accepted head lengths, relative to the median
+    closed_quantile: float = 0.8  # quantile of the heads' lengths that corresponds to closed jaws
     # solution
-    min_rounds: int = 3  # minimum rounds of detecting edges and solving for axes
+    min_rounds: int = 3  # minimum rounds of edge detection and axis solution
     max_rounds: int = 7  # maximum rounds
-    straight_px: float = 0.15  # maximum deviation of the median edge from a straight line
-    bin_radii: float = 0.5  # length of shaft, radii, in which the edges are averaged
+    straight_px: float = 0.15  # maximum curvature of the median edge
+    bin_radii: float = 0.5  # length in radii over which edges are averaged
     bins: int = 16  # number of these lengths
-    min_filled: float = 0.3  # minimum number of places on edges in one of them, per frame
-    blur_frames: int = 40  # number of frames from which the lens's blur is estimated
+    min_filled: float = 0.3  # minimum number of points per frame in one of them
+    blur_frames: int = 40  # number of frames for estimating the lens's blur
     trocar_rms_mm: float = 3.0  # maximum RMS distance between the axes and a fixed trocar
     end_px: float = 1.5  # standard deviation of the shaft's end, from its colour
     tip_mm: float = 3.0  # standard deviation of the shaft's end, from the tip
-    sliding_mm_s: float = 20.0  # standard deviation of motion along the axis, where the end is not observed
+    sliding_mm_s: float = 20.0  # standard deviation of motion along the axis while the end is not observed
     # maximum standard deviations of a frame that is kept: degrees of tilt, mm across the shaft, mm along it
     max_sd: tuple[float, float, float] = (4.0, 2.5, 4.0)
     # ratio of the tissue's depth to that of the instrument's deepest place, where nothing measures it
     tissue_behind: float = 1.15
-    max_scale_sd: float = 0.15  # maximum standard deviation of its logarithm at which the cameras' scale is known
+    max_scale_sd: float = 0.15  # maximum standard deviation of its logarithm for a known scale of the cameras
     roll_deg: float = 5.0  # standard deviation of a logged roll
     reading_deg: float = 1.0  # standard deviation of a logged joint
-    margin_px: int = 7  # margin about moving pixels, in which features are not the tissue's
+    margin_px: int = 7  # margin around moving pixels, in which features are not tissue
 
 
 SHAFT = ShaftSearchSettings()
@@ -320,10 +320,10 @@ def _narrower_part(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges) -> flo
     places, values = [], []
     for frame in range(len(axes.points)):
         for side in range(2):
-            there = np.isfinite(edges.deviations[frame, side])
-            behind = -axis_coordinates(axes, frame, edges.pixels[frame, side, there], video.intrinsics)
+            observed = np.isfinite(edges.deviations[frame, side])
+            behind = -axis_coordinates(axes, frame, edges.pixels[frame, side, observed], video.intrinsics)
             places.append(behind / (SHAFT.bin_radii * video.radius))
-            values.append(missed[frame, side, there])
+            values.append(missed[frame, side, observed])
     place, value = np.concatenate(places).astype(int), np.concatenate(values)
     numbers = [number for number in range(SHAFT.bins) if (place == number).sum() >= SHAFT.min_filled * len(axes.points)]
     medians = np.array([np.median(value[place == number]) for number in numbers])

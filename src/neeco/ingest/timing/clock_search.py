@@ -1,7 +1,7 @@
-"""The clock of a log against the video's, from motion that both recorded.
+"""Synchronisation of a log's clock with the video's, from motion in both.
 
-t_log = seconds + rate * t_video. Speeds are compared by correlation at all offsets and, because a stated frame rate may
-be wrong, at all rates from 1 / `max_rate` to `max_rate`. Where rate 1 fits as well, it is taken.
+t_log = seconds + rate * t_video. Speeds are cross-correlated at all offsets and, as a stated frame rate may be wrong,
+at all rates from 1 / `max_rate` to `max_rate`. Rate 1 is preferred if it fits as well.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ class ClockSearchSettings:
     """Steps and thresholds of the search for a clock."""
 
     step_s: float = 0.02  # step of the coarse search for an offset
-    stride_s: float = 0.12  # over which a turn is measured: long enough to stand out of the tracker's noise
+    stride_s: float = 0.12  # interval over which rotation is measured, long enough to exceed the tracker's noise
     min_correlation: float = 0.6  # minimum correlation of two recordings of one motion
-    same_motion: float = 0.95  # correlation from which on no other rate is tried: ends are off by less than a lobe
-    min_lead: float = 0.08  # minimum lead of the best offset over every other, apart from its own lobe
-    lobe_s: float = 0.3  # half the width of a peak of the correlation
-    min_significance: float = 3.5  # sd of chance: the best of tens of offsets in a short recording has 3
+    same_motion: float = 0.95  # correlation above which no other rate is tried: ends are off by less than a lobe
+    min_lead: float = 0.08  # minimum lead of the best offset over others outside its own lobe
+    lobe_s: float = 0.3  # half width of a correlation peak
+    min_significance: float = 3.5  # standard deviations of chance; the best of tens of offsets reaches 3
     min_overlap: float = 0.6  # minimum share of the video that the log covers
-    max_length_s: float = 24 * 3600.0  # maximum length of a recording: a longer log or video has stray stamps
-    max_rate: float = 2.5  # maximum s of a log in one second of the video: 60 frames a second taken for 25
-    segment_s: float = 40.0  # length of the video on which all rates are tried; around the best one the rest is added
+    max_length_s: float = 24 * 3600.0  # maximum length of a recording: longer ones have wrong time stamps
+    max_rate: float = 2.5  # maximum log s per video s: 60 frames per s read as 25
+    segment_s: float = 40.0  # length of the video for trying all rates; the best one is refined on the rest
     rate_mismatch_s: float = 0.1  # maximum error at the ends of a segment between two rates tried
-    rate_correlation: float = 0.85  # minimum correlation of another rate: of hundreds tried one fits by chance
+    rate_correlation: float = 0.85  # minimum correlation for another rate, as one of hundreds fits by chance
     rate_lead: float = 0.04  # minimum lead of the correlation at another rate over that at rate 1
-    rate_significance: float = 2.0  # standard deviations from 1, at which a rate is taken to differ
+    rate_significance: float = 2.0  # minimum deviation from 1 in standard deviations, for another rate
 
 
 CLOCK = ClockSearchSettings()
@@ -47,7 +47,7 @@ ASSUMED = "assumed equal to the video's"
 class ClockOffset:
     """A log's clock, t_log = seconds + rate * t_video, and its source.
 
-    sd: standard deviation, s, of t_log over the video (0: taken as exact, NaN: unknown); rate_sd: of the rate (0: not
+    sd: standard deviation, s, of t_log over the video (0: exact, NaN: unknown); rate_sd: of the rate (0: not
     estimated).
     """
 
@@ -66,7 +66,7 @@ class ClockOffset:
         return np.asarray((log_times - self.seconds) / self.rate)
 
     def later(self, seconds: float) -> ClockOffset:
-        """Return the clock with its offset moved."""
+        """Return the clock with a shifted offset."""
         return replace(self, seconds=self.seconds + seconds)
 
     def __str__(self) -> str:
@@ -112,7 +112,7 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
     before, after = (poses_at(log, log_grid + side * CLOCK.step_s) for side in (-1, 1))
     tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * CLOCK.step_s)
     tracked = np.sqrt(np.where(before[1] & after[1], tracked, np.nanmedian(tracked)))
-    observed = np.sqrt(np.interp(grid, middle, speed))  # roots: a fast stroke must not outweigh all others
+    observed = np.sqrt(np.interp(grid, middle, speed))  # square roots, lest a fast stroke outweighs all others
     rate, lags, scores = best_rate(observed, tracked)
     if rate != 1:
         rate = _finer_rate(observed, tracked, rate)
@@ -125,7 +125,7 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
             f"{CLOCK.min_significance:g} that are needed; give it in `sync`, or record more motion"
         )
     sd = _spread_of_parts(stretched, tracked, best)
-    rate_sd = np.sqrt(12) * sd / length if rate != 1 else 0.0  # of a line through offsets spread over the video
+    rate_sd = np.sqrt(12) * sd / length if rate != 1 else 0.0  # of a line fitted to offsets spread over the video
     seconds = log_grid[0] + _vertex(lags, scores) * CLOCK.step_s - rate * grid[0]
     return ClockOffset(float(seconds), sd, INSTRUMENT_MOTION, rate, float(rate_sd))
 
@@ -155,9 +155,9 @@ def _check_span(log: PoseLog) -> None:
 
 
 def best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the rate at which motions [V] and [L], sampled every `step_s`, fit best; all lags, and their correlation.
+    """Return the best-fitting rate of motions [V] and [L], sampled every `step_s`; all lags, and their correlation.
 
-    All rates are tried on the segment of most variance; it grows to the whole video while the rates narrow down.
+    All rates are tried on the segment of most variance, which grows to the whole video while the rates are narrowed.
     """
     lags, scores = correlate(video, log)
     if scores.max(initial=-1.0) > CLOCK.same_motion:
@@ -183,7 +183,7 @@ def best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, np
 
 
 def _finer_rate(video: np.ndarray, log: np.ndarray, rate: float) -> float:
-    """Return the rate near a coarse one at which the correlation has its vertex."""
+    """Return the rate near a coarse one at the vertex of the correlation."""
     step = CLOCK.rate_mismatch_s / (len(video) * CLOCK.step_s / 2) / 4
     rates = rate * (1 + step * np.arange(-6, 7))
     fits = np.array([correlate(_stretched(video, one), log)[1].max(initial=-1.0) for one in rates])
@@ -198,7 +198,7 @@ def _stretched(video: np.ndarray, rate: float) -> np.ndarray:
 
 
 def _peak(lags: np.ndarray, scores: np.ndarray, rate: float, log: PoseLog) -> int:
-    """Return the best lag. Raises NeecoError when it is no fit, or one of several."""
+    """Return the best lag. Raises NeecoError if it does not fit, or is ambiguous."""
     best = int(scores.argmax())
     rivals = scores[np.abs(lags - lags[best]) * CLOCK.step_s > CLOCK.lobe_s * max(rate, 1.0)]
     rival = float(rivals.max()) if len(rivals) else -1.0
@@ -212,7 +212,7 @@ def _peak(lags: np.ndarray, scores: np.ndarray, rate: float, log: PoseLog) -> in
 
 
 def significance(short: np.ndarray, long: np.ndarray, lag: int, correlation: float) -> float:
-    """Return a correlation of two signals at a lag in standard deviations of chance (Fisher's z), by the number of
+    """Return a correlation of two signals at a lag in standard deviations of chance (Fisher's z), for the number of
     independent samples in their overlap (Bartlett 1946)."""
     overlap = min(len(short) + min(lag, 0), len(long) - max(lag, 0), len(short), len(long))
     count = min(len(short), len(long)) // 2
@@ -253,7 +253,7 @@ def correlate(short: np.ndarray, long: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """
     least = int(CLOCK.min_overlap * min(len(short), len(long)))
     lags = np.arange(-(len(short) - least), len(long) - least + 1)
-    # without their means, which correlation does not see, less is lost to rounding
+    # removing means reduces rounding errors
     short, long = short - short.mean(), long - long.mean()
     one = np.ones(len(short))
     inside = np.ones(len(long))

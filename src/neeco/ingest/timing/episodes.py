@@ -1,8 +1,8 @@
 """Recordings of one instrument (episodes) in memory, on one timeline.
 
-Every episode keeps its own clocks. On the joint timeline an episode begins `pause_s` after the one before has ended;
-frames are counted on from episode to episode. A single recording is an episode with its own times and numbers. Later
-stages find clocks, robot bases and instruments; each returns an `Episodes` that knows them.
+Every episode has its own clocks. On the joint timeline an episode begins `pause_s` after the end of the previous one;
+frames are numbered consecutively. A single recording is an episode with its own times and numbers. Later stages
+estimate clocks, robot bases and instruments; each returns an updated `Episodes`.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, ClockOffset
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeSettings:
-    """Settings of the joint timeline, and what counts as the same on it."""
+    """Settings of the joint timeline."""
 
-    pause_s: float = 2.0  # longer than any smoothing over time reaches
+    pause_s: float = 2.0  # longer than any temporal smoothing window
     same_instant: float = 1e-6  # s
-    limit_slack: float = 0.03  # rad beyond a joint's limits that noise and calibration explain
+    limit_slack: float = 0.03  # rad beyond a joint's limits explained by noise and calibration
 
 
 EPISODES = EpisodeSettings()
@@ -40,18 +40,18 @@ Log = TypeVar("Log", PoseLog, ReadingLog)
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Parts of a recording that disagree, in one sentence. severe: the capture is likely to be wrong."""
+    """A contradiction between parts of a recording, in one sentence. severe: the capture is probably wrong."""
 
     sentence: str
     severe: bool
 
 
 class Notes:
-    """The one value of an ingest that grows: every stage adds to it. names: of the episodes."""
+    """Notes of all stages: the only mutable value of an ingest. names: of the episodes."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
-        self._sentences: dict[tuple[str, int | None], None] = {}  # in order; one without an episode holds for all
+        self._sentences: dict[tuple[str, int | None], None] = {}  # ordered; without an episode: for all
         self._contradictions: dict[tuple[str, int | None], Contradiction] = {}
 
     def add(self, sentence: str, episode: int | None = None) -> None:
@@ -69,7 +69,7 @@ class Notes:
         return tuple(dict.fromkeys([*sentences, *(sentence for sentence, of in self._sentences if of is None)]))
 
     def contradict(self, subject: str, sentence: str, *, severe: bool, episode: int | None = None) -> None:
-        """Set the contradiction about a subject, of one episode or all, in place of an earlier one; an empty sentence
+        """Set the contradiction on a subject, of one episode or all, replacing an earlier one; an empty sentence
         removes it."""
         if not sentence:
             self._contradictions.pop((subject, episode), None)
@@ -96,9 +96,9 @@ class Episode:
     joints: Mapping[str, Mapping[str, ReadingLog]]  # by instrument and joint
     rolls: Mapping[str, ReadingLog]
     scope: PoseLog | None
-    clocks: Mapping[str, ClockOffset]  # of the logs, as far as they are known
-    start_s: float = 0.0  # of the joint timeline at its own 0
-    first_frame: int = 0  # of the joint numbering
+    clocks: Mapping[str, ClockOffset]  # of the logs, as far as known
+    start_s: float = 0.0  # its time 0 on the joint timeline
+    first_frame: int = 0  # its first number in joint numbering
 
     @property
     def times(self) -> np.ndarray:
@@ -106,11 +106,11 @@ class Episode:
         return self.video.times
 
     def logged_poses(self, log: PoseLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return poses [N, 4, 4] in the tracker's frame at video times [N] s, and where they are known."""
+        """Return poses [N, 4, 4] in the tracker's frame at video times [N] s, and whether they are known."""
         return poses_at(log, self.clocks[log.clock].at(times))
 
     def logged_readings(self, log: ReadingLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings [N] at video times [N] s, and where they are known."""
+        """Return readings [N] at video times [N] s, and whether they are known."""
         return readings_at(log, self.clocks[log.clock].at(times))
 
 
@@ -127,7 +127,7 @@ class Episodes:
 
     @property
     def recording(self) -> Recording:
-        """The first recording, which states what holds for all: lens, links, frames, splits, settings."""
+        """The first recording, which applies to all: lens, links, frames, splits, settings."""
         return self.parts[0].recording
 
     @property
@@ -136,7 +136,7 @@ class Episodes:
 
     @property
     def video_instrument(self) -> InstrumentLogs | None:
-        """The instrument that is to be found in the video, if any."""
+        """The instrument to be found in the video, if any."""
         return next((item for item in self.recording.instruments if item.from_video is not None), None)
 
     # frames
@@ -165,19 +165,19 @@ class Episodes:
         return f"{part.name}_{frame - part.first_frame:06d}"
 
     def with_base(self, name: str, world_from_base: np.ndarray) -> Episodes:
-        """Return the episodes with the base [4, 4] mm of an instrument's log."""
+        """Return a copy with the base [4, 4] mm of an instrument's log."""
         return replace(self, world_from_base={**self.world_from_base, name: world_from_base})
 
     # clocks
 
     def with_clocks(self, episode: int, clocks: Mapping[str, ClockOffset]) -> Episodes:
-        """Return the episodes with some clocks of one of them set."""
+        """Return a copy with some clocks of one episode set."""
         parts = list(self.parts)
         parts[episode] = replace(parts[episode], clocks={**parts[episode].clocks, **clocks})
         return replace(self, parts=tuple(parts))
 
     def with_moved_clock(self, name: str, target: ClockOffset) -> Episodes:
-        """Return the episodes with a clock of the joint logs at `target`: that of every episode moves by as much."""
+        """Return a copy with a clock of the joint logs at `target`, shifting that of every episode equally."""
         before = self.clock(name)
         moved, data = target.seconds - (before.seconds if before is not None else 0.0), self
         for episode, part in enumerate(self.parts):
@@ -187,9 +187,9 @@ class Episodes:
         return data
 
     def with_assumed_clocks(self) -> Episodes:
-        """Return the episodes with every clock of an instrument known: where motion did not give one, the video's.
+        """Return a copy in which unknown clocks of instruments are the video's.
 
-        Raises NeecoError for a log whose times then do not meet the video's.
+        Raises NeecoError for a log whose times do not overlap the video's.
         """
         data = self
         for episode, part in enumerate(self.parts):
@@ -214,7 +214,7 @@ class Episodes:
         return {f"{clock} of {part.name}": offset for part in self.parts for clock, offset in part.clocks.items()}
 
     def clock(self, name: str) -> ClockOffset | None:
-        """Return a clock of the joint logs: of several episodes, known once it is known in each."""
+        """Return a clock of the joint logs, known if it is known in every episode."""
         clocks = [part.clocks.get(name) for part in self.parts]
         present = [clock for clock in clocks if clock is not None]
         if len(present) < len(clocks):
@@ -225,7 +225,7 @@ class Episodes:
         return ClockOffset(0.0, max(clock.sd for clock in present), source)
 
     def joint_log(self, of: Callable[[Episode], Log]) -> Log:
-        """Return one log of every episode as one on the joint timeline, cut off where it reaches into another."""
+        """Return the logs of all episodes as one on the joint timeline, without overlaps."""
         logs = [of(part) for part in self.parts]
         if self.single:
             return logs[0]
@@ -259,9 +259,9 @@ class Episodes:
         return self._gathered(times, of, (4, 4))[0]
 
     def instrument_poses(self, name: str, times: np.ndarray, lag: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Return poses [N, 4, 4] of an instrument, logged `lag` s later, and where they are known.
+        """Return poses [N, 4, 4] of an instrument, logged `lag` s later, and whether they are known.
 
-        They are in the world's frame as far as that is known, else in the tracker's.
+        In the world's frame if its base is known, else in the tracker's.
         """
         if name in self.video_poses:
             return self._found_poses(name, times)
@@ -282,9 +282,9 @@ class Episodes:
         return resampled, valid
 
     def states_at(self, times: np.ndarray) -> tuple[States, np.ndarray]:
-        """Return every instrument's states, and where all of them are known. All clocks have to be known.
+        """Return every instrument's states, and whether all of them are known. All clocks must be known.
 
-        Raises NeecoError for an episode of which no state is known, and for readings far beyond their limits.
+        Raises NeecoError for an episode without any known state, and for readings far beyond their limits.
         """
         states: States = {}
         usable = np.ones(len(times), dtype=bool)
@@ -332,7 +332,7 @@ class Episodes:
         of: Callable[[Episode, np.ndarray], tuple[np.ndarray, np.ndarray]],
         shape: tuple[int, ...],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return values [N, *shape] that `of` gives for an episode at times of its own, and where they are known."""
+        """Return values [N, *shape] of `of`, evaluated per episode at its own times, and whether they are known."""
         values, valid = np.full((len(times), *shape), np.nan), np.zeros(len(times), dtype=bool)
         for part, rows, local in self._each(times):
             values[rows], valid[rows] = of(part, local)
@@ -341,8 +341,8 @@ class Episodes:
     def _within_limits(
         self, part: Episode, log: ReadingLog, limits: tuple[float, float] | None, values: np.ndarray
     ) -> np.ndarray:
-        """Return readings [N] rad clipped to the joint's stated limits. Raises NeecoError where more than noise
-        exceeds them."""
+        """Return readings [N] rad clipped to the joint's stated limits. Raises NeecoError if they exceed these by more
+        than noise."""
         if limits is None:
             return values
         clipped = np.clip(values, *limits)
@@ -398,7 +398,7 @@ def _check_overlap(part: Episode, log: PoseLog | ReadingLog, valid: np.ndarray) 
 
 
 def assumed_clock(log: PoseLog | ReadingLog, times: np.ndarray) -> ClockOffset:
-    """Return the video's clock for a log. Raises NeecoError where its times do not meet the video's [V] s."""
+    """Return the video's clock for a log. Raises NeecoError if their times do not overlap; times [V] s: the video's."""
     if log.times[-1] < times[0] or log.times[0] > times[-1]:
         raise NeecoError(
             f"{log.path}: its times ({log.times[0]:g} to {log.times[-1]:g} s) do not meet the video's "

@@ -1,4 +1,4 @@
-"""Reading recordings into memory: logs, videos, the clocks that are given, and checks that all of it fits together."""
+"""Reading of recordings: logs, videos, stated clocks, and checks of their consistency."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from neeco.ingest.timing.episodes import EPISODES, Episode, Episodes, Notes, ass
 
 @dataclass(frozen=True, kw_only=True)
 class ReadingSettings:
-    """Limits of recordings that can be used."""
+    """Limits of usable recordings."""
 
     min_fps: float = 0.01
     max_fps: float = 10_000.0
-    same_focal: float = 0.02  # of a focal length, between calibrations of one lens
-    min_side_px: int = 32  # smaller frames have too few features to find cameras
+    same_focal: float = 0.02  # relative difference of focal lengths between calibrations of one lens
+    min_side_px: int = 32  # smaller frames have too few features for finding cameras
 
 
 READING = ReadingSettings()
@@ -74,7 +74,7 @@ def _check_episodes(parts: Sequence[Episode]) -> None:
 
 def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episode:
     """Read one recording. Raises NeecoError for logs and videos that cannot be used."""
-    # logs are quick to read: wrong ones are found before the video is touched
+    # logs are read first, as faults in them are found quickly
     items = recording.instruments
     poses = {item.name: read_pose_log(item.poses) for item in items if item.poses is not None}
     joints = {item.name: {joint: read_reading_log(source) for joint, source in item.joints.items()} for item in items}
@@ -125,7 +125,7 @@ def _check_partner(recording: Recording) -> str:
     right.check_size(recording.stereo.source.open().size, calibration)
     reader = None if recording.file is None else format_of(recording.file)
     stated = None
-    with suppress(NeecoError):  # what the file states is not used
+    with suppress(NeecoError):  # the file's calibration is not used
         stated = None if reader is None or recording.file is None else reader.lens(recording.file, recording.stream)
     if stated is None or abs(left.fl_x / stated.fl_x - 1) < READING.same_focal:
         return ""
@@ -150,7 +150,7 @@ def _check_bases(recording: Recording, scope: PoseLog | None, poses: Mapping[str
 
 
 def require_answers(recording: Recording, poses: Mapping[str, PoseLog]) -> None:
-    """Raise NeecoError for what a later stage needs and nothing states, before any of the work that takes minutes."""
+    """Raise NeecoError for missing inputs of a later stage, before any computation that takes minutes."""
     for item in recording.instruments:
         place, base = f"{recording.path}: instruments: {item.name}", item.base
         log = poses.get(item.name)

@@ -1,7 +1,7 @@
-"""Articulation of an instrument: a straight shaft in the tracked frame, and links beyond it that readings move.
+"""Articulation of an instrument: a straight shaft in the tracked frame, and distal links that joint readings move.
 
-The links are those of a kinematic tree that the capture states, or that was found from the images; corrections of axes,
-pivots and readings are learned. Hinges across the shaft are searched and learned by other numbers (`hinges.py`).
+The links are those of a kinematic tree that the capture states or that was estimated from the images; corrections of
+axes, pivots and readings are learned. Unstated hinges across the shaft have parameters of their own (`hinges.py`).
 """
 
 from __future__ import annotations
@@ -23,41 +23,41 @@ from neeco.raster.articulated import ArticulatedBody, link_weights
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import JointMotion, Skeleton
 
-LINK_LOGITS = "part_logits"  # the per-Gaussian extra [N, logit_count] that link weights are the softmax of
-MODULES = "hinges"  # the articulations' name in files of scenes, since version 0.1
+LINK_LOGITS = "part_logits"  # per-Gaussian extra [N, logit_count]; link weights are its softmax
+MODULES = "hinges"  # key of the articulations in scene files, since version 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class ArticulationSettings:
-    """Priors on stated kinematics, the gate behind which nothing moves, places of links about a joint, and tips."""
+    """Priors on stated kinematics, the proximal limit of moving links, link assignment about joints, and tips."""
 
     # standard deviations of the stated kinematics
     axis_sd: float = 0.09  # rad
     pivot_sd: float = 2.0  # mm
-    gain_sd: float = 0.03  # share of a reading's gain
-    gate_radii: float = 1.0  # shaft radii behind the first joint up to which a link that it moves may reach
-    gate_width_radii: float = 0.25  # width of that limit
-    max_scale_radii: float = 0.6  # standard deviation of what turns, or its far end would swing out behind the joint
-    max_gate_mm: float = 1e9  # where the radius is not known: everything is beyond the gate
-    max_gate_width_mm: float = 1e6  # the same, of the gate's width
-    side_logits: float = 2.0  # per shaft radius by which a Gaussian lies on the wrong side of a joint
-    side_start: float = 0.4  # shaft radii beyond the pivot where sides change
-    prongs: float = 0.7  # shaft radii by which they change farther out at the axis's ends, which hold the next link
-    prongs_from: float = 0.3  # shaft radii along the axis, where that begins
-    prongs_to: float = 0.7  # shaft radii along the axis, where it is reached
-    min_step_mm: float = 1.0  # between two pivots that define a direction
-    shaft_reach: float = 3.0  # shaft radii from the axis, behind the first pivot
-    end_reach: float = 8.0  # shaft radii from any pivot, before the first one
-    max_wrist_radii: float = 1.5  # behind the first joint within which a found shaft end is accepted
-    min_part_share: float = 0.5  # of a Gaussian that counts as belonging to a link
-    min_tip_gaussians: int = 10  # of a link; with fewer its tip stays unknown
-    tip_quantile: float = 0.97  # of the distances of a link's Gaussians from its pivot: farther ones are its tip
+    gain_sd: float = 0.03  # relative error of a reading's gain
+    gate_radii: float = 1.0  # shaft radii behind the first joint that its link may extend to
+    gate_width_radii: float = 0.25  # width of that limit's transition
+    max_scale_radii: float = 0.6  # maximum size on moving links, lest the far end swings out behind the joint
+    max_gate_mm: float = 1e9  # where the radius is unknown: no limit
+    max_gate_width_mm: float = 1e6  # the same for the transition's width
+    side_logits: float = 2.0  # logits per shaft radius on the wrong side of a joint
+    side_start: float = 0.4  # shaft radii from the pivot to the plane that separates two links
+    prongs: float = 0.7  # shaft radii by which that plane is farther out at the prongs of the clevis
+    prongs_from: float = 0.3  # shaft radii along the axis where this offset starts
+    prongs_to: float = 0.7  # shaft radii along the axis where it is complete
+    min_step_mm: float = 1.0  # minimum distance of two pivots that define a direction
+    shaft_reach: float = 3.0  # maximum distance from the axis, shaft radii, proximal to the first pivot
+    end_reach: float = 8.0  # maximum distance from any pivot, shaft radii, distal to the first pivot
+    max_wrist_radii: float = 1.5  # shaft radii behind the first joint within which an estimated shaft end is accepted
+    min_part_share: float = 0.5  # minimum weight of a link for a Gaussian to belong to it
+    min_tip_gaussians: int = 10  # minimum number of Gaussians for measuring a link's tip
+    tip_quantile: float = 0.97  # quantile of distances from the pivot beyond which Gaussians form the tip
 
 
 SETTINGS = ArticulationSettings()
 
-# wide: an offset is observed only by how it moves the axes beyond it, and those are stated no better
-OFFSET_SD = {False: 0.1, True: 2.0}  # rad of a revolute joint, mm of a prismatic one
+# wide: an offset is only observable through the axes it moves, whose stated positions are no more accurate
+OFFSET_SD = {False: 0.1, True: 2.0}  # rad (revolute), mm (prismatic)
 
 
 class Articulation(nn.Module):
@@ -94,7 +94,7 @@ class Articulation(nn.Module):
         "reading_offsets": 2e-3,
         "reading_gains": 2e-4,
     }
-    stated: ClassVar[bool] = True  # whether axes and readings are corrections of a tree; else hinges that were searched
+    stated: ClassVar[bool] = True  # whether axes are corrections of a stated tree (else searched hinges)
     reading_names: tuple[str, ...]  # all readings that move a link
     part_names: tuple[str, ...]  # label columns, in their order
     jointed: bool  # whether any reading moves a link
@@ -104,7 +104,7 @@ class Articulation(nn.Module):
     skeleton: Skeleton
 
     def __init__(self, tree: KinematicTree, joint_groups: Sequence[Sequence[Link]] | None = None) -> None:
-        """joint_groups: joints of the tree that share an axis, in the order in which they move what is at rest."""
+        """joint_groups: joints of the tree that share an axis, from distal to proximal."""
         super().__init__()
         self.register_buffer("base", torch.eye(4))
         self.register_buffer("wrist_start", torch.tensor(-math.inf))
@@ -156,7 +156,7 @@ class Articulation(nn.Module):
         self.skeleton = (("shaft_far", "shaft_near"), *self._bones())
 
     def add_unknowns(self, joints: int, readings: int) -> None:
-        """Add the parameters of axes and readings."""
+        """Add the learnable parameters of axes and readings."""
         self.axis_turns = nn.Parameter(torch.zeros(joints, 3))
         self.axis_shifts = nn.Parameter(torch.zeros(joints, 3))
         self.reading_offsets = nn.Parameter(torch.zeros(readings))
@@ -175,36 +175,36 @@ class Articulation(nn.Module):
         return (points - origin) @ direction
 
     def first_joint(self) -> Tensor:
-        """Return the position [] mm of the rearmost joint along the shaft, without gradient; 0 without joints."""
+        """Return the position [] mm of the most proximal joint along the shaft, without gradient; 0 without joints."""
         return self.along_shaft(self.axes()[0]).detach().min()
 
     def axes(self, shaft: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        """Return (points [J, 3] mm, unit directions [J, 3]) of the joints' axes at rest, outermost first; `shaft`: that
-        of `shaft()`, if known."""
+        """Return (points [J, 3] mm, unit directions [J, 3]) of the joints' axes at rest, outermost first; `shaft`:
+        result of `shaft()`, if already computed."""
         turned = self.directions + torch.linalg.cross(self.axis_turns, self.directions)
         return self.points + self.axis_shifts, nn.functional.normalize(turned, dim=1)
 
     def values(self, readings: Mapping[str, float]) -> Tensor:
-        """Return the values [J, L - 1] by which each joint moves each link but the shaft, rad or mm."""
-        given = torch.stack([torch.as_tensor(readings[name]).to(self.gains) for name in self.reading_names])
+        """Return joint values [J, L - 1], rad or mm, by which each joint moves each link except the shaft."""
+        recorded = torch.stack([torch.as_tensor(readings[name]).to(self.gains) for name in self.reading_names])
         return self.constants + self.gains @ (
-            (1 + self.reading_gains) * (given - self.observable * self.reading_offsets)
+            (1 + self.reading_gains) * (recorded - self.observable * self.reading_offsets)
         )
 
     @property
     def per_unit(self) -> Tensor:
-        """[J, L - 1, R] of `values` per unit of each reading."""
+        """Return `values` per unit of each reading, [J, L - 1, R]."""
         return self.gains * (1 + self.reading_gains)
 
     @torch.no_grad()
     def round_until(self) -> Tensor:
-        """Return the position [] mm along the shaft up to which everything is spun with it: its end, without links of
-        the first joint, whose axis would turn."""
+        """Return the position [] mm along the shaft up to which it is spun: its end, without the links of the first
+        joint, whose axis would turn."""
         return torch.minimum(self.wrist_start, self.first_joint() - self.radius)
 
     def resting_body(self, roll: float = 0.0) -> Callable[..., ArticulatedBody]:
-        """Return the instrument's body, the round part of its shaft spun by `roll` rad, as a function of what the state
-        determines: `world_from_body` and `values`."""
+        """Return the instrument's body, with the surface of revolution spun by `roll` rad, as a function of
+        `world_from_body` and `values`."""
         shaft, gate = self.shaft(), self._gate()
         origins, axes = self.axes(shaft)
         return partial(
@@ -223,24 +223,24 @@ class Articulation(nn.Module):
 
     @torch.no_grad()
     def _gate(self) -> tuple[Tensor, Tensor]:
-        """Return (start [], width []) mm along the shaft of the gate behind which nothing moves with the joints."""
+        """Return (start [], width []) mm along the shaft of the gate proximal to which joints move nothing."""
         start = self.first_joint() - (SETTINGS.gate_radii * self.radius).clamp_max(SETTINGS.max_gate_mm)
         return start, SETTINGS.gate_width_radii * self.radius.clamp_max(SETTINGS.max_gate_width_mm)
 
     def link_weights(self, points: Tensor, logits: Tensor) -> Tensor:
         """Return link weights [M, link_count] of Gaussians at points [M, 3] mm with logits [M, link_count or more]."""
-        known = self.positioned_logits(points, logits)[:, : self.link_count]
-        return link_weights(points, known, self.shaft(), *self._gate())
+        placed = self.positioned_logits(points, logits)[:, : self.link_count]
+        return link_weights(points, placed, self.shaft(), *self._gate())
 
     def positioned_logits(self, points: Tensor, logits: Tensor) -> Tensor:
-        """Return logits [M, link_count or more] with the prior of the Gaussians' positions [M, 3] mm added: near a
-        joint motion hardly separates links, and a Gaussian rather belongs to the link on whose side of the joint it
-        lies, divided by a plane across the links at rest."""
+        """Return logits [M, link_count or more] plus a prior from the positions [M, 3] mm: near a joint, motion hardly
+        discriminates between links, so a Gaussian is assigned to the link on its side of the plane through the joint
+        across the links at rest."""
         return nn.functional.pad(self._sides(points), (0, logits.shape[1] - self.link_count)) + logits
 
     @torch.no_grad()
     def _sides(self, points: Tensor) -> Tensor:
-        """Return logits [M, L] <= 0 of the links by the position [M, 3] mm of Gaussians."""
+        """Return the logits [M, L] <= 0 of the links given the positions [M, 3] mm of Gaussians."""
         pivots, axes = self.axes()
         directions = self._link_directions(pivots)
         along = (points @ directions.T - (pivots * directions).sum(1)) / self.radius  # [M, J]
@@ -252,7 +252,7 @@ class Articulation(nn.Module):
         return beyond.clamp_max(0) @ self.outer - beyond.clamp_min(0) @ self.inner
 
     def _link_directions(self, pivots: Tensor) -> Tensor:
-        """Return unit directions [J, 3] of the links at every joint at rest, from the pivot that carries it; else the
+        """Return unit directions [J, 3] of the links at every joint at rest, from the preceding pivot; else the
         shaft's."""
         directions = [self.shaft()[1]] * len(pivots)
         for joint in reversed(range(len(pivots))):  # the innermost first
@@ -265,49 +265,49 @@ class Articulation(nn.Module):
 
     @property
     def _following(self) -> int:
-        """Index of the link after the shaft."""
+        """Return the index of the link after the shaft."""
         return next(k for k in range(1, self.link_count) if bool(self.moves(len(self.points) - 1)[k - 1]))
 
     def settled(self, points: Tensor, logits: Tensor) -> Tensor:
-        """Return the final logits [M, link_count or more] of Gaussians at points [M, 3] mm, without links that their
-        positions rule out."""
+        """Return the final logits [M, link_count or more] of Gaussians at points [M, 3] mm, with links excluded by
+        position."""
         return logits
 
     def shaft_like(self, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ([M] shares of Gaussians that look like the shaft's surface, by their link weights; [] mm along the
-        shaft up to which they do): the link after it turns about a ball or pin that looks like the shaft's end, or
-        slides out of it."""
+        """Return ([M] weights of Gaussians on surfaces that look like the shaft, given their link weights; [] mm along
+        the shaft where these end): the next link turns about a ball or pin that looks like the shaft's end, or slides
+        out of it."""
         return weights[:, 0] + weights[:, self._following], self._latest_end() + self.radius
 
     def _latest_end(self) -> Tensor:
-        """Return the last position [] mm of the shaft's end: the first joint, one radius beyond it if prismatic."""
+        """Return the distal limit [] mm of the shaft's end: the first joint, plus one radius if prismatic."""
         return self.first_joint() + self.slides[-1] * self.radius
 
     def longest(self, weights: Tensor) -> Tensor:
-        """Return the largest standard deviation [M, 1] mm of Gaussians with link weights [M, link_count]; those that do
-        not move are not limited."""
+        """Return the maximum standard deviation [M, 1] mm of Gaussians with link weights [M, link_count]; static ones
+        are unlimited."""
         moving = 1 - weights[:, :1]
         return SETTINGS.max_scale_radii * self.radius / moving.clamp_min(1e-6)
 
     def parts(self, points: Tensor, weights: Tensor) -> Tensor:
-        """Return the shares [M, len(part_names)] of each part in Gaussians at points [M, 3] mm with link weights
-        [M, link_count]. A ball or pin looks the same on either side, and so does a sliding rod: everything that moves
-        with the shaft but lies beyond its end (where its colour or symmetry ends) is labelled as the next link."""
+        """Return the weights [M, len(part_names)] of each part for Gaussians at points [M, 3] mm with link weights [M,
+        link_count]. A ball, a pin and a sliding rod look the same when they move: whatever moves with the shaft but
+        lies beyond its end (where its colour or symmetry ends) is labelled as the next link."""
         first = self.first_joint()
-        found = (self.wrist_start > first - SETTINGS.max_wrist_radii * self.radius) & (
+        valid = (self.wrist_start > first - SETTINGS.max_wrist_radii * self.radius) & (
             self.wrist_start <= self._latest_end()
         )
-        end = torch.where(found, self.wrist_start, torch.full_like(first, torch.inf))
+        end = torch.where(valid, self.wrist_start, torch.full_like(first, torch.inf))
         beyond = weights[:, 0] * (self.along_shaft(points) > end)
         moved = nn.functional.one_hot(torch.tensor([0, self._following]), self.link_count).to(weights)
         return weights + beyond[:, None] * (moved[1] - moved[0])
 
     def place(self, points: Tensor, link: int, readings: Mapping[str, float]) -> Tensor:
-        """Return points [M, 3] mm of one link at rest moved to these readings, instrument frame."""
+        """Return points [M, 3] mm of one link, moved from rest to these readings, instrument frame."""
         return points if link == 0 else self._placed(points, link, self.values(readings), self.axes())
 
     def _placed(self, points: Tensor, link: int, values: Tensor, about: tuple[Tensor, Tensor]) -> Tensor:
-        """`place` for the joints' `values` and axes."""
+        """Like `place`, for given joint values and axes."""
         if link == 0:
             return points
         pivots, axes = about
@@ -319,21 +319,21 @@ class Articulation(nn.Module):
         return points
 
     def joint_points(self, readings: Mapping[str, float], shaft: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
-        """Return named points [3] mm, instrument frame: the pivot of every joint, `pivot_` + the link that it moves,
-        and the tip of every end link, `tip_` + its name. `shaft`: that of `shaft()`."""
-        found = {}
+        """Return named points [3] mm, instrument frame: the pivot of every joint (`pivot_` + the link that it moves)
+        and the tip of every end link (`tip_` + its name). `shaft`: result of `shaft()`."""
+        points = {}
         about, values = self.axes(), self.values(readings)
         pivots = about[0].flip(0)
         for name, group, pivot in zip(self._pivot_names[::-1], self.joint_groups[::-1], pivots, strict=True):
             carrier = self.link_of(group[0].parent)
-            if group[0].type == PRISMATIC:  # its offset across the axis is not observable: put on the shaft
+            if group[0].type == PRISMATIC:  # its offset across the axis is not observable: placed on the shaft
                 origin, direction = shaft
                 pivot = origin + ((pivot - origin) @ direction) * direction
-            found[f"pivot_{name}"] = self._placed(pivot[None], carrier, values, about)[0]
+            points[f"pivot_{name}"] = self._placed(pivot[None], carrier, values, about)[0]
         for link in self._ends:
             if bool(self.tips[link].isfinite().all()):
-                found[f"tip_{self.link_names[link]}"] = self._placed(self.tips[link][None], link, values, about)[0]
-        return found
+                points[f"tip_{self.link_names[link]}"] = self._placed(self.tips[link][None], link, values, about)[0]
+        return points
 
     def keypoints(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
         """Return named points [3] mm, instrument frame: both ends of the shaft, pivots and tips."""
@@ -344,8 +344,8 @@ class Articulation(nn.Module):
         return ends | self.joint_points(readings, (origin, direction))
 
     def rest_line(self) -> tuple[Tensor, Tensor] | None:
-        """Return (point [3] mm, step [3] mm) of the line of the links at rest, from the first pivot to the one that it
-        carries; None without two pivots."""
+        """Return (point [3] mm, step [3] mm) of the line of the links at rest, from the first pivot to the next one;
+        None with fewer than two pivots."""
         pivots, _ = self.axes()
         for joint in reversed(range(len(pivots))):
             inner = self.inner_joints[joint]
@@ -358,7 +358,7 @@ class Articulation(nn.Module):
 
     @torch.no_grad()
     def out_of_reach(self, points: Tensor) -> Tensor:
-        """Return bool [M]: points [M, 3] mm at rest that are farther from the stated links than any part of them."""
+        """Return bool [M]: points [M, 3] mm at rest that no part of the stated links can reach."""
         if self.rest_line() is None:
             return torch.zeros(len(points), dtype=torch.bool, device=points.device)
         origin, direction = self.shaft()
@@ -378,35 +378,35 @@ class Articulation(nn.Module):
         of these link weights: at a reading of 0, and per unit of it)."""
         pivots, axes = self.axes()
         rest = self.values(dict.fromkeys(self.reading_names, 0.0))
-        found, columns = [], [weights.new_zeros(len(weights), 0, 2)]
+        motions, columns = [], [weights.new_zeros(len(weights), 0, 2)]
         for joint, slides in enumerate(self.slides):
             constant = rest[joint]  # added to the first of the joint's readings
             for r, name in enumerate(self.reading_names):
                 if bool(self.gains[joint, :, r].any()):
-                    found.append(JointMotion(pivots[joint], axes[joint], name, slides))
+                    motions.append(JointMotion(pivots[joint], axes[joint], name, slides))
                     columns.append((weights[:, 1:] @ torch.stack([constant, self.per_unit[joint, :, r]], 1))[:, None])
                     constant = torch.zeros_like(constant)
-        return found, torch.cat(columns, 1)
+        return motions, torch.cat(columns, 1)
 
     def link_shares(self, points: Tensor, weights: Tensor) -> Tensor:
         """Return the shares [M, link_count] of links in Gaussians at points [M, 3] mm, by their link weights."""
         return weights
 
     def measure_tips(self, points: Tensor, weights: Tensor) -> None:
-        """Set the tip of each end link to where its solid Gaussians, of those at points [M, 3] mm with link weights
-        [M, link_count], lie farthest from its pivot; with too few it is not known."""
+        """Set the tip of each end link to the mean of its Gaussians, at points [M, 3] mm with link weights [M,
+        link_count], that are farthest from its pivot; with too few it stays unknown."""
         self.tips.fill_(torch.nan)
         pivots, _ = self.axes()
         shares = self.link_shares(points, weights)
         for link in self._ends:
-            own = points[shares[:, link] > SETTINGS.min_part_share]
-            if len(own) >= SETTINGS.min_tip_gaussians:
-                away = (own - pivots[self.joint_of(link)]).norm(dim=1)
-                self.tips[link] = own[away >= away.quantile(SETTINGS.tip_quantile)].mean(0)
+            tip = points[shares[:, link] > SETTINGS.min_part_share]
+            if len(tip) >= SETTINGS.min_tip_gaussians:
+                away = (tip - pivots[self.joint_of(link)]).norm(dim=1)
+                self.tips[link] = tip[away >= away.quantile(SETTINGS.tip_quantile)].mean(0)
 
     def describe(self, reading: str) -> dict[str, Any]:
-        """Return, of the outermost joint that the reading drives, axis and pivot at rest in the instrument's frame and
-        their distance from the stated ones; the reading's offset (None: not observable) and gain."""
+        """Return axis and pivot at rest (instrument frame) of the outermost joint that the reading drives, their
+        distance from the stated ones, and the reading's offset (None: not observable) and gain."""
         r = self.reading_names.index(reading)
         joint = next(j for j in range(len(self.points)) if bool(self.gains[j, :, r].any()))
         pivots, axes = self.axes()
@@ -424,8 +424,8 @@ class Articulation(nn.Module):
         }
 
     def prior(self) -> Tensor | None:
-        """Return the squared deviation of the learned from the stated kinematics, a scalar in standard deviations; None
-        where nothing was stated."""
+        """Return the squared deviation of the learned from the stated kinematics in units of its standard deviations, a
+        scalar; None where nothing was stated."""
         sigma = self.reading_offsets.new_tensor(self.offset_sds)
         return (
             (self.axis_turns / SETTINGS.axis_sd).square().sum()
@@ -435,7 +435,7 @@ class Articulation(nn.Module):
         )
 
     def moves(self, joint: int) -> Tensor:
-        """Return which links a joint moves, [L - 1] bool."""
+        """Return the links that a joint moves, [L - 1] bool."""
         return (self.gains[joint].abs().amax(1) > 0) | (self.constants[joint] != 0)
 
     def joint_of(self, link: int) -> int:
@@ -443,7 +443,7 @@ class Articulation(nn.Module):
         return next(joint for joint in range(len(self.points)) if bool(self.moves(joint)[link - 1]))
 
     def link_of(self, name: str | None) -> int:
-        """Return the index of the link that moves with frame `name`, or with the nearest frame that carries it."""
+        """Return the index of the link that moves with frame `name`, or with its nearest ancestor."""
         numbers = {signature(self.tree, part): k for k, part in reversed(list(enumerate(self.link_names)))}
         parents = {link.name: link.parent for link in self.tree.links}
         while name is not None and signature(self.tree, name) not in numbers:
@@ -451,7 +451,7 @@ class Articulation(nn.Module):
         return 0 if name is None else numbers[signature(self.tree, name)]
 
     def _bones(self) -> list[tuple[str, str]]:
-        """Return lines from every pivot to those it carries and to the tips beyond."""
+        """Return lines from every pivot to the next ones and to the tips."""
         bones, ends = [], [self.link_names[k] for k in self._ends]
         for name, group, inner in zip(self._pivot_names, self.joint_groups, self.inner_joints, strict=True):
             bones.append((f"pivot_{self._pivot_names[inner]}" if inner >= 0 else "shaft_near", f"pivot_{name}"))
@@ -484,8 +484,8 @@ class ArticulatedInstruments(nn.Module):
             return logits
         rows = [logits[canonical.body(0)]]
         for index, articulation in enumerate(self.articulations):
-            own = canonical.body(index + 1)
-            rows.append(articulation.positioned_logits(canonical.means[own], logits[own]))
+            rows_of = canonical.body(index + 1)
+            rows.append(articulation.positioned_logits(canonical.means[rows_of], logits[rows_of]))
         return torch.cat(rows)
 
     def link_weights(self, canonical: CanonicalGaussians, index: int) -> Tensor:

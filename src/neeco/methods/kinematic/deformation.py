@@ -69,7 +69,7 @@ from neeco.training.schedule import Event
 from neeco.training.session import GaussianSession
 from neeco.training.silhouettes import INSTRUMENT, SILHOUETTES, UNKNOWN, Silhouettes
 
-PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared standard deviations
+PRIOR_WEIGHT = 1e-5  # weight of the priors on stated kinematics, which are squared deviations over variances
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,12 +79,12 @@ class KinematicSettings:
     shaft_roll: float = 0.5  # probability of spinning the shaft (a surface of revolution) by a random angle
     shaft_roll_start: int = 600  # iteration from which it is spun
     opacity_penalty: float = 0.002  # weight of the instruments' mean opacity
-    opacity_penalty_stop: int = 1500  # iteration from which that weight is a tenth
+    opacity_penalty_stop: int = 1500  # iteration after which that weight drops to a tenth
     label_sharpness: float = 0.02  # weight of l (1 - l) on the rendered instrument label
-    label_sharpness_start: int = 1000  # iteration from which it is weighed
-    hinge_start: int = 600  # iteration from which hinges are learned: before, unformed Gaussians would drag them off
-    rate_scale: float = 1.0  # times the learning rates of hinges
-    refine_wrists: bool = True  # whether wrists are looked for again at 60 and 80 % of the run
+    label_sharpness_start: int = 1000  # iteration from which it is added
+    hinge_start: int = 600  # iteration from which hinges are learned; unformed Gaussians would displace them
+    rate_scale: float = 1.0  # factor on the learning rates of hinges
+    refine_wrists: bool = True  # whether wrist positions are estimated again at 60 and 80 % of the run
     # whether the instruments' shadow on the tissue is looked for and rendered (see `neeco.raster.shadow`)
     shadow: bool = True
     # whether tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`)
@@ -100,15 +100,15 @@ class KinematicSettings:
 
 EVENTS = (
     Event(0.1, "observe_silhouettes"),
-    Event(0.12, "judge_states"),  # later, the scene has learned from wrong states
+    Event(0.12, "judge_states"),  # before the scene has learned from wrong states
     Event(0.2, "fit_states"),
     Event(0.2, "carve_from_states"),
     Event(0.32, "observe_silhouettes"),
-    Event(0.32, "size_states"),  # of errors that only the learned tissue shows, more is seen than before
+    Event(0.32, "size_states"),  # the learned tissue reveals more errors by now
     Event(0.32, "fit_states"),
     Event(0.32, "carve_from_states"),
     Event(0.4, "find_shadow"),
-    Event(0.4, "place_wrists"),  # shapes are formed, and steps are left to learn
+    Event(0.4, "place_wrists"),  # shapes have formed, and enough steps remain
     Event(0.45, "judge_states_again"),
     Event(0.45, "fit_states"),
     Event(0.45, "carve_from_states"),
@@ -120,7 +120,7 @@ EVENTS = (
     Event(0.8, "find_shadow"),
     Event(0.8, "refine_wrists"),
     Event(0.9, "conclude_states"),
-    # iterations, not shares: instruments have shape, and no shadow is learned yet as a part of them
+    # iterations rather than shares: instruments have a shape by then, but no shadow has been learned as part of them
     Event(1000, "find_shadow"),
     Event(1500, "find_shadow"),
 )
@@ -191,9 +191,9 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         def pose(state: State) -> Posed:
             bodies: list[ArticulatedBody | None] = [None]  # tissue is no articulated body
             for instrument, articulation, body in zip(self.instruments, self.articulations, resting, strict=True):
-                given = state_of(instrument, state)
-                values = articulation.values(given.joints)
-                bodies.append(body(world_from_body=given.pose.to(canonical.means), values=values))
+                instrument_state = state_of(instrument, state)
+                values = articulation.values(instrument_state.joints)
+                bodies.append(body(world_from_body=instrument_state.pose.to(canonical.means), values=values))
             means = self.breathed(canonical.means, canonical.counts[0], state.time)
             return Posed(*pose_bodies(means, canonical.quats, canonical.log_scales, logits, canonical.counts, bodies))
 
@@ -210,7 +210,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return labels
 
     def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
-        """Return the change from canonical to posed; 0 for tissue, so that the paper's thresholds separate exactly."""
+        """Return the change from canonical to posed; exactly 0 for tissue, for the paper's thresholds."""
         deltas = super().deltas(canonical, state)
         tissue = canonical.body(0)
         for tensor in (deltas.means, deltas.quats, deltas.scales):
@@ -218,13 +218,13 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return deltas
 
     def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
-        found: dict[str, dict[str, Tensor]] = {}
+        world_points: dict[str, dict[str, Tensor]] = {}
         for instrument, articulation in zip(self.instruments, self.articulations, strict=True):
-            given = state_of(instrument, state)
-            points = articulation.keypoints(given.joints)
-            pose = given.pose.to(points["shaft_far"])
-            found[instrument.name] = {name: pose[:3, :3] @ point + pose[:3, 3] for name, point in points.items()}
-        return found
+            instrument_state = state_of(instrument, state)
+            points = articulation.keypoints(instrument_state.joints)
+            pose = instrument_state.pose.to(points["shaft_far"])
+            world_points[instrument.name] = {name: pose[:3, :3] @ point + pose[:3, 3] for name, point in points.items()}
+        return world_points
 
     def skeleton(self) -> Skeleton:
         bones = [bone for articulation in self.articulations for bone in articulation.skeleton]
@@ -239,10 +239,10 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             links.append((weights, articulation.motion(torch.eye(weights.shape[1], device=weights.device))[1]))
             if articulation.jointed:
                 log_scales[rows] = torch.minimum(log_scales[rows], articulation.longest(weights).log())
-            own, amounts = articulation.motion(weights)
-            axes.append(tuple(own))
+            motions, amounts = articulation.motion(weights)
+            axes.append(tuple(motions))
             moved.append((rows, amounts))
-        most = max((len(own) for own in axes), default=0)
+        most = max((len(motions) for motions in axes), default=0)
         amounts = canonical.means.new_zeros(len(canonical), most, 2)
         for rows, own_amounts in moved:
             amounts[rows, : own_amounts.shape[1]] = own_amounts
@@ -277,7 +277,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return perturbation
 
     def prune_mask(self, canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> Tensor | None:
-        """Return tissue whose centre no frame observes, as no image constrains it, and what no stated link reaches."""
+        """Return Gaussians to prune: tissue whose centre no frame observes, and all out of reach of stated links."""
         mask = torch.zeros(len(canonical), dtype=torch.bool, device=canonical.means.device)
         for index, articulation in enumerate(self.articulations):
             if articulation.stated:
@@ -296,7 +296,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return canonical.of_instruments.to(canonical.means.dtype)[:, None]
 
     def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor | None:
-        """Penalise opaque instruments and soft labels, and weigh the priors of stated links."""
+        """Penalise opaque instruments and soft labels, and add the priors of stated links."""
         settings, terms = self.settings, []
         if settings.opacity_penalty > 0 and len(canonical.counts) > 1:
             weight = settings.opacity_penalty * (1.0 if iteration < settings.opacity_penalty_stop else 0.1)
@@ -334,7 +334,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
                 fit_states(session, self)
             case "carve_from_states":
                 carve_from_states(session, self)
-            case "conclude_states":  # with the uncertainty of the fits; leaves out frames that no state explains
+            case "conclude_states":  # with standard deviations of the fits; excludes frames that no state explains
                 fit_states(session, self, last=True)
             case _:
                 raise KeyError(action)
@@ -351,7 +351,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         scale = self.settings.rate_scale * floored_decay(progress)
-        found = {}
+        rate_of = {}
         for name, _ in self.named_parameters():
             module, _, parameter = name.rpartition(".")
             owner = self.get_submodule(module)
@@ -359,12 +359,12 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             fixed = (parameter.startswith("axis_") and not self.settings.stated_axes) or (
                 parameter.startswith("reading_") and not self.settings.stated_readings
             )
-            found[name] = 0.0 if fixed else rates[parameter] * scale
-        return found
+            rate_of[name] = 0.0 if fixed else rates[parameter] * scale
+        return rate_of
 
 
 def articulation_of(instrument: Instrument) -> Articulation:
-    """Return the links that the instrument's kinematics state, or else a shaft with a hinge per joint, which is found
+    """Return the links that the instrument's kinematics state, else a shaft with one hinge per joint, to be estimated
     from the images."""
     tree = instrument.kinematics
     return Articulation(tree) if tree is not None and tree.readings else Hinges(tuple(instrument.joints))
@@ -372,14 +372,14 @@ def articulation_of(instrument: Instrument) -> Articulation:
 
 @torch.no_grad()
 def observe_silhouettes(session: GaussianSession) -> None:
-    """Set the session's silhouettes from its scene as learned so far, where its tissue explains the images better than
-    when they were last observed."""
+    """Update the session's silhouettes from its scene, if the tissue explains the images better than when they were
+    last computed."""
     if not session.scene.instruments:
         return
     count = len(session.views.frames)
     sampled = {index: session.compared(index) for index in evenly_spaced(count, SILHOUETTES.n_views)}
-    foreground, known = Foreground.learned(list(sampled.values())), session.silhouettes
-    if foreground is None or (known is not None and foreground.noise >= known.noise):
+    foreground, observed = Foreground.learned(list(sampled.values())), session.silhouettes
+    if foreground is None or (observed is not None and foreground.noise >= observed.noise):
         return
     values = []
     for index in range(count):
@@ -390,20 +390,20 @@ def observe_silhouettes(session: GaussianSession) -> None:
 
 
 def _corrects_states(session: GaussianSession) -> bool:
-    """Return whether there are states, and they are corrected."""
+    """Return whether the run has states and corrects them."""
     return bool(session.scene.instruments) and session.config.refine.frame_poses
 
 
 def _fits_states(session: GaussianSession) -> bool:
-    """Return whether states are corrected, their errors are larger than a tracker's, and one camera shows each instant:
-    gradients of several cameras' images determine an instant's state better than each image does."""
+    """Return whether states are fitted to images: they are corrected, their errors exceed a tracker's, and one camera
+    shows each instant. With several cameras, gradients determine an instant's state better than single images."""
     single = all(len(frames) == 1 for frames in session.refinement.frames_of_instant)
     return _corrects_states(session) and bool(session.refinement.error_scale) and single
 
 
 @torch.no_grad()
 def judge_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Size the errors of the states of all training frames, and search for those that are wrong altogether."""
+    """Estimate the size of state errors over all training frames, and search for gross errors."""
     if _corrects_states(session) and not session.refinement.error_scale:
         search = _search(session, articulated)
         misfits = Misfits.of(search)
@@ -413,14 +413,14 @@ def judge_states(session: GaussianSession, articulated: ArticulatedInstruments) 
 
 @torch.no_grad()
 def size_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Size the errors of the states of all training frames, where they were not found large before."""
+    """Estimate the size of state errors over all training frames, unless they were large before."""
     if _corrects_states(session) and not session.refinement.error_scale:
         _size_errors(session, _search(session, articulated), ())
 
 
 @torch.no_grad()
 def judge_states_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Search again for wrong states, where errors are large or some states were found wrong before."""
+    """Search again for wrong states, if errors are large or wrong states were detected before."""
     suspected = bool(session.refinement.error_scale) or bool(session.refinement.verdicts.any())
     if _corrects_states(session) and suspected:
         judge_again(_search(session, articulated))
@@ -428,7 +428,7 @@ def judge_states_again(session: GaussianSession, articulated: ArticulatedInstrum
 
 @torch.no_grad()
 def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *, last: bool = False) -> None:
-    """Fit the states of all training frames to their images, where their errors are larger than a tracker's."""
+    """Fit the states of all training frames to their images, if their errors exceed a tracker's."""
     if not _fits_states(session):
         return
     search, refinement = _search(session, articulated), session.refinement
@@ -438,19 +438,19 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *,
             continue
         wrong = refinement.verdict(index) is Verdict.REFITTED
         about = search.state(index) if wrong else None
-        found = fitted_anew(search, index) if wrong and last else search.fitted(index, SEARCH.scale, about)
-        if found is not None:
-            # until the last fit, gradients go on with the uncertainty of recorded states
-            deviations = found[1] if last else search.deviations(index, SEARCH.scale)
-            refinement.set_state(index, session.recorded.states[index], found[0].state, deviations)
-            explained[index] = found[0].misfit
+        refitted = fitted_anew(search, index) if wrong and last else search.fitted(index, SEARCH.scale, about)
+        if refitted is not None:
+            # until the last fit, gradients continue with the uncertainty of the recorded states
+            deviations = refitted[1] if last else search.deviations(index, SEARCH.scale)
+            refinement.set_state(index, session.recorded.states[index], refitted[0].state, deviations)
+            explained[index] = refitted[0].misfit
     if last:
         leave_out_unexplained(search, explained)
 
 
 @torch.no_grad()
 def carve_from_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Carve the instruments' shapes anew from fitted states."""
+    """Carve the instruments' shapes again from fitted states."""
     if _fits_states(session):
         with session.searching():
             carve_again(session, articulated)
@@ -462,7 +462,7 @@ def _search(session: GaussianSession, articulated: ArticulatedInstruments) -> St
 
 
 def _size_errors(session: GaussianSession, search: StateSearch, outliers: Sequence[int]) -> bool:
-    """Size the errors of all states but `outliers`, and report whether they are larger than a tracker's."""
+    """Estimate the size of the errors of all states except `outliers`, and report whether it exceeds a tracker's."""
     large = search.size_errors(outliers)
     if large:
         session.report("the states' errors are larger than a tracker's: they are corrected by the images")

@@ -32,12 +32,11 @@ from neeco.training.session import GaussianSession
 def find_instruments(
     session: GaussianSession, articulated: ArticulatedInstruments, *, wrists: bool
 ) -> dict[str, KinematicTree]:
-    """Add every instrument's body to the session's scene, whose canonical set holds the tissue alone, and start its
-    joints. Or, with `wrists`, return the links of instruments whose several joints no kinematics explain, where images
-    show them; then nothing was added.
+    """Add every instrument's body to the session's scene, whose canonical set holds the tissue alone, and initialise
+    its joints. With `wrists`, return instead the estimated links of instruments that have several joints and no stated
+    kinematics, if the images support them; then nothing is added.
 
-    `articulated` is the scene's deformation. Raises NeecoError when an instrument leaves no evidence in its own frame:
-    its poses do not match the images.
+    `articulated` is the scene's deformation. Raises NeecoError when an instrument leaves no evidence in its own frame.
     """
     scene, report = session.scene, session.report
     if not scene.instruments:
@@ -47,8 +46,8 @@ def find_instruments(
     if isinstance(articulated, BreathingTissue) and articulated.may_breathe and session.timed:
         tissue = _learn_breathing(session, articulated, tissue)
     evidence = tissue_evidence(scene, session.views, session.config, tissue)
-    if wrists and (found := _unstated_wrists(session, articulated, evidence)):
-        return found
+    if wrists and (trees := _unstated_wrists(session, articulated, evidence)):
+        return trees
     alone = len(scene.instruments) == 1 and articulated.articulations[0].stated
     corrects = alone and session.config.refine.frame_poses
     if corrects and register_states(session.views, session.refinement, scene.instruments[0]):
@@ -60,13 +59,13 @@ def find_instruments(
 def _unstated_wrists(
     session: GaussianSession, articulated: ArticulatedInstruments, evidence: Evidence
 ) -> dict[str, KinematicTree]:
-    """Return the links of instruments with several moving joints and no kinematics, where images show them; report
-    either."""
-    generator, found = torch.Generator().manual_seed(session.config.seed), {}
+    """Return the estimated links of instruments with several moving joints and no kinematics, if the images support
+    them; report either outcome."""
+    generator, trees = torch.Generator().manual_seed(session.config.seed), {}
     for instrument, articulation in zip(session.scene.instruments, articulated.articulations, strict=True):
         readings = [frame.state.instruments[instrument.name].joints for frame in evidence.frames]
         logged = set.intersection(*map(set, readings))
-        varying = {j for j in logged if np.ptp([given[j] for given in readings]) > STICKS.min_reading_range}
+        varying = {j for j in logged if np.ptp([row[j] for row in readings]) > STICKS.min_reading_range}
         moving = [joint for joint in articulation.reading_names if joint in varying]
         if len(moving) < 2 or articulation.stated:
             continue
@@ -74,18 +73,18 @@ def _unstated_wrists(
         if len(moving) <= WRISTS.max_joints:
             session.report(f"{instrument.name}: searching for its links, as nothing states them: {', '.join(moving)}")
             shape = carved_shape(session, evidence, instrument.name, generator)
-            # a joint of the wrist may follow from the poses by chance
-            others = [joint for joint in instrument.left_out if joint in varying and not instrument.slides(joint)]
-            tree = search_wrist(evidence, instrument.name, shape, readings, moving, others[: WRISTS.max_others])
+            # a wrist joint may correlate with the poses by chance
+            unused = [joint for joint in instrument.left_out if joint in varying and not instrument.slides(joint)]
+            tree = search_wrist(evidence, instrument.name, shape, readings, moving, unused[: WRISTS.max_others])
         if tree is None:
             session.report(
                 f"warning: {instrument.name}: {', '.join(moving)}: several joints, no kinematics, and images show no "
                 f"wrist that they turn; each is learned as a hinge across the shaft, which fits jaws; {STATE_LINKS}"
             )
         else:
-            found[instrument.name] = tree
+            trees[instrument.name] = tree
             session.report(f"{instrument.name}: images show its links: {_words(tree)}; if that is wrong, {STATE_LINKS}")
-    return found
+    return trees
 
 
 def _words(tree: KinematicTree) -> str:
@@ -93,15 +92,15 @@ def _words(tree: KinematicTree) -> str:
 
 
 def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Replace the instruments' Gaussians by seeds on shapes carved anew, at the states as corrected so far: what the
-    former states taught is forgotten. Where carving finds none, those that were learned stay. The session's views are
-    those of searches."""
+    """Replace the instruments' Gaussians by seeds on shapes carved again with the states corrected so far, and discard
+    what was learned with the former states. Where carving fails, the learned ones stay. The session's views are those
+    of searches."""
     before, articulations = session.scene.canonical, {key: t.clone() for key, t in articulated.state_dict().items()}
     scene, breathing = session.scene, articulated.breathing if isinstance(articulated, BreathingTissue) else None
     scene.canonical = tissue = scene.canonical.map(
         lambda tensor: tensor[scene.canonical.body(0)].detach().clone(), scene.canonical.counts[:1]
     )
-    with torch.enable_grad():  # tissue learned together with an instrument leaves much more unexplained
+    with torch.enable_grad():  # tissue learned jointly with an instrument leaves larger residuals
         fitted = fit_tissue(scene, session.views, session.config, breathing=breathing)
         evidence = tissue_evidence(scene, session.views, session.config, fitted)
     if session.silhouettes is not None:
@@ -116,7 +115,7 @@ def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -
             articulation.shaft_shift.zero_()
         try:
             scene.canonical = _with_instruments(session, articulated, evidence, list(zip(shafts, axes, strict=True)))
-        except NeecoError:  # without shape, few frames whose states are still off
+        except NeecoError:  # no shape: too few frames, whose states are still wrong
             scene.canonical = before
             articulated.load_state_dict(articulations)
             session.report("carving the instruments anew finds no shape: they go on as learned")
@@ -133,9 +132,9 @@ def _with_instruments(
     recorded: Evidence,
     learned: Sequence[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]] | None = None,
 ) -> CanonicalGaussians:
-    """Return the Gaussians of the session's tissue and of every instrument on its carved shape, and start the joints.
-    learned: shaft and axes of each so far (see `Articulation`), which hinges keep; None: hinges are searched for, and
-    poses of stated links corrected."""
+    """Return the Gaussians of the session's tissue and of every instrument on its carved shape, and initialise the
+    joints. learned: shaft and axes of each instrument (see `Articulation`), which hinges keep; None: hinges are
+    searched, and poses of stated links corrected."""
     scene, evidence = session.scene, recorded
     generator = torch.Generator().manual_seed(session.config.seed)
     bodies = [scene.canonical]
@@ -151,7 +150,7 @@ def _with_instruments(
                 evidence = replace(recorded, frames=tuple(corrected))
                 shape = carved_shape(session, evidence, instrument.name, generator)
                 shape = align_to_links(session, articulation, evidence, instrument.name, shape, generator)
-        elif learned is not None:  # carving few frames anew may take the rear end for the jaws
+        elif learned is not None:  # carving few frames may mistake the rear end for the jaws
             base, settings = frame_along(*learned[index][0]), session.config.deformation.carving
             shape = carve_along(evidence, instrument.name, base, shape.level, generator, settings) or shape
         articulation.base.copy_(shape.instrument_from_shaft)
@@ -177,8 +176,8 @@ def _with_instruments(
 def _color_seeds(
     canonical: CanonicalGaussians, session: GaussianSession, articulated: ArticulatedInstruments, evidence: Evidence
 ) -> None:
-    """Give all seeds in a slice of a shaft one colour, as images show those with most evidence. Seeds much brighter
-    than the images turn transparent before they darken; in colours of their own, those beside an instrument persist."""
+    """Give all seeds in a slice of a shaft one colour, from the images with most evidence: seeds much brighter than the
+    images turn transparent before they darken, and individual colours let seeds next to the shaft persist."""
     assert isinstance(articulated, Deformation)
     pose, numbers = articulated.poser(canonical), _view_numbers(session, evidence)
     total = canonical.means.new_zeros(len(canonical), 4)  # of colours, and of weights
@@ -201,7 +200,7 @@ def _color_seeds(
 
 
 def _corrected_evidence(session: GaussianSession, evidence: Evidence) -> Evidence:
-    """Return the evidence with the states as corrected so far, without frames that were left out."""
+    """Return the evidence with the states corrected so far, without excluded frames."""
     scene, refinement, numbers = session.scene, session.refinement, _view_numbers(session, evidence)
     states = [scene.registered(refinement.state(k, f.state)) for k, f in zip(numbers, evidence.frames, strict=True)]
     frames = tuple(replace(frame, state=state) for frame, state in zip(evidence.frames, states, strict=True))
@@ -210,26 +209,26 @@ def _corrected_evidence(session: GaussianSession, evidence: Evidence) -> Evidenc
 
 
 def _view_numbers(session: GaussianSession, evidence: Evidence) -> list[int]:
-    """Return the number of each of the evidence's frames among the session's views."""
+    """Return the index, among the session's views, of each frame of the evidence."""
     numbers = {frame.name: number for number, frame in enumerate(session.views.frames)}
     return [numbers[frame.name] for frame in evidence.frames]
 
 
 def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue: GaussianScene) -> GaussianScene:
-    """Return `tissue`, a fit of still tissue, or, where it breathes, a new fit with the breathing that was found, from
-    which `breathes` then starts."""
+    """Return `tissue`, a static fit; or, where the tissue breathes, a new fit with the estimated breathing, from which
+    `breathes` then starts."""
     scene, views, config = session.scene, session.views, session.config
     begun = find_breathing(tissue, views)
     if begun is None:
         return tissue
-    breathing, found = begun
-    session.report(f"the tissue breathes with a period of {found.period:.2f} s: fitting it again")
+    breathing, motion = begun
+    session.report(f"the tissue breathes with a period of {motion.period:.2f} s: fitting it again")
     tissue = fit_tissue(scene, views, config, breathing=breathing)
     deformation = tissue.deformation
     assert isinstance(deformation, BreathingTissue)
     assert deformation.breathing is not None
     breathes.start_breathing(deformation.breathing)
     scene.diagnostics["breathing"] = deformation.breathing.describe(scene.recorded.cameras) | {
-        "explained": round(found.explained, 3)
+        "explained": round(motion.explained, 3)
     }
     return tissue

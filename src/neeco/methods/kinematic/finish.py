@@ -1,4 +1,4 @@
-"""After training: extent of each instrument, prolonged shafts, and the verdict on each joint."""
+"""After training: extent of each instrument, extended shafts, and the verdict on each joint."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ from neeco.training.session import GaussianSession
 
 @dataclass(frozen=True, kw_only=True)
 class FinishSettings:
-    """Thresholds of what is concluded after training."""
+    """Thresholds of the final steps."""
 
-    min_visible_share: float = 0.2  # of the pixels that a Gaussian covers of its instrument rendered alone
-    min_pixels_alone: float = 0.05  # px covered there, in all frames together: below, its own instrument occludes it
+    min_visible_share: float = 0.2  # minimum visible share of the pixels covered when rendered alone
+    min_pixels_alone: float = 0.05  # px covered when rendered alone, over all frames: below, it is self-occluded
     max_occlusion_frames: int = 64  # evenly spaced
     # frames that show tissue in a Gaussian's place, from which on it is no instrument: number, and share of those that
     # show either for certain
     refuting_frames: int = 2
     refuting_share: float = 0.25
-    max_gap_mm: float = 3.0  # between solid Gaussians of one instrument; beyond, they are detached from it
-    cells_per_gap: int = 4  # of the grid on which they are connected, which bounds the pairs however dense they are
+    max_gap_mm: float = 3.0  # maximum gap between solid Gaussians of one instrument; beyond, they are detached
+    cells_per_gap: int = 4  # grid cells per gap for finding connected components, which bounds the number of pairs
     # training frames that must observe a position of the shaft for it to be copied: share, and number (half at most)
     min_coverage: float = 0.08
     min_frames: int = 6
-    max_end_coverage: float = 0.3  # share of frames above which the observed rear end is the real end
-    min_joint_explained: float = 0.35  # share of the moving parts' error that a found joint explains
-    slab_radii: float = 1.5  # length of the repeated slab, in shaft radii
+    max_end_coverage: float = 0.3  # share of frames above which the observed rear end counts as the real one
+    min_joint_explained: float = 0.35  # minimum share of the moving parts' error that a joint must explain
+    slab_radii: float = 1.5  # length of the copied slab, in shaft radii
 
 
 FINISH = FinishSettings()
@@ -55,7 +55,7 @@ FINISH = FinishSettings()
 
 @torch.no_grad()
 def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Drop refuted, occluded and detached Gaussians of instruments, set the extent of each, prolong its shaft and write
+    """Drop refuted, occluded and detached Gaussians of instruments, set the extent of each, extend its shaft and write
     the joints' verdicts into `scene.diagnostics`. Warn of an instrument of which hardly anything was learned.
     """
     session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
@@ -96,7 +96,7 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
 
 
 def finalise_links(canonical: CanonicalGaussians, articulated: ArticulatedInstruments) -> CanonicalGaussians:
-    """Return the canonical Gaussians without links that their positions rule out."""
+    """Return the canonical Gaussians with links excluded by position."""
     logits = canonical.extras[LINK_LOGITS].clone()
     for index, articulation in enumerate(articulated.articulations):
         rows = canonical.body(index + 1)
@@ -105,8 +105,7 @@ def finalise_links(canonical: CanonicalGaussians, articulated: ArticulatedInstru
 
 
 def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, index: int, name: str) -> dict[str, Any]:
-    """Return the verdict on the joint of a reading: whether the reading explains the image of the moving parts in the
-    training frames of its extremes.
+    """Return the verdict on a joint: whether its reading explains its parts in training frames of extreme readings.
 
     `explained` = 1 - error(reading) / error(mean reading), over pixels that a moving part covers in either rendering.
     """
@@ -119,11 +118,11 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
     moving[scene.canonical.body(index + 1), 0] = articulation.moved_by(
         name, articulated.link_weights(scene.canonical, index)
     )
-    given = middle = 0.0
+    reading_error = mean_error = 0.0
     for frame_index in extremes:
         state, camera = session.corrected(frame_index)
-        target, own = session.views.target(frame_index), state.instruments[instrument.name]
-        middle_state = InstrumentState(own.pose, {**own.joints, name: float(readings.mean())})
+        target, recorded_state = session.views.target(frame_index), state.instruments[instrument.name]
+        middle_state = InstrumentState(recorded_state.pose, {**recorded_state.joints, name: float(readings.mean())})
         renderings = [
             rasterize(scene.at(variant), camera, channels=moving)
             for variant in (state, replace(state, instruments={**state.instruments, instrument.name: middle_state}))
@@ -133,8 +132,8 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
         if mask is not None:
             covered &= mask
         errors = [float((r.color - target).abs().mean(-1)[covered].sum()) for r in renderings]
-        given, middle = given + errors[0], middle + errors[1]
-    explained = 1 - given / middle if middle > 0 else 0.0
+        reading_error, mean_error = reading_error + errors[0], mean_error + errors[1]
+    explained = 1 - reading_error / mean_error if mean_error > 0 else 0.0
     explains = bool(explained > FINISH.min_joint_explained and math.isfinite(explained))
     warning = scene.diagnostics.get("doubted_readings", {}).get(f"{instrument.name}.{name}")
     usual = replace(session.config, iterations=None).for_frames(len(session.views.frames)).length
@@ -163,10 +162,10 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
 
 
 def drop_refuted(session: GaussianSession) -> CanonicalGaussians:
-    """Return the canonical Gaussians without those of instruments in whose place training images show tissue.
+    """Return the canonical Gaussians without those of instruments at whose position training images show tissue.
 
-    An instrument hides the tissue behind it in every frame. What one or two frames taught does not, and it would be
-    labelled in new states. Tissue within the standard deviation of a frame's state does not count.
+    An instrument occludes the tissue behind it in every frame. Gaussians learned from one or two frames do not, and
+    would be labelled in new states. Tissue within the standard deviation of a frame's state does not count.
     """
     canonical, refinement = session.scene.canonical, session.refinement
     indices = [k for k in session.frames_along_poses(FINISH.max_occlusion_frames) if refinement.counts(k)]
@@ -182,15 +181,15 @@ def drop_refuted(session: GaussianSession) -> CanonicalGaussians:
         column, row = pixels.nan_to_num().long().unbind(-1)
         place = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
         surface = torch.from_numpy(view.depth).to(depths)
-        shown = canonical.of_instruments & in_image(means, camera) & (depths < CARVING.behind * surface[place])
-        if not bool(shown.any()):
+        in_front = canonical.of_instruments & in_image(means, camera) & (depths < CARVING.behind * surface[place])
+        if not bool(in_front.any()):
             continue
         deviation = float(refinement.pose_sd[refinement.instants[index], :, 3:].max())
-        margin = 2 * int(deviation * camera.fx / float(depths[shown].median())) + 1
+        margin = 2 * int(deviation * camera.fx / float(depths[in_front].median())) + 1
         certainty = foreground.certainty(view, foreground.settings.reach)
         tissue = cv2.erode((certainty < -QUALITY.certain).astype(np.uint8), np.ones((margin, margin), np.uint8))
         for votes, where in ((refuting, tissue > 0), (confirming, certainty > QUALITY.certain)):
-            votes += shown & torch.from_numpy(where).to(shown.device)[place]
+            votes += in_front & torch.from_numpy(where).to(in_front.device)[place]
     refuted = (refuting >= FINISH.refuting_frames) & (refuting > FINISH.refuting_share * (refuting + confirming))
     return _selected(canonical, ~refuted)
 
@@ -198,8 +197,8 @@ def drop_refuted(session: GaussianSession) -> CanonicalGaussians:
 def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
     """Return the canonical Gaussians without those of instruments that other bodies occlude in nearly every frame.
 
-    No image constrains them: they lie inside another instrument of the same arm, or in the tissue. Rendered alone,
-    they would widen the instrument.
+    No image constrains them: they lie inside another instrument of the same arm, or in the tissue, and would widen the
+    instrument when it is rendered alone.
     """
     canonical, recorded = scene.canonical, scene.recorded
     instruments = [canonical.bodies == body for body in range(1, len(canonical.counts))]  # bool [N] each
@@ -209,17 +208,17 @@ def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
         with torch.no_grad():
             posed = scene.at(recorded.states[index])
         visible += visible_pixels(posed, camera)
-        for own in instruments:
-            alone[own] += visible_pixels(posed.select(own), camera)
+        for rows in instruments:
+            alone[rows] += visible_pixels(posed.select(rows), camera)
     stays = (canonical.bodies == 0) | (alone < FINISH.min_pixels_alone) | (visible >= FINISH.min_visible_share * alone)
     return _selected(canonical, stays)
 
 
 def drop_detached(canonical: CanonicalGaussians) -> CanonicalGaussians:
-    """Return the canonical Gaussians without those of instruments that are detached from the rest of their instrument.
+    """Return the canonical Gaussians without those detached from the rest of their instrument.
 
-    An instrument is connected. A cloud beside it is tissue that moved as the instrument did in a few frames, or that no
-    frame looked at, and it would be labelled in new states.
+    A detached cloud is tissue that moved like the instrument in a few frames, or that no frame observed, and would be
+    labelled in new states.
     """
     stays = canonical.bodies == 0
     for body in range(1, len(canonical.counts)):
@@ -242,7 +241,7 @@ def drop_detached(canonical: CanonicalGaussians) -> CanonicalGaussians:
 
 
 def _selected(canonical: CanonicalGaussians, chosen: Tensor) -> CanonicalGaussians:
-    """Return the `chosen` [N] bool of the canonical Gaussians."""
+    """Return the subset `chosen` [N] bool of the canonical Gaussians."""
     counts = tuple(int(chosen[canonical.body(body)].sum()) for body in range(len(canonical.counts)))
     return canonical.map(lambda tensor: tensor[chosen], counts)
 

@@ -1,6 +1,6 @@
-"""Revolute joints across the shaft that are found from the images: each turns one or two jaws by one reading.
+"""Revolute joints across the shaft, estimated from the images: each turns one or two jaws by one reading.
 
-The search tries stick figures, and seeds the parts that turn about the joints found.
+The search scores stick figures, and seeds the parts that turn about the estimated joints.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from neeco.training.session import GaussianSession
 
 @dataclass(frozen=True, kw_only=True)
 class HingeSettings:
-    """Places of links about a hinge, and thresholds of parts and tips."""
+    """Link assignment about a hinge, and thresholds of parts and tips."""
 
-    jaw_start_radii: float = 0.75  # beyond the hinge, where there is nothing but jaws
+    jaw_start_radii: float = 0.75  # shaft radii beyond the hinge, from where there are only jaws
     # radii from the middle of the hinge's axis: short of that place are only the prongs that hold the jaws
     prongs_from: float = 0.55
-    border_width_radii: float = 0.2  # of either border
-    ruled_out_margin: float = 10.0  # by which the logit of a link that positions rule out is below all others
-    max_fixed_jaw_gain: float = 0.25  # rad per rad of reading: a jaw that turns less is fixed
+    border_width_radii: float = 0.2  # width of either transition
+    ruled_out_margin: float = 10.0  # logits by which links excluded by position are below all others
+    max_fixed_jaw_gain: float = 0.25  # rad per rad of reading: a jaw with a smaller gain is fixed
 
 
 HINGES = HingeSettings()
@@ -49,7 +49,7 @@ class Hinges(Articulation):
     """
 
     middle: Tensor  # [J] rad or mm, as the readings
-    closed: Tensor  # [J] the lowest recorded reading; nan: not known
+    closed: Tensor  # [J] the lowest recorded reading; nan: unknown
     rates: ClassVar[Mapping[str, float]] = {
         **Articulation.rates,
         "hinge_angle": 1e-2,
@@ -83,7 +83,7 @@ class Hinges(Articulation):
 
     @property
     def jaw_gains(self) -> Tensor:
-        """[J, 2] rad of each jaw per rad of reading."""
+        """Return the gains [J, 2], rad of each jaw per rad of reading."""
         return self.scale[:, None] * torch.stack([self.share, self.share - 1], -1)
 
     @property
@@ -106,7 +106,7 @@ class Hinges(Articulation):
         return None
 
     def axes(self, shaft: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        """No gradient reaches the shaft: it is learned by spinning alone, or the hinges would move it."""
+        """Return the axes without gradient of the shaft, which is learned by spinning alone."""
         origin, direction = (part.detach() for part in shaft or self.shaft())
         angle = self.hinge_angle
         around = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1) @ self.base[:3, :3].T
@@ -130,8 +130,8 @@ class Hinges(Articulation):
         return pivots[joint], axes[joint]
 
     def joint_points(self, readings: Mapping[str, float], shaft: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
-        """Return the first joint's hinge, and the tips of its left and right jaw. A tip that was not measured lies at
-        the shaft's end when the joint is closed."""
+        """Return the first joint's hinge, and the tips of its left and right jaw. An unmeasured tip lies at the shaft's
+        end when the joint is closed."""
         if not self.jointed:
             return {}
         pivots, axes = self.axes(shaft)
@@ -144,7 +144,7 @@ class Hinges(Articulation):
         return {"hinge": pivots[0], "tip_left": left, "tip_right": right}
 
     def link_shares(self, points: Tensor, weights: Tensor) -> Tensor:
-        """A fixed jaw is learned as shaft, since it moves with it: beyond the hinge there are only jaws."""
+        """Return the link weights; a fixed jaw, learned as shaft, is assigned to the jaws beyond the hinge."""
         along, body, jaws = self.along_shaft(points), weights[:, 0], []
         for joint in range(len(self.reading_names)):
             beyond = along > self.hinge_depth[joint] + HINGES.jaw_start_radii * self.radius  # [M]
@@ -165,17 +165,17 @@ class Hinges(Articulation):
     def settled(self, points: Tensor, logits: Tensor) -> Tensor:
         if not self.jointed:
             return logits
-        own, ruled_out = logits[:, : self.link_count], self._ruled_out(points) > 0.5
-        lowest = own.masked_fill(ruled_out, torch.inf).amin(1, keepdim=True)
-        settled = torch.where(ruled_out, torch.minimum(own, lowest - HINGES.ruled_out_margin), own)
+        link_logits, ruled_out = logits[:, : self.link_count], self._ruled_out(points) > 0.5
+        lowest = link_logits.masked_fill(ruled_out, torch.inf).amin(1, keepdim=True)
+        settled = torch.where(ruled_out, torch.minimum(link_logits, lowest - HINGES.ruled_out_margin), link_logits)
         return torch.cat([settled, logits[:, self.link_count :]], 1)
 
     @torch.no_grad()
     def _ruled_out(self, points: Tensor) -> Tensor:
-        """Return how strongly points [M, 3] mm rule out each link, [M, link_count] in [0, 1].
+        """Return how strongly points [M, 3] mm exclude each link, [M, link_count] in [0, 1].
 
-        Near a hinge all links move similarly, and images hardly separate them. But jaws turn between the prongs that
-        hold them, and beyond those there is nothing else unless a jaw is fixed."""
+        Near a hinge all links move similarly, and images hardly discriminate between them. But jaws turn between the
+        prongs of the clevis, and distal to these there are only jaws unless one is fixed."""
         along, beyond, columns = self.along_shaft(points), points.new_ones(len(points)), []
         for joint in range(len(self.reading_names)):
             pivot, axis = self.hinge(joint)
@@ -193,10 +193,10 @@ class Hinges(Articulation):
         return (gains < HINGES.max_fixed_jaw_gain) & (gains == gains.min())
 
     def left_right_order(self, joint: int, axes: Tensor | None = None) -> Tensor:
-        """Return a joint's two jaws (0 and 1) as indices [2], the left one first; `axes`: those of `axes()`, if known.
+        """Return a joint's two jaws (0 and 1) as indices [2], the left one first; `axes`: result of `axes()`, if
+        computed.
 
-        The hinge axis is given the sign that makes its largest component in the instrument frame positive; the left
-        jaw opens towards (shaft direction x axis).
+        The largest component of the hinge axis is made positive; the left jaw opens towards (shaft direction x axis).
         """
         axis = (self.axes()[1] if axes is None else axes)[joint]
         sign = torch.sign(axis.gather(0, axis.abs().argmax()[None]))
@@ -222,14 +222,14 @@ class Hinges(Articulation):
 class HingeSearchSettings:
     """Settings of the search for hinges."""
 
-    body_logit: float = 2.0  # initial link logit of seeds on the shaft's side of the hinge
-    # jaw angle per reading: two jaws share the opening, or one takes it all
+    body_logit: float = 2.0  # initial link logit of seeds proximal to the hinge
+    # jaw angle per reading: both jaws share the opening, or one has all of it
     gains: tuple[tuple[float, float], tuple[float, float]] = ((0.5, -0.5), (1.0, 0.0))
-    small_gain: float = 0.3  # a smaller rotation, which tolerates rough evidence
-    min_reading_range: float = 0.05  # rad: a joint that moves less is not searched
-    n_stick_points: int = 16  # of a stick, whose evidence is averaged
-    n_hinge_angles: int = 36  # axis directions tried over half a turn
-    n_hinge_depths: int = 10  # pivots tried along the front half
+    small_gain: float = 0.3  # for smaller rotations, which tolerate rough evidence
+    min_reading_range: float = 0.05  # rad: a joint with a smaller range is not searched
+    n_stick_points: int = 16  # points per stick, over which evidence is averaged
+    n_hinge_angles: int = 36  # axis directions per half turn
+    n_hinge_depths: int = 10  # pivot positions along the front half
 
 
 STICKS = HingeSearchSettings()
@@ -269,8 +269,8 @@ def start_hinges(
                 across = learned[1][index] @ hinges.base[:3, :2]
                 hinges.hinge_angle[index] = torch.atan2(across[1], across[0])
                 hinges.hinge_depth[index] = hinges.along_shaft(learned[0])[index]
-            elif found := search_hinge(evidence, name, joint, shape, session.config.deformation.carving):
-                hinges.hinge_angle[index], hinges.hinge_depth[index], gains = found
+            elif hypothesis := search_hinge(evidence, name, joint, shape, session.config.deformation.carving):
+                hinges.hinge_angle[index], hinges.hinge_depth[index], gains = hypothesis
                 hinges.share[index] = 1.0 if gains[1] == 0 else 0.5
             else:
                 session.report(f"{name}: joint {joint} hardly moves in the training frames; its hinge cannot be found")
@@ -288,8 +288,8 @@ def start_hinges(
 
 @torch.no_grad()
 def unbend_seeds(hinges: Hinges, seeds: Tensor, logits: Tensor) -> Tensor:
-    """Return seeds [M, 3] mm, carved with the joints at their offsets, turned to zero offsets, to which the hinges are
-    set: there a change of hinge or gains moves nothing."""
+    """Return seeds [M, 3] mm, carved with the joints at their offsets, rotated to zero offsets, at which the hinges are
+    set: there, changes of hinge or gains have no effect."""
     weights = torch.softmax(logits[:, : hinges.link_count], -1)
     for joint, (pivot, axis) in enumerate(zip(*hinges.axes(), strict=True)):
         angles = weights[:, 1 + 2 * joint : 3 + 2 * joint] @ hinges.offsets[joint]
@@ -299,7 +299,7 @@ def unbend_seeds(hinges: Hinges, seeds: Tensor, logits: Tensor) -> Tensor:
 
 
 def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Generator) -> Tensor:
-    """Return link logits [M, columns]: behind the first hinge the body, beyond it one of the moving parts at random."""
+    """Return link logits [M, columns]: the body proximal to the first hinge, else a random moving part."""
     logits = 0.3 * torch.randn(len(seeds), columns, generator=generator).to(seeds)
     if not hinges.reading_names:
         return logits
@@ -335,13 +335,13 @@ def search_hinge(
     angles = torch.arange(STICKS.n_hinge_angles, device=evidence.device) * (math.pi / STICKS.n_hinge_angles)
     length = shape.tip - shape.near
     depths = np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, STICKS.n_hinge_depths).tolist()
-    score, over_rigid, known = [], [], line.cpu().numpy()
+    score, over_rigid, centre_line = [], [], line.cpu().numpy()
     for depth in depths:
         # points [Q, 3] of the centre line, shaft frame, from just beyond the pivot to just before the tip
         along = np.linspace(
             depth + 0.15 * (shape.tip - depth), shape.tip - 0.1 * (shape.tip - depth), STICKS.n_stick_points
         )
-        across = [np.interp(along, known[:, 0], known[:, k]) for k in (1, 2)]
+        across = [np.interp(along, centre_line[:, 0], centre_line[:, k]) for k in (1, 2)]
         stick = torch.from_numpy(np.stack([*across, along], -1)).to(line)
         scores = {
             gain: _stick_scores(evidence, camera_from_shaft, stick, depth, angles, turns=gain * opening, weight=opening)
@@ -353,10 +353,10 @@ def search_hinge(
     # [D, gains, A] mean evidence on the turned sticks, and that less the evidence on unturned ones, times the share of
     # the length they cover: the first prefers pivots too far back (short turns stay on the body), the second too far
     # forward
-    found = [torch.stack(each).cpu().numpy() for each in (score, over_rigid)]
-    (back, gains, _), (forward, *_) = (np.unravel_index(each.argmax(), each.shape) for each in found)
+    score_grids = [torch.stack(each).cpu().numpy() for each in (score, over_rigid)]
+    (back, gains, _), (forward, *_) = (np.unravel_index(each.argmax(), each.shape) for each in score_grids)
     # phase of the score's second harmonic over the hinge angle: uses all scores, not the peak alone
-    best = found[0].max((0, 1)).tolist()
+    best = score_grids[0].max((0, 1)).tolist()
     wave = sum(s * complex(math.cos(2 * a), math.sin(2 * a)) for a, s in zip(angles.tolist(), best, strict=True))
     angle = (math.atan2(wave.imag, wave.real) / 2) % math.pi
     return angle, (depths[back] + depths[forward]) / 2, STICKS.gains[gains]
@@ -372,7 +372,7 @@ def _stick_scores(
     turns: Tensor,
     weight: Tensor,
 ) -> Tensor:
-    """Return the mean evidence [A] on `stick` [Q, 3] for hinges at `angles` [A], turned by `turns` [F] rad, frames
+    """Return the mean evidence [A] on `stick` [Q, 3] for hinges at `angles` [A], rotated by `turns` [F] rad, frames
     weighted by `weight` [F]."""
     axis = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1)[:, None, None]  # [A, 1, 1, 3]
     arm = (stick - stick.new_tensor([0.0, 0.0, depth]))[None, None]  # [1, 1, Q, 3]

@@ -22,22 +22,22 @@ from neeco.training.session import GaussianSession
 class LampSearchSettings:
     """Settings of the search for lamps."""
 
-    # of the tissue's distance: a lamp nearer the lens would explain any dark edge
+    # as a share of the tissue's distance: a lamp closer to the lens would explain any dark edge
     candidate_radii: tuple[float, float] = (0.04, 0.08)
-    max_coverage: float = 0.05  # share of a pixel that is solid instrument, where the tissue is compared
-    n_lamp_frames: int = 12  # in which lamps are tried
-    n_lamp_directions: int = 8  # tried around the lens
-    min_agreement: float = 0.75  # share of the frames that the first lamps found improve, at least
-    min_further_agreement: float = 0.5  # of further lamps
-    min_explained: float = 0.005  # share of the squared error near the instruments that each lamp explains
-    margin_px: int = 3  # of search images, around a compared pixel without instrument
-    max_brightness: float = 0.8  # of white: errors at highlights exceed any shadow
+    max_coverage: float = 0.05  # share of a pixel covered by solid instrument, above which it is not compared
+    n_lamp_frames: int = 12  # frames used to score lamps
+    n_lamp_directions: int = 8  # candidate directions around the lens
+    min_agreement: float = 0.75  # minimum share of frames that the first lamps improve
+    min_further_agreement: float = 0.5  # the same for further lamps
+    min_explained: float = 0.005  # minimum share of the squared error near the instruments explained by each lamp
+    margin_px: int = 3  # px of search images, around compared pixels, that must show no instrument
+    max_brightness: float = 0.8  # of white: errors at highlights exceed those of any shadow
     min_brightness: float = 0.05  # of white, to which rendered colours are clamped
     max_residual: float = 0.1  # of white, to which residuals are clamped
-    faint_opacity: float = 0.5  # of an instrument's Gaussian: up to here it may model the shadow
-    faded_opacity: float = 0.02  # to which faint Gaussians are reset
-    max_strength: float = 0.9  # initially: a lamp that gives all the light has no gradient
-    max_cosine: float = 0.5  # between directions from the lens: lamps closer than 60 degrees would share one shadow
+    faint_opacity: float = 0.5  # maximum opacity of an instrument's Gaussian that may model the shadow
+    faded_opacity: float = 0.02  # opacity to which these Gaussians are reset
+    max_strength: float = 0.9  # initial maximum: a lamp that provides all the light has no gradient
+    max_cosine: float = 0.5  # between directions from the lens: lamps within 60 degrees would cast one shadow
 
 
 LAMPS = LampSearchSettings()
@@ -79,15 +79,15 @@ class _NormalEquations:
 @torch.no_grad()
 def find_shadow(session: GaussianSession) -> None:
     """Add to the scene's lamps those that best explain the residual of tissue, solid instruments and known shadows;
-    none where none explains enough."""
+    none if none explains enough."""
     scene = session.scene
     free = [lamp for lamp in range(MAX_LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
     if not scene.instruments or not free:
         return
     offsets = _candidates(2 * session.extent, LAMPS.n_lamp_directions).to(scene.center)
     equations = _normal_equations(session, offsets)
-    known = [scene.shadow_offsets[lamp] for lamp in range(MAX_LAMPS) if lamp not in free]
-    fit = _choose(equations, offsets, known, LAMPS.min_explained)
+    fixed_lamps = [scene.shadow_offsets[lamp] for lamp in range(MAX_LAMPS) if lamp not in free]
+    fit = _choose(equations, offsets, fixed_lamps, LAMPS.min_explained)
     agree = equations.agreement(fit)
     searches = scene.diagnostics.setdefault("shadow", [])
     searches.append(
@@ -98,13 +98,13 @@ def find_shadow(session: GaussianSession) -> None:
             "found_at_mm": [],
         }
     )
-    if not fit.chosen or agree < (LAMPS.min_further_agreement if known else LAMPS.min_agreement):
+    if not fit.chosen or agree < (LAMPS.min_further_agreement if fixed_lamps else LAMPS.min_agreement):
         return
     for lamp, candidate, strength in zip(free, fit.chosen, fit.strengths, strict=False):
         scene.shadow_offsets[lamp] = offsets[candidate]
         scene.shadow_strengths[lamp] = min(float(strength), LAMPS.max_strength)
         searches[-1]["found_at_mm"].append([round(float(v), 2) for v in offsets[candidate]])
-    logits = scene.canonical.opacity_logits  # of instruments, faint ones may have modelled the shadow
+    logits = scene.canonical.opacity_logits  # faint Gaussians of instruments may have modelled the shadow
     faint = scene.canonical.of_instruments & (torch.sigmoid(logits) <= LAMPS.faint_opacity)
     logits[faint] = logits[faint].clamp_max(math.log(LAMPS.faded_opacity / (1 - LAMPS.faded_opacity)))
     session.adam.forget("opacity_logits")
@@ -118,9 +118,8 @@ def _candidates(distance: float, directions: int) -> Tensor:
 
 
 def _choose(equations: _NormalEquations, offsets: Tensor, known: list[Tensor], min_explained: float) -> _Fit:
-    """Greedy choice among the lamps at `offsets` [C, 3]: one after the other the one that explains most, as long as it
-    explains `min_explained` of the error and is far enough from those chosen and `known`; at most MAX_LAMPS with
-    these."""
+    """Choose greedily among lamps at `offsets` [C, 3]: repeatedly the one that explains most, while it explains
+    `min_explained` of the error and is far enough from those chosen and `known`; at most MAX_LAMPS including these."""
     best = _Fit((), np.zeros(0), 0.0)
     while len(known) + len(best.chosen) < MAX_LAMPS:
         taken = [*known, *(offsets[k] for k in best.chosen)]
@@ -163,7 +162,7 @@ def _normal_equations(session: GaussianSession, offsets: Tensor) -> _NormalEquat
 
 def _render_candidates(session: GaussianSession, index: int, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Render frame `index` without the instruments' faint Gaussians, which may model the shadow: colour [H, W, 3], the
-    blocked share of each candidate's light [H, W, C], and the instruments' share of each pixel [H, W]."""
+    occluded share of each candidate's light [H, W, C], and the instruments' coverage [H, W]."""
     state, camera = session.corrected(index)
     scene = session.scene
     posed: Gaussians = scene.at(state)

@@ -31,16 +31,16 @@ from neeco.training.session import GaussianSession
 class LinkRegistrationSettings:
     """Priors and settings of the registration."""
 
-    max_frames: int = 30  # compared
-    widths: tuple[int, int] = (20, 40)  # cells across the images compared, coarse to fine
-    max_steps: tuple[int, int] = (8, 4)  # of Levenberg-Marquardt, at each width
-    cells_per_observation: float = 10.0  # of the finer images, whose errors are correlated
-    evidence_sd: float = 0.3  # of a cell; beyond it, the cost is linear
+    max_frames: int = 30  # frames compared, at most
+    widths: tuple[int, int] = (20, 40)  # width of the compared images in cells, coarse to fine
+    max_steps: tuple[int, int] = (8, 4)  # Levenberg-Marquardt steps at each width
+    cells_per_observation: float = 10.0  # cells of the fine images per independent observation (errors are correlated)
+    evidence_sd: float = 0.3  # of a cell; the cost is linear beyond (Huber)
     # of a residual; less where most frames have evidence, since the tissue's fit absorbed the instrument
     min_weight: float = 0.1
-    edge_cells: float = 0.6  # width over which a silhouette fades
-    shaft_length_mm: float = 150.0  # of the shaft that is compared, from its end
-    nearest_mm: float = 5.0  # depth from which it is compared
+    edge_cells: float = 0.6  # width of a silhouette's soft edge
+    shaft_length_mm: float = 150.0  # length of shaft that is compared, from its distal end
+    nearest_mm: float = 5.0  # minimum depth of compared geometry
     # rad, mm: standard deviations of the frame's error about and along the shaft
     frame_sd: tuple[float, float] = (0.035, 2.0)
     # of the shape: tilts (rad) and shifts (mm) of the carved shaft, log radii, heading (rad) and log length of end
@@ -48,19 +48,19 @@ class LinkRegistrationSettings:
     shaft_sd: tuple[float, float, float, float] = (0.1, 0.1, 2.0, 2.0)
     log_radius_sd: float = 0.4
     end_sd: tuple[float, float] = (0.15, 0.4)
-    link_radius: float = 0.8  # of links between joints, in carved radii
-    end_radius: float = 0.4  # of end links, in carved radii
-    end_length: float = 3.0  # of end links, in carved radii
-    step: float = 0.05  # finite differences, in standard deviations
-    model_error: float = 2.0  # of a standard deviation by the evidence: errors of the model are common to all frames
-    min_gain: float = 10.0  # of -log likelihood, from which a correction is made
-    # by which links alone are moved along the shaft, at least: training finds smaller errors by itself
+    link_radius: float = 0.8  # radius of links between joints, in carved radii
+    end_radius: float = 0.4  # radius of end links, in carved radii
+    end_length: float = 3.0  # length of end links, in carved radii
+    step: float = 0.05  # finite-difference step, in standard deviations
+    model_error: float = 2.0  # factor on standard deviations: model errors are common to all frames
+    min_gain: float = 10.0  # minimum gain in -log likelihood for a correction
+    # minimum shift of the links along the shaft; training finds smaller errors by itself
     min_along_mm: float = 3.0
 
 
 CAPSULES = LinkRegistrationSettings()
 
-# parameters of models, each with those of the one before: of the shape alone, the links as stated; of the links; of all
+# nested models, each with the parameters of the one before: shape alone (links as stated); links; all
 MODELS = (("shaft", "radii", "ends"), ("turns", "shifts", "offsets"), ("base", "frame"))
 
 
@@ -68,18 +68,18 @@ MODELS = (("shaft", "radii", "ends"), ("turns", "shifts", "offsets"), ("base", "
 class LinkRegistration:
     """A correction of an instrument's poses, and of its links in the tracked frame."""
 
-    base: Tensor  # [6] rotation vector (rad) about `center`, translation (mm), world frame; zero: the links suffice
+    base: Tensor  # [6] rotation vector (rad) about `center`, translation (mm), world frame; zero: links suffice
     center: Tensor  # [3] mm, world frame
     pivots: Tensor  # [J, 3] mm, of the joints at rest, tracked frame
     axes: Tensor  # [J, 3] unit
     offsets: Tensor  # [R] rad or mm, of the readings
-    needed: bool  # whether the evidence is explained significantly better, and the correction is not small
-    cost: float  # -log likelihood and prior, of the most general model
-    along_mm: float  # by which the first pivot moves along the shaft, mean over the frames
+    needed: bool  # whether the evidence is explained significantly better and the correction is not negligible
+    cost: float  # -log likelihood plus prior, of the most general model
+    along_mm: float  # shift of the first pivot along the shaft, mean over the frames
     along_sd_mm: float
 
     def about(self, center: Tensor) -> Tensor:
-        """Return `base` [6] with the rotation about another point [3] mm."""
+        """Return `base` [6] with its rotation about another point [3] mm."""
         arm = self.center - center
         moved = self.base[3:] + arm - rotation_from_vector(self.base[:3]) @ arm
         return torch.cat([self.base[:3], moved])
@@ -95,13 +95,8 @@ def register_links(
     *,
     stated: BaseUncertainty | None = None,
 ) -> LinkRegistration | None:
-    """Return the correction of instrument `name` with which its links explain the evidence best; None where no two
-    joints follow each other. `readings`: of every frame of the evidence; `stated`: the uncertainty of the base.
-
-    The links as stated, corrected links, and a corrected base and frame as well are compared: the simplest model
-    counts that no other betters significantly. A base's error moves all poses by one rigid motion of the world, the
-    frame's error moves the links along and about the shaft (across it, the learned shape absorbs it). About a trocar
-    both move the links alike along the shaft; then the priors decide, and the sum is what the images show.
+    """Return the correction of instrument `name` for which its links explain the evidence best; None without two
+    consecutive joints. `readings`: of every frame of the evidence; `stated`: the uncertainty of the base.
     """
     line = links.rest_line()
     if line is None:
@@ -115,15 +110,15 @@ def register_links(
     for more in MODELS:
         names += more
         problem.fit_only(names)
-        found = minimised(problem)
-        fits.append((tuple(names), found, problem.linearise(found)))
+        solved = minimised(problem)
+        fits.append((tuple(names), solved, problem.linearise(solved)))
     costs = [fitted.value for _, _, fitted in fits]
     chosen = next(k for k in range(len(fits)) if costs[k] - min(costs[k:]) < CAPSULES.min_gain)
-    fitted_names, found, fitted = fits[chosen]
+    fitted_names, solved, fitted = fits[chosen]
     problem.fit_only(fitted_names)
-    parts, along = problem.parts(found), problem.along_shaft(found)
+    parts, along = problem.parts(solved), problem.along_shaft(solved)
     slope = (
-        np.array([problem.along_shaft(found + step) - along for step in CAPSULES.step * np.eye(problem.size)])
+        np.array([problem.along_shaft(solved + step) - along for step in CAPSULES.step * np.eye(problem.size)])
         / CAPSULES.step
     )
     pivots, axes = problem.corrected_axes(parts)
@@ -149,34 +144,33 @@ def correct_poses(
     shape: CarvedShape,
     readings: list[dict[str, float]],
 ) -> bool:
-    """Correct the links of an instrument, or also its base, where that explains the evidence better; return whether
-    its poses moved.
+    """Correct the links of an instrument, or also its base, if that explains the evidence better; return whether its
+    poses moved.
 
-    Warns of its readings where others explain the evidence better than any correction: a frame that is off along the
-    shaft makes a joint seem reversed. `readings`: those of every frame of the evidence.
+    Warns of its readings if other ones explain the evidence better than any correction.
     """
     scene, name = session.scene, instrument.name
     doubt = doubted_readings(session, links, evidence, instrument, readings)
     stated = instrument.base_uncertainty
-    found = register_links(links, evidence, name, shape, readings, stated=stated)
-    if doubt is not None and found is not None:
-        other = register_links(links, evidence, name, shape, [doubt.change(given) for given in readings], stated=stated)
-        doubt = doubt if other is not None and other.cost < found.cost else None
+    fit = register_links(links, evidence, name, shape, readings, stated=stated)
+    if doubt is not None and fit is not None:
+        other = register_links(links, evidence, name, shape, [doubt.change(row) for row in readings], stated=stated)
+        doubt = doubt if other is not None and other.cost < fit.cost else None
     if doubt is not None:
         session.report(f"warning: {name}: its links fit the images {doubt.ratio:.1f} times as well {doubt.words}")
         doubted = {f"{name}.{reading}": f"the links fit the images better {doubt.words}" for reading in doubt.names}
         scene.diagnostics.setdefault("doubted_readings", {}).update(doubted)
-    if doubt is not None or found is None or not found.needed:
+    if doubt is not None or fit is None or not fit.needed:
         return False
-    base = found.about(scene.center)
+    base = fit.about(scene.center)
     with torch.no_grad():
         scene.base_corrections[scene.instruments.index(instrument)] = base
-        links.axis_shifts.copy_(found.pivots - links.points)
-        cosines = (links.directions * found.axes).sum(1, keepdim=True)
-        links.axis_turns.copy_(torch.linalg.cross(links.directions, found.axes) / cosines)
-        links.reading_offsets.copy_(found.offsets)
-    off, sd, degrees = -found.along_mm, found.along_sd_mm, float(torch.rad2deg(found.base[:3].norm()))
-    its_base = f", its base by {float(found.base[3:].norm()):.1f} mm and {degrees:.1f} degrees" if base.any() else ""
+        links.axis_shifts.copy_(fit.pivots - links.points)
+        cosines = (links.directions * fit.axes).sum(1, keepdim=True)
+        links.axis_turns.copy_(torch.linalg.cross(links.directions, fit.axes) / cosines)
+        links.reading_offsets.copy_(fit.offsets)
+    off, sd, degrees = -fit.along_mm, fit.along_sd_mm, float(torch.rad2deg(fit.base[:3].norm()))
+    its_base = f", its base by {float(fit.base[3:].norm()):.1f} mm and {degrees:.1f} degrees" if base.any() else ""
     session.report(
         f"{name}: the pose's frame is off along the shaft by {off:.1f} mm (standard deviation {sd:.1f} mm; positive: "
         f"towards the jaws){its_base}; corrected"
@@ -199,13 +193,13 @@ def base_root(stated: BaseUncertainty, center: Tensor) -> Tensor:
 
 
 def minimised(problem: SilhouetteProblem, *, coarse: bool = False) -> np.ndarray:
-    """Return the parameters of least cost, in standard deviations of those that are fitted. The problem then compares
-    the images of the last width; coarse: of the first alone."""
-    found = np.zeros(problem.size)
+    """Return the minimiser of the cost, in standard deviations of the fitted parameters. The problem then compares
+    images of the last width; coarse: of the first width only."""
+    solved = np.zeros(problem.size)
     for width, steps in list(zip(CAPSULES.widths, CAPSULES.max_steps, strict=True))[: 1 if coarse else None]:
         problem.compare_at(width)
-        found = levenberg_marquardt(found, problem.linearise, np.add, max_steps=steps, damping=1e-3, tolerance=1e-3)
-    return found
+        solved = levenberg_marquardt(solved, problem.linearise, np.add, max_steps=steps, damping=1e-3, tolerance=1e-3)
+    return solved
 
 
 class SilhouetteProblem:
@@ -234,7 +228,7 @@ class SilhouetteProblem:
         self.poses = torch.linalg.solve(to_camera, camera_from_instrument(self.evidence, name))
         self.center = self.poses[:, :3, 3].mean(0)
         joints = range(len(links.points))
-        # of every link but the shaft: the joint that carries it, and the joints that it carries
+        # of every link except the shaft: the joint that carries it, and the joints that it carries
         self.own = [links.joint_of(link) for link in range(1, links.link_count)]
         carriers = [links.link_of(group[0].parent) for group in links.joint_groups]
         self.carried = [[j for j in joints if carriers[j] == k] for k in range(1, links.link_count)]
@@ -251,7 +245,7 @@ class SilhouetteProblem:
         self.layout = {key: torch.tensor(spread).to(self.axis) for key, spread in spreads.items()}
 
     def fit_only(self, names: Sequence[str]) -> None:
-        """Fit the parameters of these names; others, and those without deviation, stay 0."""
+        """Fit only the parameters of these names; others, and those without a standard deviation, stay 0."""
         spread = torch.cat([spread * float(key in names) for key, spread in self.layout.items()])
         self.columns = torch.nonzero(spread)[:, 0]
         self.spread, self.size = spread, len(self.columns)
@@ -290,24 +284,24 @@ class SilhouetteProblem:
         )
 
     def cost(self, at: np.ndarray, residual: Tensor | None = None) -> float:
-        """Return -log likelihood and prior; `residual`: that of `at`, if known."""
+        """Return -log likelihood plus prior; `residual`: that of `at`, if already computed."""
         size = (self._residual(at) if residual is None else residual).abs()
         huber = torch.where(size < self._limit, 0.5 * size.square(), self._limit * (size - 0.5 * self._limit))
         return float(huber.sum(dtype=torch.float64)) + 0.5 * float(at @ at)
 
     @property
     def _limit(self) -> Tensor:
-        """Residuals [F * C] from which on the cost is linear."""
+        """Return the residuals [F * C] beyond which the cost is linear."""
         return (CAPSULES.evidence_sd * self.weight).flatten().repeat(len(self.target))
 
     def _residual(self, at: np.ndarray) -> Tensor:
-        """Return weighed differences [F * C] of silhouette and evidence."""
+        """Return weighted differences [F * C] of silhouette and evidence."""
         inside = self._inside_px(*self._capsules(self.parts(at)))
         silhouette = torch.sigmoid(inside / (CAPSULES.edge_cells * self.cell_px))
         return ((silhouette - self.target.flatten(1)) * self.weight.flatten()).flatten()
 
     def corrected_axes(self, parts: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return (pivots [J, 3] mm, axes [J, 3]) of the joints at rest, with their own and the frame's correction."""
+        """Return (pivots [J, 3] mm, axes [J, 3]) of the joints at rest, with both corrections."""
         turn, shift = rotation_from_vector(self.axis * parts["frame"][0]), self.axis * parts["frame"][1]
         pivots, axes = self.links.axes()
         pivots = pivots + parts["shifts"].view(-1, 3)
@@ -322,7 +316,7 @@ class SilhouetteProblem:
         return poses
 
     def along_shaft(self, at: np.ndarray) -> float:
-        """Return by how many mm the correction moves the first pivot along the shaft, mean over the frames."""
+        """Return the shift, mm, of the first pivot along the shaft by the correction, mean over the frames."""
         parts, zero = self.parts(at), self.parts(np.zeros(self.size))
         moved, still = self._corrected(parts), self._corrected(zero)
         shift = moved[:, :3, :3] @ self.corrected_axes(parts)[0][-1] + moved[:, :3, 3] - still[:, :3, 3]
@@ -339,16 +333,16 @@ class SilhouetteProblem:
         origin = base[:3, :3] @ torch.cat([shifts, shifts.new_zeros(1)]) + base[:3, 3]
         front = origin + ((pivots[-1] - origin) @ shaft) * shaft
         segments = [(0, torch.stack([front - CAPSULES.shaft_length_mm * shaft, front]), 1.0)]
-        for link, (own, carried) in enumerate(zip(self.own, self.carried, strict=True), 1):
-            segments += [(link, pivots[[own, joint]], CAPSULES.link_radius) for joint in carried]
+        for link, (hinge, carried) in enumerate(zip(self.own, self.carried, strict=True), 1):
+            segments += [(link, pivots[[hinge, joint]], CAPSULES.link_radius) for joint in carried]
             if carried:
                 continue
             (heading, length), ends = ends[0], ends[1:]
-            ahead = self.axis - (self.axis @ axes[own]) * axes[own]
+            ahead = self.axis - (self.axis @ axes[hinge]) * axes[hinge]
             ahead = nn.functional.normalize(ahead, dim=0)
-            ahead = heading.cos() * ahead + heading.sin() * torch.linalg.cross(axes[own], ahead)
-            tip = pivots[own] + CAPSULES.end_length * shape.radius * length.exp() * ahead
-            segments.append((link, torch.stack([pivots[own], tip]), CAPSULES.end_radius))
+            ahead = heading.cos() * ahead + heading.sin() * torch.linalg.cross(axes[hinge], ahead)
+            tip = pivots[hinge] + CAPSULES.end_length * shape.radius * length.exp() * ahead
+            segments.append((link, torch.stack([pivots[hinge], tip]), CAPSULES.end_radius))
         to_camera = self.evidence.camera_from_world @ self._corrected(parts)
         values = links.constants + torch.einsum("jlr,fr->fjl", links.gains, self.readings - parts["offsets"])
         placed = []
@@ -366,7 +360,7 @@ class SilhouetteProblem:
         return torch.stack(placed, 1), torch.stack(radii)
 
     def _inside_px(self, ends: Tensor, radii: Tensor) -> Tensor:
-        """Return how far [F, C] px every cell's middle lies inside the nearest capsule's outline."""
+        """Return the distance [F, C] px of every cell's centre inside the nearest capsule's outline."""
         far, near = ends.unbind(2)  # [F, S, 3]
         depth = near[..., 2] - far[..., 2]
         share = (CAPSULES.nearest_mm - far[..., 2]) / torch.where(depth.abs() > 1e-6, depth, 1e-6)

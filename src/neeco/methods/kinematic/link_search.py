@@ -1,4 +1,4 @@
-"""Start the links of a stated kinematic tree: carve each in its own frame, and check the readings that move it."""
+"""Initialise the links of a stated kinematic tree: carve each in its own frame, and check the readings that move it."""
 
 from __future__ import annotations
 
@@ -33,35 +33,35 @@ class LinkSearchSettings:
     """Settings of carving links and of the check of readings."""
 
     link_logit: float = 2.0  # initial logit of a seed for the link that it was carved on
-    shaft_share: float = 0.4  # of the seeds
-    reach_radii: float = 7.0  # shaft radii beyond its pivot within which an end link is searched
-    margin_radii: float = 2.0  # shaft radii about the pivots beyond it within which another link is searched
-    candidates_per_seed: int = 20  # sampled about a link
-    evidence_tolerance: float = 0.03  # by which the evidence of another link may be larger
-    # tolerances within which a carved shaft agrees with the line of the links at rest
+    shaft_share: float = 0.4  # share of the seeds on the shaft
+    reach_radii: float = 7.0  # shaft radii around its pivot in which an end link is searched
+    margin_radii: float = 2.0  # shaft radii around the adjacent pivots in which another link is searched
+    candidates_per_seed: int = 20  # candidates sampled per seed
+    evidence_tolerance: float = 0.03  # margin by which the evidence of another link may be larger
+    # tolerances for agreement of a carved shaft with the line of the links at rest
     min_cosine: float = 0.85  # between both directions
     max_offset_radii: float = 1.5  # of the line from the first pivot, in shaft radii
     max_offset_mm: float = 4.0  # the same, if larger
     # of the best evidence of a link's points: stated axes may be off, and all points with them
     min_relative_level: float = 0.85
-    min_radius_ratio: float = 0.33  # of the shaft's radius to the distance between the first two pivots
-    max_shaft_radius_mm: float = 6.5  # of instruments that pass a trocar
-    # shaft radii behind the first pivot: with less evidence, the shaft is seeded about its line
+    min_radius_ratio: float = 0.33  # minimum ratio of the shaft's radius to the distance of the first two pivots
+    max_shaft_radius_mm: float = 6.5  # of instruments that fit through a trocar
+    # shaft radii behind the first pivot: with less evidence, the shaft is seeded around its line
     min_evident_radii: float = 3.0
-    shaft_length: float = 0.3  # of the distance to the tissue: the shaft that is seeded about its line
-    side_tolerance_radii: float = 0.3  # by which a link that is searched on one side of its pivot may lie on the other
-    min_visible_share: float = 0.05  # of the frames, that must observe a seed
-    heading_sigma: float = 0.5  # rad, of stated headings
-    heading_weight: float = 0.02  # of evidence, by which a heading one such deviation off may be less likely
+    shaft_length: float = 0.3  # length of the shaft seeded around its line, as a share of the distance to the tissue
+    side_tolerance_radii: float = 0.3  # tolerance of a link searched on one side of its pivot
+    min_visible_share: float = 0.05  # minimum share of frames that observe a seed
+    heading_sigma: float = 0.5  # rad, standard deviation of stated headings
+    heading_weight: float = 0.02  # evidence penalty of a heading one standard deviation off
     # over half way open and straight on: where jaws move, any opening has some evidence
     min_evidence_gain: float = 0.25
     # check of the readings
     check_points: int = 1500  # per link
-    check_reach_radii: float = 4.0  # shaft radii about the pivots of end links within which they lie
-    check_margin_radii: float = 2.0  # shaft radii about the pivots of other links within which they lie
+    check_reach_radii: float = 4.0  # shaft radii around the pivots of end links that are sampled
+    check_margin_radii: float = 2.0  # shaft radii around the pivots of other links that are sampled
     max_check_frames: int = 80  # evenly spaced
-    min_volume_ratio: float = 1.15  # of the volume on evidence with other readings, from which a warning is given
-    check_min_visible_share: float = 0.1  # of the frames, that must observe a point
+    min_volume_ratio: float = 1.15  # volume on evidence, changed over original readings, that raises a warning
+    check_min_visible_share: float = 0.1  # minimum share of frames that observe a point
 
 
 LINKS = LinkSearchSettings()
@@ -82,10 +82,10 @@ def align_to_links(
     shape: CarvedShape,
     generator: torch.Generator,
 ) -> CarvedShape:
-    """Return `shape`, or one carved about the line of the links at rest where its line is another.
+    """Return `shape`, or one carved around the line of the links at rest if its own line differs.
 
-    An instrument that hardly turns leaves evidence along its lines of sight, too. The radius is at least a share of the
-    distance of the first pivots: where the tissue's fit absorbed a dark shaft, little evidence of it is left."""
+    An instrument that hardly rotates leaves evidence along its lines of sight as well. The radius is at least a share
+    of the distance of the first pivots: if the tissue's fit absorbed a dark shaft, little evidence of it remains."""
     line = links.rest_line()
     if line is None:
         return shape
@@ -102,22 +102,22 @@ def align_to_links(
     session.report(f"{name}: the shaft is searched along the stated links: carving found another line")
     base = frame_along(pivot, direction)
     carved = carve_along(evidence, name, base, shape.level, generator, session.config.deformation.carving)
-    found = shape if carved is None else carved
-    found = replace(found, radius=max(found.radius, thickness))
+    aligned = shape if carved is None else carved
+    aligned = replace(aligned, radius=max(aligned.radius, thickness))
     if (
         carved is not None
-        and carved.near < -LINKS.min_evident_radii * found.radius
-        and found.radius < LINKS.max_shaft_radius_mm
+        and carved.near < -LINKS.min_evident_radii * aligned.radius
+        and aligned.radius < LINKS.max_shaft_radius_mm
     ):
-        return found
-    return _shaft_about_line(found, base, thickness, LINKS.shaft_length * evidence.distance, generator)
+        return aligned
+    return _shaft_about_line(aligned, base, thickness, LINKS.shaft_length * evidence.distance, generator)
 
 
 def _shaft_about_line(
     shape: CarvedShape, base: Tensor, radius: float, length: float, generator: torch.Generator
 ) -> CarvedShape:
-    """Return `shape` with a full cylinder of seeds behind the origin of `base` [4, 4] (z along the shaft): where the
-    tissue's fit absorbed a shaft that hardly moves, or what is evident is not on its line."""
+    """Return `shape` with a full cylinder of seeds behind the origin of `base` [4, 4] (z along the shaft): the tissue's
+    fit absorbed a shaft that hardly moves, or the evidence is not on its line."""
     count = len(shape.seeds)
     random = torch.rand(count, 3, generator=generator, device=generator.device).to(shape.seeds)
     across, angle = radius * random[:, 0].sqrt(), 2 * math.pi * random[:, 1]
@@ -160,9 +160,9 @@ def start_links(
     seeds, owners = [of_shaft[chosen]], [torch.zeros(count, dtype=torch.long)]
     each = (settings.seeds - count) // max(links.link_count - 1, 1)
     for link in range(1, links.link_count):
-        found = _on_link(views, links, link, shape.radius, count=each, generator=generator, side=sides.get(link))
-        seeds.append(found)
-        owners.append(torch.full((len(found),), link))
+        link_points = _on_link(views, links, link, shape.radius, count=each, generator=generator, side=sides.get(link))
+        seeds.append(link_points)
+        owners.append(torch.full((len(link_points),), link))
     points, owner = torch.cat(seeds), torch.cat(owners).to(shape.seeds.device)
     logits = 0.3 * torch.randn(len(points), columns, generator=generator).to(points)
     return points, logits + LINKS.link_logit * nn.functional.one_hot(owner, columns)
@@ -185,42 +185,40 @@ def _open_links(
         if not opening:
             continue
         low, high = instrument.joints[reading] or (0.0, 0.0)
-        values, turned, found = low + (high - low) * OPENINGS, 0.0, False
+        values, turned, headed = low + (high - low) * OPENINGS, 0.0, False
         recorded = readings_of(session, evidence, name)
         scores = torch.stack(
             [
-                _plane_evidence(
-                    links, evidence, name, radius, opening, [given | {reading: value} for given in recorded]
-                )
+                _plane_evidence(links, evidence, name, radius, opening, [row | {reading: value} for row in recorded])
                 for value in values.tolist()
             ]
         )  # [openings, headings]
         likely = scores - LINKS.heading_weight * (HEADINGS / LINKS.heading_sigma).square()
         best, heading = divmod(int(likely.argmax()), len(HEADINGS))
         if float(scores[best, heading] - scores[len(OPENINGS) // 2, len(HEADINGS) // 2]) > LINKS.min_evidence_gain:
-            turned, found = float(HEADINGS[heading]), True
+            turned, headed = float(HEADINGS[heading]), True
             column = session.refinement.readings.index((name, reading))
             session.refinement.joints[:, column] = values[best] - instrument.halfway(reading)
         for link, (joint, sense) in opening.items():
             pivot, ahead, towards = _plane_between(links, joint, turned)
             opens_to = sense * towards
-            sides[link] = (pivot, torch.stack([ahead, opens_to]) if found else opens_to[None])
+            sides[link] = (pivot, torch.stack([ahead, opens_to]) if headed else opens_to[None])
     return sides
 
 
 def _opened_by(links: Articulation, reading: str) -> dict[int, tuple[int, float]]:
-    """Return {link: (joint, sense)} of links that a reading turns about one axis in opposite directions."""
-    found: dict[int, tuple[int, float]] = {}
-    for joint, own in enumerate(links.gains[:, :, links.reading_names.index(reading)]):  # [L - 1]
-        if bool((own > 0).any()) and bool((own < 0).any()) and not links.slides[joint]:
-            found |= {k + 1: (joint, 1.0 if gain > 0 else -1.0) for k, gain in enumerate(own.tolist()) if gain}
-    return found
+    """Return {link: (joint, sign)} of links that a reading turns about one axis in opposite directions."""
+    opened: dict[int, tuple[int, float]] = {}
+    for joint, gains in enumerate(links.gains[:, :, links.reading_names.index(reading)]):  # [L - 1]
+        if bool((gains > 0).any()) and bool((gains < 0).any()) and not links.slides[joint]:
+            opened |= {k + 1: (joint, 1.0 if gain > 0 else -1.0) for k, gain in enumerate(gains.tolist()) if gain}
+    return opened
 
 
 @torch.no_grad()
 def _plane_between(links: Articulation, joint: int, heading: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (pivot [3] mm, unit directions [3] of the links beyond and of positive rotation) at rest, for links turned
-    by `heading` (rad) about the joint's axis from the line of those before."""
+    """Return (pivot [3] mm, unit directions [3] of the distal links and of positive rotation) at rest, for links
+    rotated by `heading` (rad) about the joint's axis from the line of the proximal ones."""
     pivots, axes = links.axes()
     line = links.rest_line()
     along = links.shaft()[1] if line is None else line[1]
@@ -240,22 +238,22 @@ def _plane_evidence(
 ) -> Tensor:
     """Return the mean evidence [headings] of links that open, each next to the plane between them."""
     moved = link_motions(links, readings)  # [F, L, 4, 4]
-    own = camera_from_instrument(evidence, name)
-    far, along_axis, aside = (radius * PLANE_OFFSETS.to(own)).split(1, 1)  # [P, 1] each
+    poses = camera_from_instrument(evidence, name)
+    far, along_axis, aside = (radius * PLANE_OFFSETS.to(poses)).split(1, 1)  # [P, 1] each
     scores = []
     for link, (joint, sense) in opening.items():
         points = []
         for heading in HEADINGS.tolist():
-            pivot, ahead, towards = (part.to(own) for part in _plane_between(links, joint, heading))
+            pivot, ahead, towards = (part.to(poses) for part in _plane_between(links, joint, heading))
             axis = torch.linalg.cross(ahead, towards)
             points.append(pivot + far * ahead + along_axis * axis + sense * aside * towards)
-        found, _ = score_points(evidence, own @ moved[:, link], torch.cat(points))
-        scores.append(found.reshape(len(HEADINGS), -1).mean(1))
+        evident, _ = score_points(evidence, poses @ moved[:, link], torch.cat(points))
+        scores.append(evident.reshape(len(HEADINGS), -1).mean(1))
     return torch.stack(scores).mean(0).cpu()
 
 
 def readings_of(session: GaussianSession, evidence: Evidence, name: str) -> list[dict[str, float]]:
-    """Return the readings of every frame of the evidence; those of unrecorded joints as estimated so far."""
+    """Return the readings of every frame of the evidence; for unrecorded joints, the current estimates."""
     recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
     by_name = dict(zip(recorded.names, recorded.states, strict=True))
     return [dict(by_name[frame.name].instruments[name].joints) for frame in evidence.frames]
@@ -276,14 +274,14 @@ def link_motions(links: Articulation, readings: list[dict[str, float]]) -> Tenso
 
 
 def _extent_of(links: Articulation, link: int, reach: float, margin: float) -> tuple[Tensor, Tensor]:
-    """Return cubes at rest that contain a link: centres [K, 3] mm, half sizes [K] mm. They reach `reach` from its pivot
-    where no link follows, else to the pivots beyond plus `margin`."""
-    pivots, own = links.axes()[0], links.joint_of(link)
+    """Return cubes at rest that contain a link: centres [K, 3] mm, half sizes [K] mm. They extend `reach` from the
+    pivot of an end link, else to the next pivots plus `margin`."""
+    pivots, inner = links.axes()[0], links.joint_of(link)
     beyond = [j for j, group in enumerate(links.joint_groups) if links.link_of(group[0].parent) == link]
     if not beyond:
-        return pivots[own][None], pivots.new_tensor([reach])
-    middle = torch.stack([(pivots[own] + pivots[j]) / 2 for j in beyond])
-    half = torch.stack([(pivots[own] - pivots[j]).norm() / 2 + margin for j in beyond])
+        return pivots[inner][None], pivots.new_tensor([reach])
+    middle = torch.stack([(pivots[inner] + pivots[j]) / 2 for j in beyond])
+    half = torch.stack([(pivots[inner] - pivots[j]).norm() / 2 + margin for j in beyond])
     return middle, half
 
 
@@ -298,7 +296,7 @@ def _on_link(
     side: tuple[Tensor, Tensor] | None,
 ) -> Tensor:
     """Sample points [count, 3] mm at rest that stay on evidence when moved with a link, and better than with any other;
-    in the half spaces `side` (point mm, unit directions) where given."""
+    in the half spaces `side` (point mm, unit directions), if any."""
     device = links.points.device
     centers, reaches = (
         part.to(device) for part in _extent_of(links, link, LINKS.reach_radii * radius, LINKS.margin_radii * radius)
@@ -311,12 +309,12 @@ def _on_link(
         place, directions = (part.to(device) for part in side)
         outside = ((points - place) @ directions.T + LINKS.side_tolerance_radii * radius).clamp_max(0)  # [Q, K]
         points = points - 2 * outside @ directions  # mirrored into the half spaces
-    own, visible = views[link].scores(points)
-    likely = torch.nonzero((own > 0.5 * CARVING.min_level) & (visible > LINKS.min_visible_share))[:, 0]
-    others = torch.stack([view.scores(points[likely])[0] for k, view in enumerate(views) if k != link]).amax(0)
-    fits = own[likely] >= others - LINKS.evidence_tolerance
-    likely, score = likely[fits], own[likely][fits]
-    if not len(likely):  # no evidence: about its pivot; training moves them
+    scores, visible = views[link].scores(points)
+    likely = torch.nonzero((scores > 0.5 * CARVING.min_level) & (visible > LINKS.min_visible_share))[:, 0]
+    rival = torch.stack([view.scores(points[likely])[0] for k, view in enumerate(views) if k != link]).amax(0)
+    fits = scores[likely] >= rival - LINKS.evidence_tolerance
+    likely, score = likely[fits], scores[likely][fits]
+    if not len(likely):  # no evidence: sampled about its pivot; training moves them
         return points[:count] * 0 + centers[:1] + 0.5 * (points[:count] - centers[which[:count]])
     best = likely[score >= LINKS.min_relative_level * float(score.max())]
     again = torch.randint(len(best), (max(0, count - len(best)),), generator=generator, device=generator.device)
@@ -330,11 +328,11 @@ Readings = dict[str, float]
 
 @dataclass(frozen=True)
 class DoubtedReadings:
-    """Readings with which the links fit the images less well than with others."""
+    """Readings for which the links fit the images worse than for others."""
 
     names: tuple[str, ...]
-    ratio: float  # of the volume on evidence with other readings to that with the given ones
-    words: str  # what is other
+    ratio: float  # volume on evidence with the changed readings over that with the recorded ones
+    words: str  # description of the change
     change: Callable[[Readings], Readings]
 
 
@@ -342,10 +340,10 @@ class DoubtedReadings:
 def doubted_readings(
     session: GaussianSession, links: Articulation, evidence: Evidence, instrument: Instrument, readings: list[Readings]
 ) -> DoubtedReadings | None:
-    """Return what to doubt where the links keep more of their volume on evidence with two readings exchanged or one's
-    sign reversed. `readings`: those of every frame of the evidence.
+    """Return the readings to doubt: the links keep more of their volume on evidence with two readings exchanged or
+    one's sign reversed. `readings`: those of every frame of the evidence.
 
-    Swapped logs and reversed signs pass every check of numbers, but not the images."""
+    Swapped logs and reversed signs pass all numeric checks, but not a comparison with the images."""
     volumes = _Volumes(links, evidence, instrument.name, readings, session.config.seed)
     named = volumes.with_readings(dict)
     recorded = [name for name in links.reading_names if name not in instrument.unrecorded]
@@ -357,8 +355,8 @@ def doubted_readings(
     for name in recorded:
         words = f"with the sign of {name} reversed: is its axis, or its gain, the wrong way round?"
         changes.append(((name,), words, partial(_changed, {name: (-1.0, name)})))
-    found = [(volumes.with_readings(change), index) for index, (_, _, change) in enumerate(changes)]
-    most, index = max(found, default=(0.0, 0))
+    trials = [(volumes.with_readings(change), index) for index, (_, _, change) in enumerate(changes)]
+    most, index = max(trials, default=(0.0, 0))
     if most <= LINKS.min_volume_ratio * named:
         return None
     names, words, change = changes[index]
@@ -366,12 +364,12 @@ def doubted_readings(
 
 
 def _changed(taken: dict[str, tuple[float, str]], readings: Readings) -> Readings:
-    """Return `readings` with some `taken` as (sign, of which reading)."""
+    """Return `readings` with some replaced by others, `taken` as (sign, name of the source)."""
     return {**readings, **{name: sign * readings[source] for name, (sign, source) in taken.items()}}
 
 
 class _Volumes:
-    """Volume that stays on evidence, counted in sample points of all links together."""
+    """Volume that stays on evidence, as a number of sample points over all links."""
 
     def __init__(self, links: Articulation, evidence: Evidence, name: str, readings: list[Readings], seed: int) -> None:
         step = max(1, len(readings) // LINKS.max_check_frames)
@@ -395,8 +393,8 @@ class _Volumes:
         return (centers[which] + away * half[which, None]).to(self.evidence.device)
 
     def with_readings(self, change: Callable[[Readings], Readings]) -> float:
-        """Return the volume on evidence, in points, with the readings changed by `change`."""
-        moved = link_motions(self.links, [change(given) for given in self.readings])  # [F, L, 4, 4]
+        """Return the volume on evidence, in points, after `change` of the readings."""
+        moved = link_motions(self.links, [change(row) for row in self.readings])  # [F, L, 4, 4]
         total = 0.0
         for link, points in enumerate(self.points, 1):
             score, visible = score_points(self.evidence, self.camera_from_instrument @ moved[:, link], points)

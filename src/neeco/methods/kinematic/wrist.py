@@ -1,5 +1,5 @@
-"""Search for the wrist, where the shaft ends: the colour along it changes, or, on an instrument of one colour, it stops
-being a surface of revolution."""
+"""Search for the wrist at the shaft's end: the colour along the shaft changes there, or, on an instrument of one
+colour, the surface of revolution ends."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from neeco.training.session import GaussianSession
 class WristSettings:
     """Settings of the search for the wrist."""
 
-    n_profile_frames: int = 40  # whose colours along the shaft are used
-    n_spin_frames: int = 16  # in which shafts are spun to test their symmetry
+    n_profile_frames: int = 40  # frames whose colours along the shaft are used
+    n_spin_frames: int = 16  # frames in which shafts are spun to test their symmetry
     spin_angle: float = 0.5  # rad: small, so that visible sides stay in view
-    n_wrist_positions: int = 14  # whose symmetry is tested
-    max_cost_ratio: float = 1.01  # of the error with a new wrist position to that before
-    symmetry_tolerance: float = 0.25  # of the range of losses that spinning causes
+    n_wrist_positions: int = 14  # candidate positions
+    max_cost_ratio: float = 1.01  # maximum ratio of errors, new to previous wrist position
+    symmetry_tolerance: float = 0.25  # share of the range of losses caused by spinning
     bins_per_radius: int = 6  # of the colour profile along the shaft
-    min_body_share: float = 0.95  # of a pixel whose colour counts
-    min_facing: float = 0.6  # cosine between a ray and the shaft's normal, across the shaft: silhouettes are left out
+    min_body_share: float = 0.95  # minimum instrument coverage of a pixel whose colour counts
+    min_facing: float = 0.6  # cosine between ray and shaft normal, across the shaft: excludes silhouettes
     min_color: float = 0.02  # added to colours before the logarithm
-    min_pixels: int = 6  # on either side of a step, in one frame
-    min_frame_share: float = 0.2  # of the frames that show both sides of a step
-    min_step_ratio: float = 8.0  # of a step to the median of steps along the shaft
-    solid_opacity: float = 0.3  # from which a Gaussian counts as part of the instrument
-    radius_share: float = 0.9  # of the solid Gaussians lie within the shaft's radius
+    min_pixels: int = 6  # on either side of a step, per frame
+    min_frame_share: float = 0.2  # minimum share of frames that show both sides of a step
+    min_step_ratio: float = 8.0  # minimum ratio of a step to the median of steps along the shaft
+    solid_opacity: float = 0.3  # minimum opacity of a solid Gaussian
+    radius_share: float = 0.9  # quantile of solid Gaussians' distances that is the radius
     min_solid_gaussians: int = 10  # with fewer nothing is measured
 
 
@@ -45,15 +45,15 @@ WRIST = WristSettings()
 
 @dataclass(frozen=True)
 class Spin(Perturbation):
-    """`shaft_roll`: angle in rad by which everything behind the wrist is spun about the shaft (a surface of revolution
-    looks the same)."""
+    """`shaft_roll`: angle in rad by which the part behind the wrist is spun about the shaft (a surface of revolution is
+    invariant)."""
 
     shaft_roll: float = 0.0
 
 
 @torch.no_grad()
 def place_wrists(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Set every wrist to its estimated position."""
+    """Set every wrist position to its estimate."""
     for index in range(len(session.scene.instruments)):
         articulation = articulated.articulations[index]
         if articulation.jointed:
@@ -63,15 +63,15 @@ def place_wrists(session: GaussianSession, articulated: ArticulatedInstruments) 
 
 @torch.no_grad()
 def refine_wrists(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Estimate every wrist again, and move it unless spinning the part behind it then costs more than before."""
+    """Estimate every wrist position again; accept it unless the spinning error grows."""
     for index in range(len(session.scene.instruments)):
         articulation = articulated.articulations[index]
         if not articulation.jointed:
             continue
-        before, found = float(articulation.wrist_start), _boundary(session, articulated, index)
+        before, estimate = float(articulation.wrist_start), _boundary(session, articulated, index)
         frames = session.frames_along_poses(WRIST.n_spin_frames)
-        costs = {place: _spun_error(session, articulated, index, place, frames) for place in (before, found)}
-        articulation.wrist_start.fill_(found if costs[found] <= WRIST.max_cost_ratio * costs[before] else before)
+        costs = {place: _spun_error(session, articulated, index, place, frames) for place in (before, estimate)}
+        articulation.wrist_start.fill_(estimate if costs[estimate] <= WRIST.max_cost_ratio * costs[before] else before)
 
 
 def _boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float:
@@ -115,7 +115,7 @@ def _image_error(session: GaussianSession, index: int, perturbation: Perturbatio
 
 
 def color_boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float | None:
-    """Return the position in mm along the shaft where the recorded colour changes most; None without a clear step."""
+    """Return the position in mm along the shaft of the largest change of colour; None if there is none."""
     articulation = articulated.articulations[index]
     radius = float(articulation.radius)
     rear = float(solid_extent(session.scene.canonical, index, articulation)[0])
@@ -162,8 +162,8 @@ def _profile(
     like: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return a recorded image's colour along the shaft: sums [B, 3] over the pixels [B] of each bin, as log brightness
-    and two log ratios, to which the light's colour and distance add constants. `like` [M]: shares of Gaussians that
-    look like the shaft."""
+    and two log ratios, for which the light's colour and distance are additive constants. `like` [M]: weights of
+    Gaussians that look like the shaft."""
     scene = session.scene
     state, camera = session.corrected(frame_index)
     body = scene.canonical.means.new_zeros(len(scene.canonical), 1)
@@ -190,7 +190,7 @@ def _along_shaft(camera: Camera, pose: Tensor, articulation: Articulation) -> Te
     """Return the position [H, W] mm along the shaft where pixel rays meet its cylinder; nan where they miss or graze
     it.
 
-    Depths of the Gaussians are too imprecise: they lie in a cloud about the surface. pose [4, 4] world_from_instrument.
+    Depths of the Gaussians, a cloud around the surface, are too noisy. pose [4, 4] world_from_instrument.
     """
     origin, direction = articulation.shaft()
     rotation = pose[:3, :3]
@@ -215,7 +215,7 @@ def solid_gaussians(canonical: CanonicalGaussians, index: int) -> Tensor:
 
 def measure_radius(canonical: CanonicalGaussians, index: int, articulation: Articulation) -> None:
     """Set the shaft's radius to the quantile `radius_share` of the solid Gaussians' distances from its axis, well
-    behind the first joint; leave it where there are too few."""
+    behind the first joint; unchanged with too few."""
     points = canonical.means[canonical.body(index + 1)][solid_gaussians(canonical, index)]
     origin, direction = articulation.shaft()
     along = articulation.along_shaft(points)

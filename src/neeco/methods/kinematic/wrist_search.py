@@ -1,8 +1,8 @@
-"""Links of a wrist that nobody stated, found from the images: those whose capsules explain the evidence best.
+"""Links of an unstated wrist, estimated from the images: those whose capsules explain the evidence best.
 
-Wristed instruments are built alike: the shaft carries a wrist that turns about an axis across it, and the wrist carries
-two jaws that turn about a second axis, across the wrist and the first axis. What differs is where the axes lie, and
-which reading turns what.
+Wristed instruments share one structure: the shaft carries a wrist that turns about an axis across it, and the wrist
+carries two jaws that turn about a second axis, perpendicular to the wrist and the first axis. Unknown are the positions
+of the axes, and which reading drives what.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from neeco.methods.kinematic.link_registration import CAPSULES, SilhouetteProble
 
 @dataclass(frozen=True, kw_only=True)
 class WristSearchSettings:
-    """Wrists that are tried, and when one is taken."""
+    """Candidate wrists, and the criterion for accepting one."""
 
-    max_joints: int = 3  # that turn the links: the wrist, both jaws, and one against the other
-    max_others: int = 4  # joints that follow from the poses, of which one may be the wrist's
-    n_headings: int = 8  # of the first axis, about the shaft
+    max_joints: int = 3  # joints that drive the links: wrist, both jaws, and one jaw against the other
+    max_others: int = 4  # joints that correlate with the poses, one of which may be the wrist's
+    n_headings: int = 8  # headings of the first axis, about the shaft
     first_radii: tuple[float, ...] = (2.0, 3.5, 5.0, 6.5, 8.0)  # shaft radii from the first axis to the tip
     apart_radii: float = 2.0  # shaft radii from the first to the second axis
-    shares: tuple[float, ...] = (0.0, 0.3, 0.7, 1.0)  # of the opening, by which the first jaw turns if not by half
+    shares: tuple[float, ...] = (0.0, 0.3, 0.7, 1.0)  # share of the opening by which the first jaw turns, if not half
     n_fitted: int = 8  # number of trees that are fitted
-    turn_sd: float = 0.25  # rad, of an axis of the grid
-    shift_sd_mm: float = 4.0  # of a pivot of the grid
-    min_gain: float = 3.0  # of -log likelihood by either axis of the wrist, over the same links where it rests
+    turn_sd: float = 0.25  # rad, prior of an axis of the grid
+    shift_sd_mm: float = 4.0  # prior of a pivot of the grid
+    min_gain: float = 3.0  # minimum gain in -log likelihood by either axis, over the same links at rest
 
 
 WRISTS = WristSearchSettings()
@@ -46,8 +46,8 @@ FITTED = ("shaft", "radii", "ends", "turns", "shifts", "offsets")
 
 @dataclass(frozen=True, kw_only=True)
 class _Wrist:
-    """A hypothesis: readings that turn the wrist, both jaws and one jaw against the other (None: no reading does), and
-    the places of both axes."""
+    """A hypothesis: readings that drive the wrist, both jaws, and one jaw against the other (None: no reading), and the
+    positions of both axes."""
 
     first: str
     second: str | None
@@ -55,10 +55,10 @@ class _Wrist:
     heading: float  # rad, of the first axis about the shaft
     back: float  # mm from the first axis to the shape's tip
     sense: float  # 1 or -1, of the second reading
-    share: float = 0.5  # of the opening, by which the first jaw turns
+    share: float = 0.5  # share of the opening by which the first jaw turns
 
     def tree(self, shape: CarvedShape, closed: Readings) -> KinematicTree:
-        """The links in the instrument's frame; closed: readings at which the jaws lie along the wrist."""
+        """Return the links in the instrument's frame; closed: readings at which the jaws are parallel to the wrist."""
         base = shape.instrument_from_shaft.double().cpu().numpy()
         across = base[:3, 0] * math.cos(self.heading) + base[:3, 1] * math.sin(self.heading)
         pivot = base[:3, 3] + (shape.tip - self.back) * base[:3, 2]
@@ -84,13 +84,13 @@ def search_wrist(
     joints: Sequence[str],
     others: Sequence[str] = (),
 ) -> KinematicTree | None:
-    """Return the wrist and two jaws that explain the evidence best, in the instrument's frame; None where the
-    wrist, or what turns both jaws, explains hardly anything.
+    """Return the wrist and two jaws that explain the evidence best, in the instrument's frame; None if the wrist, or
+    the jaws' common rotation, explains hardly anything.
 
-    readings: of every frame of the evidence; joints: two or three of them, all of which turn something; others: those
-    of which one may as well, where there are two.
+    readings: of every frame of the evidence; joints: two or three of them, all of which drive a link; others:
+    candidates for a third where there are two.
     """
-    closed = {joint: min(given[joint] for given in readings) for joint in (*joints, *others)}
+    closed = {joint: min(frame_readings[joint] for frame_readings in readings) for joint in (*joints, *others)}
 
     def problem_of(wrist: _Wrist, readings: Sequence[Mapping[str, float]] = readings) -> SilhouetteProblem:
         links = Articulation(wrist.tree(shape, closed)).to(evidence.device)
@@ -119,18 +119,18 @@ def search_wrist(
         costs |= {wrist: fitted_cost(wrist) for wrist in unequal}
         best = min(costs, key=costs.__getitem__)
     problem = problem_of(best)
-    found = minimised(problem)
+    parameters = minimised(problem)
     for joint in filter(None, (best.first, best.second)):
-        rest = {joint: float(np.mean([given[joint] for given in readings]))}
-        resting = problem_of(best, [{**given, **rest} for given in readings])
-        if resting.cost(minimised(resting)) - problem.cost(found) < WRISTS.min_gain:
+        rest = {joint: float(np.mean([frame_readings[joint] for frame_readings in readings]))}
+        resting = problem_of(best, [{**frame_readings, **rest} for frame_readings in readings])
+        if resting.cost(minimised(resting)) - problem.cost(parameters) < WRISTS.min_gain:
             return None
-    pivots, axes = (part.double().cpu().numpy() for part in problem.corrected_axes(problem.parts(found)))
+    pivots, axes = (part.double().cpu().numpy() for part in problem.corrected_axes(problem.parts(parameters)))
     return _placed(best.tree(shape, closed), best.jaw, pivots, axes)
 
 
 def _hypotheses(shape: CarvedShape, joints: Sequence[str], others: Sequence[str]) -> Iterator[_Wrist]:
-    """Hypotheses of the grid: which reading turns what, where both axes lie, and which way the second turns."""
+    """Generate the grid's hypotheses: which reading drives what, both axes, and the second's direction."""
     roles: list[tuple[str, str | None, str | None]] = []
     if len(joints) == 2:
         roles += [role for one, other in permutations(joints) for role in ((one, other, None), (one, None, other))]
@@ -145,8 +145,8 @@ def _hypotheses(shape: CarvedShape, joints: Sequence[str], others: Sequence[str]
 
 
 def _placed(tree: KinematicTree, jaw: str | None, pivots: np.ndarray, axes: np.ndarray) -> KinematicTree:
-    """The tree with its axes, outermost first, as fitted. The second has the sign that makes its largest component
-    positive; the left jaw opens towards (shaft x axis), as `Hinges` has it."""
+    """Return the tree with its fitted axes, outermost first. The sign of the second makes its largest component
+    positive; the left jaw opens towards (shaft x axis), as in `Hinges`."""
     (outer, inner), (second, first) = pivots, axes
     sign = float(np.sign(second[np.abs(second).argmax()]))
     shaft, wrist, left, right = tree.links

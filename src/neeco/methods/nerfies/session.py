@@ -86,10 +86,10 @@ def depth_bounds(points: Tensor, frames: Sequence[Frame]) -> tuple[float, float]
         pose = frame.camera.world_from_camera.float()
         z = (points - pose[:3, 3]) @ pose[:3, 2]
         depths.append(z[z > frame.camera.near].quantile(torch.tensor(QUANTILES)) if (z > 0).any() else None)
-    known = [pair for pair in depths if pair is not None]
-    if not known:
+    depth_ranges = [pair for pair in depths if pair is not None]
+    if not depth_ranges:
         raise NeecoError("sparse points: none lies before a training camera; run `neeco check` on the capture")
-    ends = torch.stack(known)
+    ends = torch.stack(depth_ranges)
     return NEAR_SHARE * float(ends[:, 0].min()), FAR_SHARE * float(ends[:, 1].max())
 
 

@@ -27,7 +27,7 @@ def product(aw, ax, ay, az, bw, bx, by, bz):
         aw * bx + ax * bw + ay * bz - az * by,
         aw * by - ax * bz + ay * bw + az * bx,
         aw * bz + ax * by - ay * bx + az * bw,
-    )  # fmt: skip
+    )
 
 
 @triton.jit
@@ -45,7 +45,7 @@ def turn_point(px, py, pz, nx, ny, nz, sine, cosine, x, y, z):
         px + cosine * ax + sine * (ny * az - nz * ay) + along * nx,
         py + cosine * ay + sine * (nz * ax - nx * az) + along * ny,
         pz + cosine * az + sine * (nx * ay - ny * ax) + along * nz,
-    )  # fmt: skip
+    )
 
 
 @triton.jit
@@ -166,9 +166,8 @@ def articulate(
         moving = moving_of(logits, g, inside, greatest, total, gate, LINKS, LOGITS)
     if SPINS:
         x, y, z, qw, qx, qy, qz = turn(
-            numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin_of(numbers, roll, x, y, z),
-            x, y, z, qw, qx, qy, qz,
-        )  # fmt: skip
+            numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin_of(numbers, roll, x, y, z), x, y, z, qw, qx, qy, qz
+        )
     for joint in tl.static_range(JOINTS):
         own_numbers = numbers + BODY + joint * (VALUES + LINKS - 1)
         amount = amount_of(logits, own_numbers, g, inside, greatest, total, gate, LINKS, LOGITS)
@@ -224,8 +223,9 @@ def put_sum(at, value, inside):
 
 
 @triton.jit
-def turn_backward(pivot, axis, angle, sums_pivot, sums_axis, inside, x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy,
-                  hz):  # fmt: skip
+def turn_backward(
+    pivot, axis, angle, sums_pivot, sums_axis, inside, x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy, hz
+):
     """Points and quaternions back to before the turn, their gradients g and h too, and dL/d angle; sums of dL/d pivot
     and dL/d axis are written."""
     px, py, pz = three(pivot)
@@ -272,7 +272,7 @@ def pose_backward_kernel(
     wx, wy, wz = triple(from_scales, g, inside)
     wx, wy, wz = wx * sx, wy * sy, wz * sz
     if numbers is not None:
-        own = sums + tl.program_id(0) * (BODY + JOINTS * (VALUES + LINKS - 1))
+        block = sums + tl.program_id(0) * (BODY + JOINTS * (VALUES + LINKS - 1))
         x, y, z, qw, qx, qy, qz, norm = resting(means, quats, g, inside)
         rw, rx, ry, rz = qw, qx, qy, qz
         spin = spin_of(numbers, roll, x, y, z)
@@ -284,26 +284,26 @@ def pose_backward_kernel(
             wx = tl.where(sx < longest, wx, 0.0)
             wy = tl.where(sy < longest, wy, 0.0)
             wz = tl.where(sz < longest, wz, 0.0)
-        put_pose_row(own, gx, x, y, z, inside)
-        put_pose_row(own + 4, gy, x, y, z, inside)
-        put_pose_row(own + 8, gz, x, y, z, inside)
+        put_pose_row(block, gx, x, y, z, inside)
+        put_pose_row(block + 4, gy, x, y, z, inside)
+        put_pose_row(block + 8, gz, x, y, z, inside)
         gx, gy, gz = (
             tl.load(numbers) * gx + tl.load(numbers + 4) * gy + tl.load(numbers + 8) * gz,
             tl.load(numbers + 1) * gx + tl.load(numbers + 5) * gy + tl.load(numbers + 9) * gz,
             tl.load(numbers + 2) * gx + tl.load(numbers + 6) * gy + tl.load(numbers + 10) * gz,
         )
         tw, tx, ty, tz = product(hw, hx, hy, hz, qw, 0.0 - qx, 0.0 - qy, 0.0 - qz)
-        put_sum(own + SPIN_END, tw, inside)
-        put_sum(own + SPIN_END + 1, tx, inside)
-        put_sum(own + SPIN_END + 2, ty, inside)
-        put_sum(own + SPIN_END + 3, tz, inside)
+        put_sum(block + SPIN_END, tw, inside)
+        put_sum(block + SPIN_END + 1, tx, inside)
+        put_sum(block + SPIN_END + 2, ty, inside)
+        put_sum(block + SPIN_END + 3, tz, inside)
         _, a, b, c, d, length = pose_row(numbers)
         hw, hx, hy, hz = product(a / length, 0.0 - b / length, 0.0 - c / length, 0.0 - d / length, hw, hx, hy, hz)
         shared = 0.0 * gx  # sum over links of share times dL/d share
         for undone in tl.static_range(JOINTS):
             joint = JOINTS - 1 - undone
             own_numbers = numbers + BODY + joint * (VALUES + LINKS - 1)
-            to_numbers = own + BODY + joint * (VALUES + LINKS - 1)
+            to_numbers = block + BODY + joint * (VALUES + LINKS - 1)
             amount = amount_of(logits, own_numbers, g, inside, greatest, total, gate, LINKS, LOGITS)
             if (SLIDES >> joint) & 1:
                 x, y, z = slide(own_numbers + 3, 0.0 - amount, x, y, z)
@@ -332,7 +332,7 @@ def pose_backward_kernel(
                 tl.store(at, share * (tl.load(at, inside, other=0.0) - shared), inside)
         if SPINS:
             x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy, hz, _ = turn_backward(
-                numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin, own + SHAFT_ORIGIN, own + SHAFT_DIRECTION,
+                numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin, block + SHAFT_ORIGIN, block + SHAFT_DIRECTION,
                 inside, x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy, hz,
             )  # fmt: skip
         radial = rw * hw + rx * hx + ry * hy + rz * hz

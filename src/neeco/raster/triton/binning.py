@@ -102,7 +102,7 @@ def list_kernel(
         low = tl.where(behind, low, middle + 1)
     live = live & (low < count)
     gaussian = tl.load(order + low, live, other=0)
-    left = tl.load(counts + gaussian, live, other=0) - (tl.load(slot_ends + low, live, other=0) - slot).to(tl.int32)
+    rest = tl.load(counts + gaussian, live, other=0) - (tl.load(slot_ends + low, live, other=0) - slot).to(tl.int32)
     at = ellipses + gaussian * ELLIPSE
     x, y = tl.load(at, live, other=0.0), tl.load(at + 1, live, other=0.0)
     half_height, slope = tl.load(at + 2, live, other=0.0), tl.load(at + 3, live, other=0.0)
@@ -114,11 +114,11 @@ def list_kernel(
     more = tl.max(searching.to(tl.int32), axis=0) > 0
     while more:
         column, here = tile_columns(row, x, y, half_height, slope, k0, k1, peak, width, height, TILE)
-        found = searching & (left < here)
-        tile = tl.where(found, row * columns + column + left, tile)
-        left -= here
+        hit = searching & (rest < here)
+        tile = tl.where(hit, row * columns + column + rest, tile)
+        rest -= here
         row += 1
-        searching = searching & (left >= 0) & (row <= last_row)
+        searching = searching & (rest >= 0) & (row <= last_row)
         more = tl.max(searching.to(tl.int32), axis=0) > 0
     inside = slot < pairs
     tl.store(tiles + slot, tile.to(tiles.dtype.element_ty), inside)

@@ -306,9 +306,7 @@ def composite_backward_kernel(
 
 
 @triton.jit
-def sum_slots_kernel(
-    slot_sums, order, slot_ends, sums, WIDTH: tl.constexpr, PADDED: tl.constexpr, SLOTS: tl.constexpr
-):  # fmt: skip
+def sum_slots_kernel(slot_sums, order, slot_ends, sums, WIDTH: tl.constexpr, PADDED: tl.constexpr, SLOTS: tl.constexpr):
     """Add the slots of one Gaussian per program, in a fixed order."""
     place = tl.program_id(0)
     g = tl.load(order + place)
@@ -354,6 +352,6 @@ def composite_backward(
             WIDTH=columns, PADDED=triton.next_power_of_2(columns), SLOTS=SLOTS, num_warps=1, enable_fp_fusion=True,
         )  # fmt: skip
     if more:
-        own = sums[:, HEAD.value + count :].reshape(n, more, SHAPE.value)
-        sums[:, : SHAPE.value] += own.sum(1)
+        slotted_sums = sums[:, HEAD.value + count :].reshape(n, more, SHAPE.value)
+        sums[:, : SHAPE.value] += slotted_sums.sum(1)
     return sums[:, : HEAD.value + count]

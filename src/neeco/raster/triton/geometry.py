@@ -235,9 +235,7 @@ def _coefficient(sh, to_sh, k: tl.constexpr, inside, seen, basis, to_red, to_gre
 
 
 @triton.jit
-def sh_gradient(
-    sh, to_sh, inside, seen, x, y, z, to_red, to_green, to_blue, COUNT: tl.constexpr, WANTED: tl.constexpr
-):  # fmt: skip
+def sh_gradient(sh, to_sh, inside, seen, x, y, z, to_red, to_green, to_blue, COUNT: tl.constexpr, WANTED: tl.constexpr):
     """Store the harmonics' gradients; return the direction's. sh, to_sh [B]: address of a Gaussian's first harmonic."""
     _coefficient(sh, to_sh, 0, inside, seen, SH0 + 0 * x, to_red, to_green, to_blue, WANTED)
     gx, gy, gz = 0 * x, 0 * x, 0 * x

@@ -57,8 +57,8 @@ def across_kernel(image, target, mask, blurred, numbers, width, BLOCK: tl.conste
     mx = tl.zeros([BLOCK], tl.float32)
     my, mxx, myy, mxy = mx, mx, mx, mx
     for k in tl.static_range(TAPS):
-        there = inside & (column + (k - REACH) >= 0) & (column + (k - REACH) < width)
-        x, y = seen_pair(image, target, mask, at + 3 * (k - REACH), there)
+        valid = inside & (column + (k - REACH) >= 0) & (column + (k - REACH) < width)
+        x, y = seen_pair(image, target, mask, at + 3 * (k - REACH), valid)
         wx, wy = weight_of(k) * x, weight_of(k) * y
         mx, my, mxx, myy, mxy = mx + wx, my + wy, mxx + wx * x, myy + wy * y, mxy + wx * y
     to = blurred + at
@@ -74,8 +74,8 @@ def column_mean(plane, at, inside, numbers, row):
     """A plane's mean over windows along columns, `row` numbers apart."""
     total = tl.zeros_like(at).to(tl.float32)
     for k in tl.static_range(TAPS):
-        there = at + (k - REACH) * row
-        total += weight_of(k) * tl.load(plane + there, inside & (there >= 0) & (there < numbers), other=0.0)
+        tap = at + (k - REACH) * row
+        total += weight_of(k) * tl.load(plane + tap, inside & (tap >= 0) & (tap < numbers), other=0.0)
     return total
 
 
@@ -114,11 +114,11 @@ def slopes_across_kernel(slopes, blurred, numbers, width, BLOCK: tl.constexpr):
     a = tl.zeros([BLOCK], tl.float32)
     b, c = a, a
     for k in tl.static_range(TAPS):
-        there = inside & (column + (k - REACH) >= 0) & (column + (k - REACH) < width)
+        valid = inside & (column + (k - REACH) >= 0) & (column + (k - REACH) < width)
         at_tap = slopes + at + 3 * (k - REACH)
-        a += weight_of(k) * tl.load(at_tap, there, other=0.0)
-        b += weight_of(k) * tl.load(at_tap + numbers, there, other=0.0)
-        c += weight_of(k) * tl.load(at_tap + 2 * numbers, there, other=0.0)
+        a += weight_of(k) * tl.load(at_tap, valid, other=0.0)
+        b += weight_of(k) * tl.load(at_tap + numbers, valid, other=0.0)
+        c += weight_of(k) * tl.load(at_tap + 2 * numbers, valid, other=0.0)
     tl.store(blurred + at, a, inside)
     tl.store(blurred + numbers + at, b, inside)
     tl.store(blurred + 2 * numbers + at, c, inside)
@@ -151,17 +151,15 @@ def photometric(
     sums = torch.empty(programs, device=device)
     pixels = torch.full((), numbers / 3, device=device) if mask is None else mask.sum()
     count = (3 * pixels).clamp(min=1).float()
-    how = {"BLOCK": BLOCK, "num_warps": 4, "enable_fp_fusion": True}
+    launch = {"BLOCK": BLOCK, "num_warps": 4, "enable_fp_fusion": True}
     gradient = None
     with working_on(device):
-        across_kernel[(programs,)](image, target, mask, blurred, numbers, width, **how)
-        compare_kernel[(programs,)](
-            image, target, mask, blurred, slopes, sums, numbers, width, ssim_weight, **how
-        )  # fmt: skip
+        across_kernel[(programs,)](image, target, mask, blurred, numbers, width, **launch)
+        compare_kernel[(programs,)](image, target, mask, blurred, slopes, sums, numbers, width, ssim_weight, **launch)
         if slopes is not None:
             gradient = torch.empty_like(image)
-            slopes_across_kernel[(programs,)](slopes, blurred, numbers, width, **how)
-            gradient_kernel[(programs,)](image, target, mask, blurred, gradient, numbers, width, ssim_weight, **how)
+            slopes_across_kernel[(programs,)](slopes, blurred, numbers, width, **launch)
+            gradient_kernel[(programs,)](image, target, mask, blurred, gradient, numbers, width, ssim_weight, **launch)
             gradient /= count
     return (sums.double().sum() / count).float(), gradient
 
@@ -215,7 +213,7 @@ def step_together(
     Waits for nothing: the table goes to the device behind what that has yet to do.
     """
     device = tensors[0][0].device
-    if any(held.device != device for four in tensors for held in four):
+    if any(each.device != device for four in tensors for each in four):
         raise NeecoError("adam_steps: tensors are on several devices; move them to one")
     table, programs = _table(tensors, rates, betas)
     if not programs:
@@ -237,7 +235,7 @@ def _table(
     first, rows, factors = 0, [], []
     for four, (rate, step) in zip(tensors, rates, strict=True):
         size = four[0].numel()
-        rows.append([first, *(held.data_ptr() for held in four), size])
+        rows.append([first, *(each.data_ptr() for each in four), size])
         factors.append([rate / (1 - betas[0] ** step), 1 / math.sqrt(1 - betas[1] ** step)])
         first += triton.cdiv(size, ADAM_BLOCK)
     table = torch.full((FIELDS, triton.next_power_of_2(len(rows))), first, dtype=torch.int64)

@@ -71,8 +71,8 @@ def tiles_touched(seen, x, y, half_height, slope, k0, k1, peak, width, height, T
     searching = seen & (row <= last_row)
     more = tl.max(searching.to(tl.int32), axis=0) > 0
     while more:
-        _first, here = tile_columns(row, x, y, half_height, slope, k0, k1, peak, width, height, TILE)
-        touched += tl.where(searching, here, 0)
+        _first, in_row = tile_columns(row, x, y, half_height, slope, k0, k1, peak, width, height, TILE)
+        touched += tl.where(searching, in_row, 0)
         row += 1
         searching = searching & (row <= last_row)
         more = tl.max(searching.to(tl.int32), axis=0) > 0
@@ -134,8 +134,7 @@ def project_kernel(
 
 
 @triton.jit
-def colors(sh, falloff, left, vignette, frames, pose, g, seen, wx, wy, wz, x, y, z, slope_x, slope_y,
-           SH: tl.constexpr):  # fmt: skip
+def colors(sh, falloff, left, vignette, frames, pose, g, seen, wx, wy, wz, x, y, z, slope_x, slope_y, SH: tl.constexpr):
     """Return red, green and blue as rendered; NaN where any input is not finite."""
     dx, dy, dz, _ = direction(pose, wx, wy, wz)
     if frames is not None:
@@ -146,8 +145,8 @@ def colors(sh, falloff, left, vignette, frames, pose, g, seen, wx, wy, wz, x, y,
     red, green = sh_color(at, seen, dx, dy, dz, SH), sh_color(at + 1, seen, dx, dy, dz, SH)
     blue = sh_color(at + 2, seen, dx, dy, dz, SH)
     # maximum() may turn NaN into 0
-    known = seen & finite(red) & finite(green) & finite(blue)
-    light = tl.where(known, 1.0, float("nan"))
+    all_finite = seen & finite(red) & finite(green) & finite(blue)
+    light = tl.where(all_finite, 1.0, float("nan"))
     if falloff is not None:
         factor, _, _ = headlight(tl.load(falloff + g, seen, other=0.0), vignette, x, y, z, slope_x, slope_y)
         light = light * factor

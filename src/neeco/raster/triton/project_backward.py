@@ -27,9 +27,8 @@ CAMERA_SUMS = tl.constexpr(18)  # camera_from_world (rotation 9, translation 3),
 
 @triton.jit
 def shape_gradient(
-    to_xx, to_xy, to_yy, t0, t1, t2, t3, t4, t5, u0, u1, u2, u3, u4, u5,
-    r0, r1, r2, r3, r4, r5, r6, r7, r8, sx, sy, sz,
-):  # fmt: skip
+    to_xx, to_xy, to_yy, t0, t1, t2, t3, t4, t5, u0, u1, u2, u3, u4, u5, r0, r1, r2, r3, r4, r5, r6, r7, r8, sx, sy, sz
+):
     """Return, through U = T R S, dL/d T (6), dL/d scales (3), dL/d R (9)."""
     a0, a1, a2 = 2 * (to_xx * u0 + to_xy * u3), 2 * (to_xx * u1 + to_xy * u4), 2 * (to_xx * u2 + to_xy * u5)
     b0, b1, b2 = 2 * (to_xy * u0 + to_yy * u3), 2 * (to_xy * u1 + to_yy * u4), 2 * (to_xy * u2 + to_yy * u5)
@@ -95,8 +94,9 @@ def ellipse_gradient(h1, h2, h3, h4, h5, xx, xy, yy, determinant):
 
 
 @triton.jit
-def mean_gradient(pose, to_x, to_y, to_z, g0, g1, g2, g3, g4, g5, x, y, iz, slope_x, slope_y, clamped_x, clamped_y,
-                  fx, fy):  # fmt: skip
+def mean_gradient(
+    pose, to_x, to_y, to_z, g0, g1, g2, g3, g4, g5, x, y, iz, slope_x, slope_y, clamped_x, clamped_y, fx, fy
+):
     """Return the gradient of the mean, camera frame, through projected centre, depth and T (g0 to g5)."""
     c0, c1, c2, c3, c4, c5, c6, c7, c8 = view_rotation(pose)
     jx, jy = fx * iz, fy * iz
@@ -112,8 +112,9 @@ def mean_gradient(pose, to_x, to_y, to_z, g0, g1, g2, g3, g4, g5, x, y, iz, slop
 
 
 @triton.jit
-def light_gradient(falloff, vignette, to_falloff, g, inside, seen, to_log, x, y, z, iz, slope_x, slope_y,
-                   clamped_x, clamped_y):  # fmt: skip
+def light_gradient(
+    falloff, vignette, to_falloff, g, inside, seen, to_log, x, y, z, iz, slope_x, slope_y, clamped_x, clamped_y
+):
     """Store the falloff's gradient from that of the light's logarithm; return the mean's (3), the factor and t."""
     power = tl.load(falloff + g, seen, other=0.0)
     light, log2_distance, t = headlight(power, vignette, x, y, z, slope_x, slope_y)
@@ -126,8 +127,9 @@ def light_gradient(falloff, vignette, to_falloff, g, inside, seen, to_log, x, y,
 
 
 @triton.jit
-def direction_gradient(sh, to_sh, frames, pose, g, inside, seen, wx, wy, wz, red, green, blue, to_red, to_green,
-                       to_blue, SH: tl.constexpr):  # fmt: skip
+def direction_gradient(
+    sh, to_sh, frames, pose, g, inside, seen, wx, wy, wz, red, green, blue, to_red, to_green, to_blue, SH: tl.constexpr
+):
     """Store the harmonics' gradients through max(0, sh . basis + 0.5); return the mean's (3) by its direction."""
     to_red, to_green = tl.where(red > 0, to_red, 0.0), tl.where(green > 0, to_green, 0.0)
     to_blue = tl.where(blue > 0, to_blue, 0.0)
@@ -178,8 +180,9 @@ def project_backward_kernel(
     put(to_quats + g * 4, to_qw, inside, seen)
     put_three(to_quats + g * 4 + 1, to_qx, to_qy, to_qz, inside, seen)
 
-    mx, my, mz = mean_gradient(pose, to_x, to_y, to_z, g0, g1, g2, g3, g4, g5, x, y, iz, slope_x, slope_y,
-                               clamped_x, clamped_y, fx, fy)  # fmt: skip
+    mx, my, mz = mean_gradient(
+        pose, to_x, to_y, to_z, g0, g1, g2, g3, g4, g5, x, y, iz, slope_x, slope_y, clamped_x, clamped_y, fx, fy
+    )
     red, green, blue = triple_at(records + g * RECORD + 6, seen)
     to_log = to_red * red + to_green * green + to_blue * blue  # of whatever multiplies colours
     if left is not None:
@@ -187,14 +190,16 @@ def project_backward_kernel(
         put(to_left + g, to_log / dimmed, inside, seen)
         to_red, to_green, to_blue = to_red * dimmed, to_green * dimmed, to_blue * dimmed
     if falloff is not None:
-        lx, ly, lz, light, t = light_gradient(falloff, vignette, to_falloff, g, inside, seen, to_log, x, y, z, iz,
-                                              slope_x, slope_y, clamped_x, clamped_y)  # fmt: skip
+        lx, ly, lz, light, t = light_gradient(
+            falloff, vignette, to_falloff, g, inside, seen, to_log, x, y, z, iz, slope_x, slope_y, clamped_x, clamped_y
+        )
         mx, my, mz = mx + lx, my + ly, mz + lz
         to_red, to_green, to_blue = to_red * light, to_green * light, to_blue * light
         if camera_sums is not None:
             put_sums(camera_sums + tl.program_id(0) * CAMERA_SUMS + 15, to_log * t, to_log * t * t, 0.0 * t, seen)
-    dx, dy, dz = direction_gradient(sh, to_sh, frames, pose, g, inside, seen, wx, wy, wz, red, green, blue,
-                                    to_red, to_green, to_blue, SH)  # fmt: skip
+    dx, dy, dz = direction_gradient(
+        sh, to_sh, frames, pose, g, inside, seen, wx, wy, wz, red, green, blue, to_red, to_green, to_blue, SH
+    )
     c0, c1, c2, c3, c4, c5, c6, c7, c8 = view_rotation(pose)
     put_three(
         to_means + g * 3, c0 * mx + c3 * my + c6 * mz + dx, c1 * mx + c4 * my + c7 * mz + dy,

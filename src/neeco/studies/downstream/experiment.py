@@ -110,7 +110,7 @@ class DownstreamJob(Job):
         return [data for data in self.request.image_sets if data.name in self.condition.sets]
 
     def identity(self) -> dict[str, Any]:
-        """Return what a folder must agree with to be this job's. Its keys are those of job.json."""
+        """Return the description that a folder must match to be this job's, with the keys of job.json."""
         request, kind = self.request, model_class(self.model)
         backgrounds = request.backgrounds if PASTE in self.condition else None
         return {
@@ -208,8 +208,8 @@ class DownstreamJob(Job):
         if self.fold == self.request.kept_fold:
             write_predictions(self.folder, test, [sample.name for sample in samples], predictions)
         frames = [
-            {"box_iou": box_iou(found, true)} if isinstance(found, Detections) else mask_scores(found, true, names)
-            for found, true in zip(predictions, truth, strict=True)
+            {"box_iou": box_iou(output, true)} if isinstance(output, Detections) else mask_scores(output, true, names)
+            for output, true in zip(predictions, truth, strict=True)
         ]
         boxes = [prediction for prediction in predictions if isinstance(prediction, Detections)]
         rows = [
@@ -268,7 +268,7 @@ class DownstreamPlan:
 
 
 def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
-    """Check all that can be known before the work. Raises NeecoError for what cannot be trained or tested."""
+    """Check everything that can be checked before training. Raises NeecoError for an invalid request."""
     for option in ("folds", "steps", "size", "batch"):
         if (value := getattr(request, option)) is not None and value < 1:
             raise NeecoError(f"--{option} must be at least 1 (got {value})")

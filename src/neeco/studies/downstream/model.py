@@ -71,7 +71,7 @@ class TorchModel(ABC):
 
     @classmethod
     def is_too_small(cls, size: tuple[int, int]) -> bool:
-        """Return whether images of this size (width, height), at its input, are too small for it."""
+        """Return whether images of this size (width, height) are too small as input."""
         return False
 
     @abstractmethod
@@ -128,7 +128,7 @@ class TorchModel(ABC):
                 task.progress(step / task.steps, f"step {step}  loss {value:.3f}")
 
     def _rate(self, step: int, steps: int) -> float:
-        """The learning rate at a step, as a share of the highest."""
+        """Return the learning rate at a step, as a share of the maximum."""
         return min((step + 1) / (1 + self.warmup * steps), (1 + math.cos(math.pi * step / steps)) / 2)
 
     @torch.inference_mode()
@@ -154,8 +154,8 @@ def model_class(name: str) -> type[TorchModel]:
     """The model of that name. Raises NeecoError when there is none."""
     models = find_models()
     if name not in models:
-        known = ", ".join(models)
-        raise NeecoError(f"--models: {name!r} is unknown; choose of {known}, or install the package that has it")
+        available = ", ".join(models)
+        raise NeecoError(f"--models: {name!r} is unknown; choose of {available}, or install the package that has it")
     return models[name]
 
 

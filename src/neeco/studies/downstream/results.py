@@ -160,9 +160,9 @@ class Estimate(NamedTuple):
 
 
 class Scores:
-    """The scores of a study's finished jobs by arm, test and metric, and the intervals of their means and differences.
+    """Scores of a study's finished jobs by arm, test and metric, with intervals of means and differences.
 
-    All arms are resampled alike (the same seeds, the same frames), so that a difference of two is a paired one.
+    All arms use the same resampled seeds and frames, so that a difference of two is a paired one.
     """
 
     def __init__(self, jobs: Sequence[Document]) -> None:
@@ -214,16 +214,16 @@ class Scores:
 
 @cache
 def seed_weights(seeds: int) -> np.ndarray:
-    """[R, seeds]: how often each seed is drawn, in all one time fewer than there are seeds: as often would make
-    the variance of few too small (Rao and Wu, "Resampling inference with complex survey data", 1988)."""
+    """Return [R, seeds]: resampling counts of each seed, one draw fewer than seeds: as many draws would underestimate
+    the variance of few (Rao and Wu, "Resampling inference with complex survey data", 1988)."""
     times, rng = max(seeds - 1, 1), np.random.default_rng(1)
     return rng.multinomial(times, np.full(seeds, 1 / seeds), INTERVALS.resamples).astype(np.float64)
 
 
 @cache
 def block_weights(frames: int) -> np.ndarray:
-    """[R, frames]: how often each frame is drawn, in blocks of neighbours from anywhere in the recording
-    (Politis and Romano, "A circular block-resampling procedure", 1992)."""
+    """Return [R, frames]: resampling counts of each frame, in circular blocks of neighbours (Politis and Romano, "A
+    circular block-resampling procedure", 1992)."""
     length = -(-frames // INTERVALS.blocks)
     starts = np.random.default_rng(2).integers(frames, size=(INTERVALS.resamples, -(-frames // length)))
     ends = np.zeros((INTERVALS.resamples, 2 * frames + 1))
@@ -245,12 +245,12 @@ def words_of(condition: str) -> set[str]:
 
 
 def title_of(condition: str, real: int) -> str:
-    """`kinematic+real, 20 labelled`."""
+    """Format an arm as `kinematic+real, 20 labelled`."""
     return f"{condition}, {real} labelled" if real else condition
 
 
 def failed_jobs(experiment: Document) -> list[str]:
-    """`model, condition, …: why` of every job that failed."""
+    """Format every failed job as `model, condition, …: reason`."""
     return [
         f"{job['model']}, {title_of(job['condition'], job['real'])}, fold {job['fold']}: {job['error']}"
         for job in experiment["jobs"]
@@ -259,7 +259,7 @@ def failed_jobs(experiment: Document) -> list[str]:
 
 
 def metrics_of(jobs: Sequence[Document], predicts: str) -> list[str]:
-    """The scores that these jobs have, the main one first; of several classes that of each behind them."""
+    """Return the scores of these jobs, the main one first; with several classes followed by each one's."""
     metrics = {key for job in jobs for split in job["splits"].values() for key in split}
     classes = sorted(key for key in metrics if key.endswith(f".{MAIN[predicts]}"))
     return [*(MASK_SCORES if predicts == "masks" else BOX_SCORES), *classes]
@@ -288,20 +288,20 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
 
 
 def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
-    """The arm that `arm` is compared with on a test: the better of labelled frames alone and strongly augmented, at as
-    many labelled frames (sets alone: at the most); strong augmentation with none; permuted labels with the right."""
+    """Return the arm compared with `arm` on a test: the better of labelled frames alone and strongly augmented, with as
+    many labelled frames (sets alone: the most); for strong augmentation none; for permuted labels correct ones."""
     words, baselines = words_of(arm.condition), [words_of(name) for name in BASELINES]
-    others = [other for other in scores.jobs if other.model == arm.model and other != arm]
+    other_arms = [other for other in scores.jobs if other.model == arm.model and other != arm]
     wanted, real = baselines, arm.real
     if PERMUTED in words:
         wanted = [words - {PERMUTED}]
     elif words in baselines:
         wanted = baselines[: baselines.index(words)]
     elif REAL not in words:
-        real = max((other.real for other in others if words_of(other.condition) in baselines), default=0)
+        real = max((other.real for other in other_arms if words_of(other.condition) in baselines), default=0)
     rivals = [
         (mean, other)
-        for other in others
+        for other in other_arms
         if words_of(other.condition) in wanted
         and other.real == real
         and (mean := mean_or_none(scores.by_fold(other, test, metric))) is not None
@@ -310,7 +310,7 @@ def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
 
 
 def verdict(folds: int, low: float | None, high: float | None) -> str:
-    """Return the verdict of a difference over so many folds by its interval; of one fold that is of frames alone."""
+    """Return the verdict on a difference over this many folds from its interval; with one fold, from frames alone."""
     if low is None or high is None or folds < 2:
         return ONE_FOLD
     return HELPS if low > 0 else HURTS if high < 0 else NONE_SHOWN
@@ -370,7 +370,7 @@ def table_of(experiment: Document, model: Document, test: str) -> ResultTable:
 
 
 def _title(metric: str) -> str:
-    """A score's title; of a class `jaws IoU`."""
+    """Return a score's title; of one class `jaws IoU`."""
     name, _, score = metric.rpartition(".")
     return f"{name} {TITLES.get(score, score)}".strip()
 

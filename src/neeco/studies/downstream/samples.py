@@ -98,8 +98,8 @@ def _classes_of(ids: np.ndarray, table: bytes, file: Path, remedy: str) -> np.nd
 
 
 class Sample(Protocol):
-    """An image with labels that is read when it is needed. name: in messages and tables; key: equal for samples that
-    load the same. `load` raises NeecoError."""
+    """An image with labels that is read on demand. name: in messages and tables; key: equal for samples with the same
+    content. `load` raises NeecoError."""
 
     @property
     def name(self) -> str: ...
@@ -109,7 +109,7 @@ class Sample(Protocol):
 
 
 class Cache:
-    """Decoded images by key, of at most `limit` bytes in all; those that were not used for longest go first."""
+    """Cache of decoded images by key, of at most `limit` bytes; least recently used ones are evicted."""
 
     def __init__(self, limit: int = 1 << 30) -> None:
         self.limit, self.used = limit, 0
@@ -183,7 +183,7 @@ class SyntheticSample:
 
 
 def permuted(samples: Sequence[SyntheticSample]) -> tuple[SyntheticSample, ...]:
-    """The same images, each with the labels of another, by a fixed cyclic permutation in random order."""
+    """Return the images with each other's labels, by a fixed cyclic permutation in random order."""
     order = np.random.default_rng(0).permutation(len(samples))
     source = dict(zip(order.tolist(), np.roll(order, 1).tolist(), strict=True))
     return tuple(replace(sample, labels=samples[source[index]].labels) for index, sample in enumerate(samples))
@@ -225,12 +225,12 @@ class ImageSet:
         return info
 
     def instruments(self) -> int:
-        """Return how many instruments its labels tell apart."""
+        """Return the number of instruments that its labels distinguish."""
         ids = (self.info() or {"ids": ()})["ids"]
         return len({entry.get("instrument") for entry in ids if entry["id"]})
 
     def described(self) -> dict[str, Any]:
-        """Return its identity; `sha256` of its dataset.json changes when it is synthesized anew."""
+        """Return its identity; `sha256` of its dataset.json changes when the set is made again."""
         file = self.file(DATASET_FILE)
         digest = hashlib.sha256(read_bytes(file, "a data set")).hexdigest() if file.is_file() else None
         return {"name": self.name, "path": str(self.path.absolute()), "count": self.count, "sha256": digest}

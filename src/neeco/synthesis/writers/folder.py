@@ -1,6 +1,6 @@
 """The data set as plain files: images, masks, share of instrument, part ids, depth, states, and one record per image.
 
-A record says everything about its image and is written last, so an image without a whole record is not there yet.
+A record contains everything about its image and is written last, so an image without a complete record does not exist.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def encoded_sample(
     facts: Mapping[str, Any] = MappingProxyType({}),
     quality: int | None = None,
 ) -> Encoded:
-    """Encode one image with its `labels` as JSON, as JPEG of `quality` or as PNG, with all that its pixels say, and its
+    """Encode one image with its `labels` as JSON, as JPEG of `quality` or as PNG, with all its pixel labels, and its
     record, to which `facts` are added."""
     name = f"{stem(index)}.png"
     silhouettes = np.zeros(drawing.depth.shape, np.uint8)
@@ -113,7 +113,7 @@ def encoded_sample(
 
 
 def skipped_sample(index: int, refused: Mapping[str, int], facts: Mapping[str, Any] = MappingProxyType({})) -> Encoded:
-    """The record that `index` has no image, and why; `facts` are added."""
+    """Return the record that `index` has no image, and why; `facts` are added."""
     record = {"index": index, "skipped": True, **facts, "refused": dict(sorted(refused.items())), "files": {}}
     return Encoded(record, {})
 
@@ -128,9 +128,9 @@ def record_path(root: Path, index: int) -> Path:
 
 
 def load_record(root: Path, index: int) -> Record | None:
-    """The record of image `index` when it is as it was written and all its files are there and whole, else None.
+    """Return the record of image `index` if it is unchanged and all its files exist and are complete, else None.
 
-    The record of a version that wrote less is not whole: its image is to be rendered again.
+    Records of older versions that wrote less are incomplete: their images are rendered again.
     """
     try:
         record = json.loads(read_text(record_path(root, index), "the record of an image"))
@@ -177,5 +177,5 @@ def write_states(root: Path, records: list[Record]) -> None:
 
 
 def public_record(record: Record) -> dict[str, Any]:
-    """A record without what it says of the making."""
+    """Return a record without information on its making."""
     return {key: value for key, value in record.items() if key not in ("files", "refused")}

@@ -101,9 +101,9 @@ def joined_polygon(polygons: list[np.ndarray]) -> np.ndarray:
     while remaining:
         gaps = [np.linalg.norm(joined[:, None] - other[None], axis=2) for other in remaining]
         nearest = int(np.argmin([gap.min() for gap in gaps]))
-        here, there = np.unravel_index(gaps[nearest].argmin(), gaps[nearest].shape)
-        other = np.roll(remaining.pop(nearest), -int(there), axis=0)
-        joined = np.concatenate([joined[: here + 1], other, other[:1], joined[here:]])
+        place, place_in_other = np.unravel_index(gaps[nearest].argmin(), gaps[nearest].shape)
+        other = np.roll(remaining.pop(nearest), -int(place_in_other), axis=0)
+        joined = np.concatenate([joined[: place + 1], other, other[:1], joined[place:]])
     return joined
 
 
