@@ -272,7 +272,9 @@ def _changes(problem: ArticulatedProblem) -> list[Callable[[ArticulatedFit], Art
     def clock(shift: float, fit: ArticulatedFit) -> ArticulatedFit:
         return replace(fit, clock=float(np.clip(fit.clock + shift, CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])))
 
-    changes = [partial(size, factor) for factor in LINKED.sizes if problem.still]
+    changes: list[Callable[[ArticulatedFit], ArticulatedFit]] = [
+        partial(size, factor) for factor in LINKED.sizes if problem.still
+    ]
     changes += [partial(end, shift) for shift in LINKED.end_steps_mm]
     changes += [partial(clock, shift) for shift in LINKED.clock_steps_s if problem.prior.sd_clock > 0]
     return changes
@@ -385,8 +387,9 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
 
 
 def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], tree: KinematicTree | None) -> BaseRegistration:
-    best, prior = with_pose_errors(problem, fits[0]), problem.prior
-    full = covariance(problem, best)
+    with_errors, prior = with_pose_errors(problem, fits[0]), problem.prior
+    full = covariance(problem, with_errors)
+    best = fits[0] if tree is None else with_errors  # errors of poses beside swings make up for too much
     scatter = LINKED.rigid_scatter if tree is None else LINKED.scatter
     spread = scatter**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
