@@ -87,6 +87,9 @@ class ArticulatedSettings:
     # of an instrument without links that bend: a tube, of which lines and tips in masks give a first guess, and a head
     # minimum ratio of the cost with poses of other moments: of right ones 11 to 120, of another moment's at most 6
     swinging_exchanged: float = 8.0
+    # maximum standard deviation of a head's turns before a still camera, of an unknown base: with more, the base may
+    # be mirrored
+    max_swing_rad: float = 0.2
     rigid_scatter: float = 1.6  # factor on standard deviations: its shape makes up for slow errors of logs
     head_mm: float = 12.0  # distance from the tip to the tube's end
     head_sd_mm: float = 6.0  # standard deviation of the head's length
@@ -167,7 +170,13 @@ def _explaining(problem: ArticulatedProblem, starts: list[ArticulatedFit]) -> li
     fits = _fits(problem, starts)
     if not fits or fits[0].residual_px > LINKED.max_residual_px or overlap(problem, fits[0]) < LINKED.least_overlap:
         return []
-    return [] if _exchangeable(problem, fits[0]) else fits
+    return [] if _exchangeable(problem, fits[0]) or _mirrorable(problem, fits[0]) else fits
+
+
+def _mirrorable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
+    """Whether another base may explain the masks with other turns of the head."""
+    unknown = problem.prior.sd_mm is None and problem.still and fit.swings.size > 0
+    return unknown and float(fit.swings[:, :2].std(0).max()) > LINKED.max_swing_rad
 
 
 def _elsewhere(problem: ArticulatedProblem, model: ArticulatedModel, reached: float, seed: int) -> str:

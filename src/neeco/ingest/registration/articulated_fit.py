@@ -53,7 +53,7 @@ class ArticulatedFitSettings:
     # of a head about which nothing is stated, in each frame: standard deviations of its turns, and of its place along
     # itself, which opening jaws and further joints change
     swing_sd_rad: float = 0.4
-    slide_sd_mm: float = 2.0
+    slide_sd_mm: float = 0.7
 
 
 LINKED_FIT = ArticulatedFitSettings()
