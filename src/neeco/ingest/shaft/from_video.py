@@ -33,8 +33,9 @@ class ShaftSearchSettings:
     """Thresholds for instruments found in a video."""
 
     # requirements
-    min_diameters: float = 2.0  # minimum length of visible shaft
-    min_share: float = 0.6  # minimum share of the frames that show as much
+    min_diameters: float = 2.0  # usual length of visible shaft
+    usual_share: float = 0.6  # share of the frames that usually show as much
+    short_factor: float = 2.0  # factor on standard deviations of axes if fewer frames do
     min_frames_share: float = 0.3  # minimum share of the frames with a visible shaft
     min_frames: int = 10  # minimum number of these frames
     second_area: float = 0.3  # ratio of areas above which another component is a second instrument
@@ -150,10 +151,12 @@ def find_shaft(
             break
     axes = solve_axes(video, axes, edges, covariance=True)
     share = float((diameters >= SHAFT.min_diameters).mean())
-    if share < SHAFT.min_share:
-        raise NeecoError(
-            f"two diameters of shaft are visible in {share:.0%} of the frames (at least {SHAFT.min_share:.0%} are "
-            "needed to find its direction); hold the scope back, or the instrument farther in, so that its shaft shows"
+    if share < SHAFT.usual_share:
+        assert axes.covariance is not None
+        axes = replace(axes, covariance=SHAFT.short_factor**2 * axes.covariance)
+        notes.append(
+            f"two diameters of shaft are visible in {share:.0%} of the frames only (usual: {SHAFT.usual_share:.0%} or "
+            "more), so that errors are twice as large; hold the scope back, or the instrument farther in"
         )
     by_color = bool(ends.any()) and heads is not None
     length = working_length or (
@@ -162,8 +165,11 @@ def find_shaft(
     along_sd = _along_deviation(video, axes, ends, by_color)
     uncertainties, tilt, across = _uncertainties(axes, poses := _poses(video, axes), along_sd, video)
     certain = (tilt < SHAFT.max_sd[0]) & (across < SHAFT.max_sd[1]) & (along_sd < SHAFT.max_sd[2])
-    if not certain.any():
-        raise NeecoError("the shaft's direction is uncertain in all frames; film more of the shaft, and nearer")
+    if certain.sum() < SHAFT.min_frames:
+        raise NeecoError(
+            f"the shaft's direction is certain in {certain.sum()} of {len(certain)} frames, at least "
+            f"{SHAFT.min_frames} are needed; film more of the shaft, and nearer"
+        )
     if not by_color:
         notes.append(
             "shaft and head have the same colour: the place along the shaft is that of the tip, which opening jaws "
@@ -429,7 +435,8 @@ def _in_words(name: str, shaft: FoundShaft) -> str:
         scale = f"; the cameras' scale is known to {shaft.axes.scale_sd:.0%}, from the trocar"
     return (
         f"instrument {name!r} was found in the video: {shaft.share:.0%} of the frames show two diameters of its shaft "
-        f"({SHAFT.min_share:.0%} are needed); {left_out} of {len(shaft.known)} show too little of it and are left out; "
+        f"(usual: {SHAFT.usual_share:.0%} or more); {left_out} of {len(shaft.known)} show too little of it and are "
+        "left out; "
         f"its direction has a standard deviation of {np.median(turns):.1f} degrees, its place of "
         f"{np.median(shifts[:, :2]):.1f} mm across the view and {np.median(shifts[:, 2]):.1f} mm in depth; from the "
         f"end of the shaft to the tip it is {shaft.working_length:.0f} mm{scale}"
