@@ -85,8 +85,9 @@ class ArticulatedSettings:
     exchanged_shares: tuple[float, float] = (0.37, 0.61)  # of the recording, by which poses are shifted for comparison
     clock_sd_s: float = 0.1  # standard deviation of a clock that nothing gives
     # of an instrument without links that bend: a tube, of which lines and tips in masks give a first guess, and a head
-    # minimum ratio of the cost with poses of other moments: of right ones 11 to 120, of another moment's at most 6
-    swinging_exchanged: float = 8.0
+    # minimum ratio of the cost with poses of other moments, about a stated base and about an unknown one: of right ones
+    # 5 to 120, of another moment's 2 to 3 where a base is stated
+    swinging_exchanged: tuple[float, float] = (4.0, 8.0)
     # maximum standard deviation of a head's turns before a still camera, of an unknown base: with more, the base may
     # be mirrored
     max_swing_rad: float = 0.2
@@ -384,7 +385,7 @@ def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[A
 
 def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
     """Whether poses and readings of other moments explain the masks about as well."""
-    least = LINKED.min_exchanged if problem.readings else LINKED.swinging_exchanged
+    least = LINKED.min_exchanged if problem.readings else LINKED.swinging_exchanged[problem.prior.sd_mm is None]
     width = LINKED_FIT.widths_px[1]
     for share in LINKED.exchanged_shares:
         by = round(share * len(problem.blocks))
