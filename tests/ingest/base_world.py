@@ -54,14 +54,17 @@ class World:
 
 
 @functools.cache
-def make_world(frames: int = 60, moving_camera: bool = False, pure_insertion: bool = False) -> World:
-    """A 6 mm shaft with a flat head, about 90 mm away; not to be changed."""
+def make_world(
+    frames: int = 60, moving_camera: bool = False, pure_insertion: bool = False, bends: bool = False
+) -> World:
+    """A 6 mm shaft with a flat head, about 90 mm away, which a wrist that nothing logs may bend; not to be changed."""
     times = np.arange(frames) / RATE
     cameras, masks = [], []
     for time in times:
         sway = 14 * np.sin(np.array([1.1, 0.8, 0.6]) * time) if moving_camera else np.zeros(3)
         cameras.append(np.linalg.inv(rigid((0.05 * sway[1] / 14, -0.14 * sway[0] / 14, 0.0), tuple(sway))))
-        masks.append(_draw(cameras[-1] @ _world_from_instrument(time, pure_insertion)))
+        wrist = (0.6 * np.sin(1.9 * time), 0.4 * np.sin(1.3 * time + 0.5), 0.0) if bends else (0.0, 0.0, 0.0)
+        masks.append(_draw(cameras[-1] @ _world_from_instrument(time, pure_insertion), wrist))
     return World(np.stack(masks), np.stack(cameras), times, pure_insertion)
 
 
@@ -78,15 +81,16 @@ def _world_from_instrument(time: float, pure_insertion: bool) -> np.ndarray:
     return pose @ rigid((0.1, -0.15, 0.5), (2.0, -1.0, -8.0))
 
 
-def _draw(camera_from_instrument: np.ndarray) -> np.ndarray:
-    """bool [h, w]: the shaft, 3 mm thick, and a head 14 mm long, 4.4 mm wide and 2 mm thick, as hulls of points."""
+def _draw(camera_from_instrument: np.ndarray, wrist: tuple[float, float, float]) -> np.ndarray:
+    """bool [h, w]: the shaft, 3 mm thick, and a head 14 mm long, 4.4 mm wide and 2 mm thick, turned by a rotation
+    vector, as hulls of points."""
     mechanical = camera_from_instrument @ np.linalg.inv(rigid((0.1, -0.15, 0.5), (2.0, -1.0, -8.0)))
     angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     ring = 3 * np.stack([np.cos(angle), np.sin(angle)], -1)
     shaft = np.concatenate([np.c_[ring, np.full(48, z)] for z in np.linspace(-90, 0, 10)])
     head = np.array([[x, y, z] for x in (-2.2, 2.2) for y in (-1.0, 1.0) for z in (-1.0, 10.0)] + [[0.0, 0.0, 14.0]])
     image = np.zeros((HEIGHT, WIDTH), np.uint8)
-    for points in (shaft, head):
+    for points in (shaft, Rotation.from_rotvec(wrist).apply(head)):
         local = points @ mechanical[:3, :3].T + mechanical[:3, 3]
         local = local[local[:, 2] > 8]
         if len(local):

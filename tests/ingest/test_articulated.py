@@ -14,12 +14,7 @@ from wristed_world import shifted
 from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.ingest.foreground.silhouettes import silhouettes_of
-from neeco.ingest.registration.articulated import (
-    ArticulatedMotion,
-    find_articulated_base,
-    problem_of,
-    unknown_starts,
-)
+from neeco.ingest.registration.articulated import LoggedMotion, find_base, problem_of, searched_starts
 from neeco.ingest.registration.articulated_fit import (
     ArticulatedFit,
     ArticulatedProblem,
@@ -28,8 +23,7 @@ from neeco.ingest.registration.articulated_fit import (
     fit_articulated,
     with_pose_errors,
 )
-from neeco.ingest.registration.silhouette_fit import BasePrior
-from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
+from neeco.ingest.registration.logged import CLOCK_SHIFTS_S, BasePrior
 from neeco.states.outline_model import ArticulatedModel, joint_values, with_motion
 
 FRAMES, RATE = 36, 8.0
@@ -75,8 +69,8 @@ def _poses_at(shift: float) -> np.ndarray:
     return np.stack([inverse @ _world_from_shaft(time + shift - TRUE_CLOCK_S) for time in TIMES])
 
 
-def _motion(tree: KinematicTree) -> ArticulatedMotion:
-    return ArticulatedMotion(
+def _motion(tree: KinematicTree) -> LoggedMotion:
+    return LoggedMotion(
         tree=tree, poses_at=_poses_at, readings_at=lambda shift: _readings(TIMES + shift - TRUE_CLOCK_S)
     )
 
@@ -128,7 +122,7 @@ def _off(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find(masks: np.ndarray, tree: KinematicTree, given: np.ndarray, sd_mm: float = 5.0, sd_deg: float = 3.0):
-    return find_articulated_base(masks, INTRINSICS, STILL, _motion(tree), (given, sd_mm, sd_deg))
+    return find_base(masks, INTRINSICS, STILL, _motion(tree), (given, sd_mm, sd_deg))
 
 
 def test_the_bend_of_a_wrist_tells_the_place_along_the_shaft(masks):
@@ -142,7 +136,6 @@ def test_the_bend_of_a_wrist_tells_the_place_along_the_shaft(masks):
     given[:3, 3] += 8 * _world_from_shaft(0.0)[:3, 2]
     model = ArticulatedModel(_tree(), motion.poses_at(0.0))
     problem = ArticulatedProblem(
-        model=model,
         silhouettes=silhouettes_of(masks[rows], INTRINSICS),
         contours=contours_of(masks[rows], None),
         camera_from_world=STILL[rows],
@@ -150,9 +143,9 @@ def test_the_bend_of_a_wrist_tells_the_place_along_the_shaft(masks):
         readings=readings,
         values=with_motion(joint_values(_tree(), readings)),
         blocks=np.arange(len(rows)) // 2,
-        prior=BasePrior(given, np.radians(3.0), 5.0),
+        prior=BasePrior.of((given, 5.0, 3.0), 0.1),
     )
-    fit = fit_articulated(problem, ArticulatedFit(given, 0.0, model.means.copy()), max_steps=8)
+    fit = fit_articulated(problem, ArticulatedFit.start(model, given).in_frames(problem), max_steps=8)
     turn, shift = _off(fit.world_from_base)
     sd = np.sqrt(np.diag(covariance(problem, fit)))
     assert np.abs(shift).max() < 1.2
@@ -192,12 +185,13 @@ def test_a_rough_base_is_found_within_what_it_states(masks, seed):
 
 def test_lines_and_links_lead_near_a_base_of_which_nothing_is_known(masks):
     problem = problem_of(masks, INTRINSICS, STILL, _motion(_tree()), None, hidden=None, sd_clock=0.08)
-    assert min(np.linalg.norm(_off(start)[0]) for start in unknown_starts(problem, seed=0)) < 8
+    starts = searched_starts(problem, ArticulatedModel(_tree(), problem.poses[0]), seed=0)
+    assert min(np.linalg.norm(_off(start.world_from_base)[0]) for start in starts) < 8
 
 
 @pytest.mark.slow
 def test_a_base_of_which_nothing_is_known_is_found_within_what_it_states(masks):
-    found = find_articulated_base(masks, INTRINSICS, STILL, _motion(_tree()), None)
+    found = find_base(masks, INTRINSICS, STILL, _motion(_tree()), None)
     turn, shift = _off(found.world_from_base)
     assert np.abs(shift).max() < 2.5
     assert np.abs(turn).max() < 1.2
@@ -219,7 +213,7 @@ def test_a_transform_in_other_axes_is_told_from_another_arms_log(masks):
 @pytest.mark.slow
 def test_another_arms_log_is_refused_where_nothing_is_known_of_its_base(masks):
     with pytest.raises(NeecoError, match="of all bases none was found"):
-        find_articulated_base(masks[::-1], INTRINSICS, STILL, _motion(_tree()), None)
+        find_base(masks[::-1], INTRINSICS, STILL, _motion(_tree()), None)
 
 
 def _doubts(masks: np.ndarray, tree: KinematicTree, given: np.ndarray) -> str:
@@ -253,7 +247,7 @@ def test_another_arms_log_is_refused(masks):
 
 def test_readings_that_stay_do_not_bend():
     motion = _motion(_tree())
-    assert motion.bends
+    assert motion.bending is motion.tree
     still = replace(motion, readings_at=lambda shift: {name: 0 * TIMES for name in ("pitch", "yaw", "jaw")})
-    assert not still.bends
-    assert not replace(motion, readings_at=lambda shift: {"pitch": TIMES}).bends
+    assert still.bending is None
+    assert replace(motion, readings_at=lambda shift: {"pitch": TIMES}).bending is None

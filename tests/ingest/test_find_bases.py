@@ -79,7 +79,7 @@ def test_a_rough_base_is_found_with_its_clock_and_told_in_a_note():
     placed, _ = find_bases(data, _black(world), lambda rows: world.masks[rows], silent)
     assert errors(placed.world_from_base["psm1"], world.poses_at(0.0))[0] < 0.8
     assert placed.clock("ros").source == "found with the base"
-    assert abs(placed.clock("ros").seconds - 0.03) < 0.008
+    assert abs(placed.clock("ros").seconds - 0.03) < min(0.013, 2 * placed.clock("ros").sd)
     assert "its base was found from what moves in 44 frames" in data.notes.sentences[0]
     assert "mm and" in data.notes.sentences[0]
 
@@ -155,7 +155,7 @@ def test_a_base_is_as_far_off_among_misplaced_cameras_as_it_states(monkeypatch):
         turn = Rotation.from_matrix(second[:3, :3] @ first[:3, :3].T).as_rotvec()
         return np.append(turn, (second - first)[:3] @ np.append(middle, 1.0))
 
-    def find(masks, intrinsics, camera_from_world, poses_at, times, prior, **others):
+    def find(masks, intrinsics, camera_from_world, motion, prior, **others):
         base = np.linalg.inv(camera_from_world[0]) @ world.camera_from_world[0] @ WORLD_FROM_BASE
         shown = seen @ generator.multivariate_normal(np.zeros(6), np.linalg.pinv(seen))
         known = np.diag(np.repeat([np.radians(prior[2]) ** -2, prior[1] ** -2], 3))
@@ -163,7 +163,6 @@ def test_a_base_is_as_far_off_among_misplaced_cameras_as_it_states(monkeypatch):
         return BaseRegistration(
             world_from_base=moved(base, covariance @ (shown + known @ step(base, prior[0]))), clock_s=0.0,
             clock_sd_s=0.0, covariance=in_camera(covariance, camera_from_world[0]), open_directions=(), frames=14,
-            from_masks=True,
         )  # fmt: skip
 
     monkeypatch.setattr(module, "find_base", find)
@@ -188,7 +187,7 @@ def test_a_base_found_among_cameras_stays_there_when_these_are_placed_again():
     data = _data(world, None, {"ros": ClockOffset(0.03, 0.0, GIVEN)}).with_base("psm1", WORLD_FROM_BASE)
     base = BaseRegistration(
         world_from_base=WORLD_FROM_BASE, clock_s=0.0, clock_sd_s=0.0, covariance=np.eye(6), open_directions=(),
-        frames=14, from_masks=True,
+        frames=14,
     )  # fmt: skip
     before = _black(world, np.linalg.inv(world.camera_from_world))
     again = rigid((0.02, -0.01, 0.03), (2.0, -1.0, 3.0)) @ before.world_from_camera
@@ -238,13 +237,13 @@ def test_a_place_is_corrected_only_where_images_fit_clearly_better(monkeypatch, 
     world, moved = make_world(44, moving_camera=True), np.eye(4)
     moved[:3, 3] = [1.0, 2.0, 3.0]
 
-    def find(masks, intrinsics, camera_from_world, poses_at, times, prior, **others):
+    def find(masks, intrinsics, camera_from_world, motion, prior, **others):
         assert np.array_equal(prior[0], np.eye(4))
         assert prior[1:] == pytest.approx((3.0 / 3**0.5, 1.5 / 3**0.5), rel=0.01)  # along each axis
         assert others["clock_known"]
         return BaseRegistration(
             world_from_base=moved, clock_s=0.0, clock_sd_s=0.0, covariance=np.eye(6), open_directions=(),
-            overlap=overlap, overlap_before=0.6, frames=44, from_masks=True, doubts=doubts,
+            overlap=overlap, overlap_before=0.6, frames=44, doubts=doubts,
         )  # fmt: skip
 
     monkeypatch.setattr(module, "find_base", find)
@@ -289,15 +288,15 @@ def test_the_pose_of_a_tip_is_turned_into_the_shafts_with_readings_of_the_same_m
     )
     seen = {}
 
-    def find_articulated_base(masks, intrinsics, cameras, motion, prior, **others):
+    def find(masks, intrinsics, camera_from_world, motion, prior, **others):
         assert prior is None
         seen.update(poses_at=motion.poses_at, readings_at=motion.readings_at)
         return BaseRegistration(
             world_from_base=WORLD_FROM_BASE, clock_s=0.03, clock_sd_s=0.005, covariance=np.eye(6), open_directions=(),
-            frames=44, from_masks=True,
+            frames=44,
         )  # fmt: skip
 
-    monkeypatch.setattr(module, "find_articulated_base", find_articulated_base)
+    monkeypatch.setattr(module, "find_base", find)
     placed, _ = find_bases(replace(data, parts=(part,)), _black(world), lambda rows: world.masks[rows], silent)
     assert placed.clock("encoder").seconds == placed.clock("ros").seconds == 0.03  # as the readings were moved
     for shift in (0.0, 0.04):

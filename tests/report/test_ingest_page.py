@@ -75,7 +75,7 @@ def based(overlap: float, sd_mm: float = 1.0) -> BaseRegistration:
     return BaseRegistration(
         world_from_base=np.eye(4), clock_s=0.0, clock_sd_s=0.0, open_directions=(),
         covariance=np.diag([*[np.radians(0.2) ** 2] * 3, 0.04, sd_mm**2, 0.04]),
-        moved_mm=0.0, turned_deg=0.0, overlap=overlap, overlap_before=0.5, residual_px=1.0, frames=100, from_masks=True,
+        moved_mm=0.0, turned_deg=0.0, overlap=overlap, overlap_before=0.5, residual_px=1.0, frames=100,
     )  # fmt: skip
 
 

@@ -50,20 +50,14 @@ class Silhouettes:
         gradient = np.stack([(1 - b) * (d01 - d00) + b * (d11 - d10), bottom - top], -1)
         return top + b * (bottom - top), gradient
 
-    def extent(self, directions: np.ndarray) -> np.ndarray:
-        """Extent [F] px of the piece with the shaft along unit directions [F, 2]; NaN where its tip is not visible."""
-        return np.asarray(np.einsum("fcj,fj->fc", self.shafts.corners, directions).max(1))
-
     def inside(self, pixels: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Whether pixels [F, N, 2] are in the image, `margin` px from its border, bool [F, N]."""
         size = np.array(self.distances.shape[:0:-1])
         return np.asarray(((pixels > margin) & (pixels < size - margin)).all(-1))
 
-    def overlap(self, filled: np.ndarray, counted: np.ndarray | bool = True) -> float:
-        """Intersection over union of filled silhouettes bool [F, h, w] with the masks, over all frames, of the pixels
-        that are `counted`."""
-        both, either = filled & self.masks & counted, (filled | self.masks) & counted
-        return int(both.sum()) / max(int(either.sum()), 1)
+    def overlap(self, filled: np.ndarray) -> float:
+        """Intersection over union of filled silhouettes bool [F, h, w] with the masks, over all frames."""
+        return int((filled & self.masks).sum()) / max(int((filled | self.masks).sum()), 1)
 
     def take(self, rows: np.ndarray) -> Silhouettes:
         """Return those of some of the frames."""
@@ -94,7 +88,6 @@ class ShaftLines:
     points: np.ndarray  # [F, 2] on the line
     directions: np.ndarray  # [F, 2] unit, towards the tip
     tips: np.ndarray  # [F, 2]
-    corners: np.ndarray  # [F, C, 2] of the convex hull of the piece, where its tip is visible
     entering_points: np.ndarray  # [F, 2] and [F, 2], as the first two, of the part at the border alone
     entering_directions: np.ndarray
 
@@ -126,7 +119,6 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
     """Return lines and tips of the largest elongated piece of each mask [F, h, w] that enters at the image's border."""
     count = len(masks)
     points, directions, tips, entries, courses = (np.full((count, 2), np.nan) for _ in range(5))
-    hulls: list[np.ndarray] = [np.full((1, 2), np.nan)] * count
     border = border_of(masks.shape[1:], hidden)
     for row, mask in enumerate(masks):
         pieces, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
@@ -153,11 +145,7 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
         end = along > along.max() - 2.0
         if not touching[end].any():
             tips[row] = places[end].mean(0)
-            hulls[row] = cv2.convexHull(places.astype(np.float32))[:, 0]
-    most = max((len(hull) for hull in hulls), default=1)
-    padded = [hull[np.arange(most) % len(hull)] for hull in hulls]
-    corners = np.array(padded, np.float64).reshape(count, most, 2)
-    return ShaftLines(points, directions, tips, corners, entries, courses)
+    return ShaftLines(points, directions, tips, entries, courses)
 
 
 def _entering_line(

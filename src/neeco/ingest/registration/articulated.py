@@ -1,22 +1,29 @@
-"""Base registration of an instrument with stated links: its articulated silhouette is fitted to foreground masks.
+"""Base registration from images: where a robot's base stands, from foreground masks and the poses that its arm logs.
 
-Where it bends is known along the shaft, which a straight shaft leaves open. The fit starts from several hypotheses, and
-their disagreement counts as uncertainty. What contradicts the recording's statements becomes a doubt.
+The instrument's silhouette is fitted to the masks: with links that recorded readings bend as these are stated, and
+where it bends is then known along the shaft; any other as a tube with a head, of which lines and tips in the masks give
+a first guess (`silhouette_search`). Such a shape absorbs a constant offset or turn of the instrument's own frame, and
+motion that is the same in every frame stays undetermined, such as a shift of the base when the instrument never turns.
+
+The fit starts from several hypotheses, and their disagreement counts as uncertainty. What contradicts the recording's
+statements becomes a doubt.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from neeco.base.errors import NeecoError
-from neeco.capture.kinematics import KinematicTree
+from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
 from neeco.capture.model import evenly_spaced
-from neeco.geometry.lines import unit
-from neeco.ingest.foreground.silhouettes import silhouettes_of
+from neeco.geometry.lines import frame_about, nearest_point, unit
+from neeco.geometry.rotations import rigid
+from neeco.ingest.foreground.silhouettes import ShaftLines, shaft_lines, silhouettes_of
 from neeco.ingest.registration.articulated_fit import (
     LINKED_FIT,
     ArticulatedFit,
@@ -31,23 +38,29 @@ from neeco.ingest.registration.articulated_fit import (
 from neeco.ingest.registration.base import (
     BASES,
     BaseRegistration,
-    Prior,
     in_camera,
     moved_from,
     sd_motion,
     too_few_shafts,
     unmoved,
+    with_prior,
 )
-from neeco.ingest.registration.layers import LAYERS
-from neeco.ingest.registration.silhouette_fit import RIGID_FIT, BasePrior
-from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, moved_base, poses_at_clock, step_between
+from neeco.ingest.registration.logged import (
+    CLOCK_SHIFTS_S,
+    MIDDLE,
+    BasePrior,
+    Prior,
+    moved_base,
+    poses_at_clock,
+    step_between,
+)
 from neeco.ingest.registration.silhouette_search import distance_to, search_bases
-from neeco.states.outline_model import ArticulatedModel, bends, joint_values, with_motion
+from neeco.states.outline_model import MODEL, ArticulatedModel, bends, joint_values, with_motion
 
 
 @dataclass(frozen=True, kw_only=True)
 class ArticulatedSettings:
-    """Settings of the search for a base by links."""
+    """Settings of the search for a base."""
 
     start_frames: int = 16  # number of frames on which starts are compared
     fit_frames: int = 48  # number of frames that the result is fitted to
@@ -69,87 +82,111 @@ class ArticulatedSettings:
     min_exchanged: float = 1.25  # minimum ratio of the cost with poses of other moments
     max_sds: float = 3.2  # maximum error of a stated length or angle, standard deviations of its prior
     max_shift_sds: float = 3.5  # maximum error of the base, standard deviations of its prior
+    exchanged_shares: tuple[float, float] = (0.37, 0.61)  # of the recording, by which poses are shifted for comparison
+    clock_sd_s: float = 0.1  # standard deviation of a clock that nothing gives
+    # of an instrument without links that bend: a tube, of which lines and tips in masks give a first guess, and a head
+    # minimum ratio of the cost with poses of other moments, about a stated base and about an unknown one: of right ones
+    # 5 to 120, of another moment's 2 to 3 where a base is stated
+    swinging_exchanged: tuple[float, float] = (4.0, 8.0)
+    # maximum standard deviation of a head's turns before a still camera, of an unknown base: with more, the base may
+    # be mirrored
+    max_swing_rad: float = 0.2
+    rigid_scatter: float = 1.6  # factor on standard deviations: its shape makes up for slow errors of logs
+    head_mm: float = 12.0  # distance from the tip to the tube's end
+    head_sd_mm: float = 6.0  # standard deviation of the head's length
+    bend_sd_rad: float = 0.4  # standard deviation of its mean turns
+    end_sd_mm: float = 30.0  # standard deviation of the place of the tube's end in the instrument's frame
+    tilt_sd_rad: float = 0.5  # standard deviation of the tube's direction there
+    # changes of a fit, tried after it: factors on the size before a camera that stands still, as then hardly more than
+    # the tip tells how far the instrument is
+    sizes: tuple[float, ...] = (0.7, 1.4, 0.87, 1.15)
+    end_steps_mm: tuple[float, ...] = (-6.0, 6.0)  # shifts of the tube's end along it
+    clock_steps_s: tuple[float, ...] = (-0.04, 0.04)  # changes of a clock that is not known
+    max_changes: int = 6  # maximum number of times that each of these is made, as long as it improves the fit
+    size_sd: float = 0.04  # standard deviation of the logarithm of the size: wrists and jaws blur the tip
+    along_sd_mm: float = 3.0  # standard deviation along the shaft, which a tube hardly determines
+    gap_mm: float = 3.0  # length between tube and head
+    gap_sd_mm: float = 2.0  # standard deviation of that length
 
 
 LINKED = ArticulatedSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ArticulatedMotion:
-    """The links of an instrument and what its logs say, so many s after frames' times [F]: base_from_root [F, 4, 4] mm,
-    and readings [F] by name, NaN where a log has none."""
+class LoggedMotion:
+    """Logs of an arm, so many s after frames' times [F]: base_from_root [F, 4, 4] mm, and readings [F] by name, NaN
+    where a log has none; and the links that they move, if any are stated."""
 
-    tree: KinematicTree
+    tree: KinematicTree | None
     poses_at: Callable[[float], np.ndarray]
     readings_at: Callable[[float], dict[str, np.ndarray]]
 
     @property
-    def bends(self) -> bool:
-        """Whether recorded readings move a joint."""
+    def bending(self) -> KinematicTree | None:
+        """The links, where recorded readings move a joint of theirs."""
         readings = self.readings_at(0.0)
-        if not self.tree.readings or not set(self.tree.readings) <= set(readings):
-            return False
+        if self.tree is None or not self.tree.readings or not set(self.tree.readings) <= set(readings):
+            return None
         values = joint_values(self.tree, readings)
         values = values[np.isfinite(values).all(1)]
-        return len(values) >= BASES.min_frames and bends(self.tree, values)
+        return self.tree if len(values) >= BASES.min_frames and bends(self.tree, values) else None
 
 
-def find_articulated_base(
+def find_base(
     masks: np.ndarray,
     intrinsics: tuple[float, float, float, float],
     camera_from_world: np.ndarray,
-    motion: ArticulatedMotion,
+    motion: LoggedMotion,
     prior: Prior | None,
     *,
     hidden: np.ndarray | None = None,
     clock_known: bool = False,
     seed: int = 0,
 ) -> BaseRegistration:
-    """Find the base of an instrument whose links bend, near a stated one, or anywhere.
+    """Find the base of an instrument near a stated one, or anywhere.
 
     masks: foreground bool [F, h, w], through a pinhole of `intrinsics` (fx, fy, cx, cy px of the masks);
     camera_from_world [F, 4, 4]; hidden: bool [h, w], beyond a round border. Raises NeecoError, which names neither
     instrument nor key, where the foreground is not the instrument.
     """
-    problem = problem_of(
-        masks,
-        intrinsics,
-        camera_from_world,
-        motion,
-        prior,
-        hidden=hidden,
-        sd_clock=0.0 if clock_known else RIGID_FIT.clock_sd_s,
-    )
-    if problem is None:
-        raise NeecoError(
-            f"poses, readings and what moves are there together in fewer than {BASES.min_frames} frames; give the "
-            "transform exactly, or a recording that shows more of it"
-        )
-    fits = _explaining(problem, unknown_starts(problem, seed) if prior is None else known_starts(problem))
-    reached = overlap(problem, fits[0]) if fits else 0.0
-    if prior is not None and reached < LINKED.usual_overlap and (words := _elsewhere(problem, reached, seed)):
-        raise NeecoError(words)
+    tree = motion.bending
+    sd_clock = 0.0 if clock_known else LINKED.clock_sd_s
+    problem = problem_of(masks, intrinsics, camera_from_world, motion, prior, hidden=hidden, sd_clock=sd_clock)
+    model = None if tree is None else ArticulatedModel(tree, problem.poses[MIDDLE])
+    if model is None or prior is None:
+        fits = _explaining(problem, searched_starts(problem, model, seed))
+    else:
+        fits = _explaining(problem, known_starts(problem, model))
+        reached = overlap(problem, fits[0]) if fits else 0.0
+        if reached < LINKED.usual_overlap and (words := _elsewhere(problem, model, reached, seed)):
+            raise NeecoError(words)
     if not fits:
-        raise NeecoError(unmoved(stated=prior is not None, linked=True))
-    return _result(problem, fits, motion)
+        raise NeecoError(unmoved(stated=prior is not None, linked=tree is not None))
+    return _result(problem, fits, tree)
 
 
-def _explaining(problem: ArticulatedProblem, starts: list[np.ndarray]) -> list[ArticulatedFit]:
-    """Fits from different starts, the best first; none where that does not explain the masks, or poses of other moments
+def _explaining(problem: ArticulatedProblem, starts: list[ArticulatedFit]) -> list[ArticulatedFit]:
+    """Fits from starts, the best first; none where that does not explain the masks, or poses of other moments
     do so about as well."""
     fits = _fits(problem, starts)
     if not fits or fits[0].residual_px > LINKED.max_residual_px or overlap(problem, fits[0]) < LINKED.least_overlap:
         return []
-    return [] if _exchangeable(problem, fits[0]) else fits
+    return [] if _exchangeable(problem, fits[0]) or _mirrorable(problem, fits[0]) else fits
 
 
-def _elsewhere(problem: ArticulatedProblem, reached: float, seed: int) -> str:
+def _mirrorable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
+    """Whether another base may explain the masks with other turns of the head."""
+    unknown = problem.prior.sd_mm is None and problem.still and fit.swings.size > 0
+    return unknown and float(fit.swings[:, :2].std(0).max()) > LINKED.max_swing_rad
+
+
+def _elsewhere(problem: ArticulatedProblem, model: ArticulatedModel, reached: float, seed: int) -> str:
     """Error for a stated base that explains the masks worse, by `reached` of their overlap, than one far from it; else
     empty."""
     if problem.silhouettes.shafts.visible.sum() < BASES.min_frames:
         return ""
     free = replace(problem, prior=BasePrior.of(None, problem.prior.sd_clock))
-    fits = _explaining(free, unknown_starts(free, seed))
+    fits = _explaining(free, searched_starts(free, model, seed))
     if not fits or overlap(free, fits[0]) < max(LINKED.usual_overlap, reached + LINKED.min_gain):
         return ""
     off = moved_from(problem.prior.world_from_base, fits[0].world_from_base, problem.middle)
@@ -164,24 +201,33 @@ def problem_of(
     masks: np.ndarray,
     intrinsics: tuple[float, float, float, float],
     camera_from_world: np.ndarray,
-    motion: ArticulatedMotion,
+    motion: LoggedMotion,
     prior: Prior | None,
     *,
     hidden: np.ndarray | None,
     sd_clock: float,
-) -> ArticulatedProblem | None:
-    """At most `fit_frames` frames with masks whose poses and readings are known at all clocks tried."""
+) -> ArticulatedProblem:
+    """At most `fit_frames` frames with masks whose poses and readings are known at all clocks tried; of an instrument
+    that does not bend, masks that show a shaft. Raises NeecoError where these are too few."""
+    tree = motion.bending
     poses = np.stack([motion.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
-    by_shift = [motion.readings_at(float(shift)) for shift in CLOCK_SHIFTS_S]
-    readings = {key: np.stack([at[key] for at in by_shift]) for key in motion.tree.readings}
-    values = joint_values(motion.tree, readings)
+    readings: dict[str, np.ndarray] = {}
+    values = np.zeros((*poses.shape[:2], len(_swinging_links(np.zeros(3), np.eye(3)))))
+    if tree is not None:
+        by_shift = [motion.readings_at(float(shift)) for shift in CLOCK_SHIFTS_S]
+        readings = {key: np.stack([at[key] for at in by_shift]) for key in tree.readings}
+        values = joint_values(tree, readings)
     valid = np.isfinite(poses).all((0, 2, 3)) & np.isfinite(values).all((0, 2))
     rows = np.flatnonzero(valid & masks.any((1, 2)))
-    if len(rows) < BASES.min_frames:
-        return None
+    if tree is None:
+        rows = rows[_require_shafts(shaft_lines(masks[rows], hidden)).visible]
+    elif len(rows) < BASES.min_frames:
+        raise NeecoError(
+            f"poses, readings and what moves are there together in fewer than {BASES.min_frames} frames; give the "
+            "transform exactly, or a recording that shows more of it"
+        )
     rows = rows[evenly_spaced(len(rows), LINKED.fit_frames)]
     return ArticulatedProblem(
-        model=ArticulatedModel(motion.tree, poses[len(CLOCK_SHIFTS_S) // 2][valid]),
         silhouettes=silhouettes_of(masks[rows], intrinsics, hidden),
         contours=contours_of(masks[rows], hidden),
         camera_from_world=camera_from_world[rows],
@@ -193,44 +239,138 @@ def problem_of(
     )
 
 
-def _fits(problem: ArticulatedProblem, starts: list[np.ndarray]) -> list[ArticulatedFit]:
-    """Fits from different starts world_from_base, the best first; of similar ones the best."""
+def _require_shafts(shafts: ShaftLines) -> ShaftLines:
+    """Raise NeecoError where too few masks show a shaft."""
+    if shafts.visible.sum() < BASES.min_frames:
+        raise NeecoError(too_few_shafts(shafts))
+    return shafts
+
+
+def _fits(problem: ArticulatedProblem, starts: list[ArticulatedFit]) -> list[ArticulatedFit]:
+    """Fits from different starts, the best first; of similar ones the best."""
     few = problem.take(np.array(evenly_spaced(len(problem.blocks), LINKED.start_frames)))
-    first = [ArticulatedFit(start, 0.0, problem.model.means.copy()) for start in starts]
-    coarse = [fit_articulated(few, start, LINKED_FIT.widths_px[:2], 10, rough=True) for start in first]
-    chosen = _distinct(problem, coarse)[: LINKED.n_refined]
-    fits = _distinct(problem, [fit_articulated(problem, fit, LINKED_FIT.widths_px[1:]) for fit in chosen])
+    rough = bool(problem.readings)  # what is stated of links comes close
+    coarse = [fit_articulated(few, start.in_frames(few), LINKED_FIT.widths_px[:2], 10, rough=rough) for start in starts]
+    chosen = [fit.in_frames(problem) for fit in _distinct(problem, coarse)[: LINKED.n_refined]]
+    fits = [fit_articulated(problem, fit, LINKED_FIT.widths_px[1:]) for fit in chosen]
+    if fits and not rough:
+        best = min(fits, key=lambda fit: fit.cost)
+        for change in _changes(problem):
+            for _ in range(LINKED.max_changes):
+                changed = fit_articulated(problem, change(best), LINKED_FIT.widths_px[2:])
+                fits.append(changed)
+                if changed.cost > best.cost:
+                    break
+                best = changed
+    fits = _distinct(problem, fits)
     return [minimise(problem, fits[0], LINKED_FIT.widths_px[-1], 20), *fits[1:]] if fits else []
 
 
-def known_starts(problem: ArticulatedProblem) -> list[np.ndarray]:
+def _changes(problem: ArticulatedProblem) -> list[Callable[[ArticulatedFit], ArticulatedFit]]:
+    """Changes of a tube's fit to which the masks respond little, so that least squares end before they make them."""
+
+    def size(factor: float, fit: ArticulatedFit) -> ArticulatedFit:
+        return _resized(problem, fit, factor)
+
+    def end(shift: float, fit: ArticulatedFit) -> ArticulatedFit:
+        parameters, pivot = fit.parameters.copy(), fit.model.pivots[fit.model.first]
+        assert pivot is not None
+        parameters[pivot : pivot + 3] += shift * fit.model.shaft_axis(parameters)
+        parameters[fit.model.mean_length] = max(parameters[fit.model.mean_length] - shift, MODEL.min_length_mm)
+        return replace(fit, parameters=parameters)
+
+    def clock(shift: float, fit: ArticulatedFit) -> ArticulatedFit:
+        return replace(fit, clock=float(np.clip(fit.clock + shift, CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])))
+
+    changes: list[Callable[[ArticulatedFit], ArticulatedFit]] = [
+        partial(size, factor) for factor in LINKED.sizes if problem.still
+    ]
+    changes += [partial(end, shift) for shift in LINKED.end_steps_mm]
+    changes += [partial(clock, shift) for shift in LINKED.clock_steps_s if problem.prior.sd_clock > 0]
+    return changes
+
+
+def _tube_in_world(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np.ndarray, np.ndarray]:
+    """Places [F, 3] mm where the tube of an instrument without links ends, and its directions [F, 3]."""
+    poses = fit.world_from_base @ poses_at_clock(problem.poses, fit.clock)
+    end = fit.model.link_poses(fit.parameters, np.zeros((1, 8)))[1][fit.model.first][0]
+    return poses[:, :3, :3] @ end + poses[:, :3, 3], poses[:, :3, :3] @ fit.model.shaft_axis(fit.parameters)
+
+
+def _trocar(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
+    """The point [3] mm, world, nearest to all lines of the tube."""
+    return nearest_point(*_tube_in_world(problem, fit), ridge=1e-3)
+
+
+def _resized(problem: ArticulatedProblem, fit: ArticulatedFit, factor: float) -> ArticulatedFit:
+    """The fit scaled about a still camera, with the robot's motion as it is."""
+    camera = np.linalg.inv(problem.camera_from_world[0])[:3, 3]
+    ends, _ = _tube_in_world(problem, fit)
+    base, parameters = fit.world_from_base.copy(), fit.parameters.copy()
+    base[:3, 3] += (factor - 1) * (_trocar(problem, fit) - camera)
+    moved = replace(fit, world_from_base=base)
+    off = camera + factor * (ends - camera) - _tube_in_world(problem, moved)[0]
+    turns = (base @ poses_at_clock(problem.poses, fit.clock))[:, :3, :3]
+    pivot = fit.model.pivots[fit.model.first]
+    assert pivot is not None
+    parameters[pivot : pivot + 3] += np.einsum("fji,fj->fi", turns, off).mean(0)
+    parameters[fit.model.tube] += np.log(factor)
+    parameters[fit.model.mean_length] *= factor
+    return replace(moved, parameters=parameters)
+
+
+def known_starts(problem: ArticulatedProblem, model: ArticulatedModel) -> list[ArticulatedFit]:
     """The base as stated, and shifted along the shaft or turned about it: there it is the least certain."""
     base = problem.prior.world_from_base
-    shaft = unit((base[:3, :3] @ problem.poses[len(CLOCK_SHIFTS_S) // 2][:, :3, :3] @ problem.model.axis).mean(0))
+    shaft = unit((base[:3, :3] @ problem.poses[MIDDLE][:, :3, :3] @ model.axis).mean(0))
     steps = [np.zeros(6)]
     steps += [np.append(np.zeros(3), along * shaft) for along in LINKED.along_mm]
     steps += [np.append(roll * shaft, np.zeros(3)) for roll in LINKED.rolls_rad]
-    return [moved_base(base, problem.pivot(base), step) for step in steps]
+    return [ArticulatedFit.start(model, moved_base(base, problem.pivot(base), step)) for step in steps]
 
 
-def unknown_starts(problem: ArticulatedProblem, seed: int) -> list[np.ndarray]:
-    """The best bases of all, by lines and tips of the masks' shafts. Raises NeecoError where too few show one."""
-    shafts, model = problem.silhouettes.shafts, problem.model
-    if shafts.visible.sum() < BASES.min_frames:
-        raise NeecoError(too_few_shafts(shafts))
-    ends = model.cones_at(model.means, problem.values[len(CLOCK_SHIFTS_S) // 2])[0]
-    outermost = [2 + index for index, cone in enumerate(model.cones) if cone.child is None]
-    candidates = search_bases(
-        problem,
-        problem.prior,
-        distance_to(problem, problem.prior),
-        np.random.default_rng(seed),
-        shafts.entering,
-        axis=model.axis,
-        end=model.rest[model.first][:3, 3],
-        tips=ends[:, outermost or [1], 1].mean(1),
-    )
-    return list(candidates.world_from_base)
+def searched_starts(problem: ArticulatedProblem, model: ArticulatedModel | None, seed: int) -> list[ArticulatedFit]:
+    """The best bases near the stated one, or of all, by lines and tips of the masks' shafts; without a model each with
+    the tube that they show. Raises NeecoError where too few show one."""
+    shafts = _require_shafts(problem.silhouettes.shafts)
+    stated: dict[str, Any] = {}
+    if model is not None:
+        ends = model.cones_at(model.means, problem.values[MIDDLE])[0]
+        outermost = [2 + index for index, cone in enumerate(model.cones) if cone.child is None]
+        stated = {"axis": model.axis, "end": model.rest[model.first][:3, 3]}
+        stated |= {"lines": shafts.entering, "tips": ends[:, outermost or [1], 1].mean(1)}
+    distance, generator = distance_to(problem, problem.prior), np.random.default_rng(seed)
+    found = search_bases(problem, problem.prior, distance, generator, **stated)
+    return [
+        ArticulatedFit.start(model or _rigid_model(tip, axis), base)
+        for base, tip, axis in zip(found.world_from_base, found.tips, found.axes, strict=True)
+    ]
+
+
+def _swinging_links(end: np.ndarray, basis: np.ndarray) -> tuple[Link, ...]:
+    """A tube to `end` [3] mm and a head, which swings as nothing states; basis [3, 3]: columns across and along."""
+    pitch = Link("pitch", "shaft", REVOLUTE, rigid(np.eye(3), end), basis[:, 0], body=False)
+    yaw = Link("yaw", "pitch", REVOLUTE, np.eye(4), basis[:, 1], body=False)
+    return Link("shaft"), pitch, yaw, Link("head", "yaw", PRISMATIC, np.eye(4), basis[:, 2])
+
+
+def _rigid_model(tip: np.ndarray, axis: np.ndarray) -> ArticulatedModel:
+    """A tube with a head, of roughly a tip [3] mm and a direction [3] in the instrument's frame."""
+    links = _swinging_links(tip - LINKED.head_mm * axis, frame_about(axis))
+    model = ArticulatedModel(KinematicTree(links), np.eye(4)[None])
+    model.axis = axis
+    pivot, head = model.pivots[model.first], model.cones[-1]
+    assert pivot is not None
+    shape = [*range(model.tube, model.tube + 2), *range(head.radii, head.radii + 4)]
+    sds = np.zeros(len(model.sds))
+    sds[shape] = model.sds[shape]
+    sds[pivot : pivot + 3] = LINKED.end_sd_mm
+    sds[model.tilt : model.tilt + 2] = LINKED.tilt_sd_rad
+    sds[model.ears], sds[model.mean_length] = LINKED.gap_sd_mm, LINKED.head_sd_mm
+    sds[[index for index in model.offsets[1:3] if index is not None]] = LINKED.bend_sd_rad
+    model.sds = sds
+    model.means[model.ears] = LINKED.gap_mm
+    return model
 
 
 def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[ArticulatedFit]:
@@ -245,31 +385,38 @@ def _distinct(problem: ArticulatedProblem, fits: list[ArticulatedFit]) -> list[A
 
 def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
     """Whether poses and readings of other moments explain the masks about as well."""
-    for share in LAYERS.exchanged_shares:
+    least = LINKED.min_exchanged if problem.readings else LINKED.swinging_exchanged[problem.prior.sd_mm is None]
+    width = LINKED_FIT.widths_px[1]
+    for share in LINKED.exchanged_shares:
         by = round(share * len(problem.blocks))
         poses, values = (np.roll(part, by, axis=1) for part in (problem.poses, problem.values))
-        other = replace(problem, poses=poses, values=values)
-        if (
-            minimise(other, fit, LINKED_FIT.widths_px[1], 6).cost
-            < LINKED.min_exchanged * minimise(problem, fit, LINKED_FIT.widths_px[1], 3).cost
-        ):
+        other = minimise(replace(problem, poses=poses, values=values), fit, width, 6)
+        if other.cost < least * minimise(problem, fit, width, 3).cost:
             return True
     return False
 
 
-def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: ArticulatedMotion) -> BaseRegistration:
-    best, prior = with_pose_errors(problem, fits[0]), problem.prior
-    full = covariance(problem, best)
-    spread = LINKED.scatter**2 * full[:6, :6]
+def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], tree: KinematicTree | None) -> BaseRegistration:
+    with_errors, prior = with_pose_errors(problem, fits[0]), problem.prior
+    full = covariance(problem, with_errors)
+    best = fits[0] if tree is None else with_errors  # errors of poses beside swings make up for too much
+    scatter = LINKED.rigid_scatter if tree is None else LINKED.scatter
+    spread = scatter**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
-        weight = float(np.exp(-0.5 * (other.cost - fits[0].cost)))
+        weight = float(np.exp(-0.5 * (other.cost - fits[0].cost) / scatter**2))
         off = step_between(best.world_from_base, other.world_from_base, problem.middle)
         spread = spread + weight / (1 + weight) * np.outer(off, off)
     in_view = in_camera(spread, problem.camera_from_world[0])
     floor = np.array([np.radians(LINKED.floor_deg)] * 3 + [LINKED.floor_mm, LINKED.floor_mm, LINKED.floor_depth_mm])
-    spread = in_view + np.diag(floor**2)
     poses = problem.camera_from_world[0] @ best.world_from_base @ poses_at_clock(problem.poses, best.clock)
-    shaft = unit((poses[:, :3, :3] @ problem.model.axis).mean(0))
+    shaft = unit((poses[:, :3, :3] @ best.model.shaft_axis(best.parameters)).mean(0))
+    in_view = in_view + np.diag(floor**2)
+    if tree is None:
+        in_view[3:, 3:] += LINKED.along_sd_mm**2 * np.outer(shaft, shaft)
+    if tree is None and problem.still:
+        away = problem.camera_from_world[0] @ np.append(_trocar(problem, best), 1.0)
+        in_view[3:, 3:] += LINKED.size_sd**2 * np.outer(away[:3], away[:3])
+    spread, open_directions = with_prior(in_view, prior, shaft)
     stated: dict[str, Any] = {}
     if prior.sd_mm is not None:
         stated = moved_from(prior.world_from_base, best.world_from_base, problem.middle)
@@ -277,34 +424,33 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], motion: Art
     return BaseRegistration(
         world_from_base=best.world_from_base,
         clock_s=best.clock,
-        clock_sd_s=LINKED.scatter * float(np.sqrt(full[6, 6])),
+        clock_sd_s=scatter * float(np.sqrt(full[6, 6])),
         covariance=spread,
-        open_directions=(),
+        open_directions=open_directions,
         overlap=overlap(problem, best),
         residual_px=best.residual_px * problem.px_scale,
         frames=len(problem.blocks),
-        from_masks=True,
         shaft=shaft,
         sd_motion_mm=sd_motion(spread, poses),
-        doubts=tuple(_doubts(problem, fits[0], best, motion)),
+        doubts=tuple(_doubts(problem, fits[0], best, tree)),
         **stated,
     )
 
 
 def _doubts(
-    problem: ArticulatedProblem, rigid: ArticulatedFit, fit: ArticulatedFit, motion: ArticulatedMotion
+    problem: ArticulatedProblem, exact: ArticulatedFit, fit: ArticulatedFit, tree: KinematicTree | None
 ) -> list[str]:
-    """Sentences on what contradicts the recording's statements; `rigid`: the fit without errors of poses, which would
+    """Sentences on what contradicts the recording's statements; `exact`: the fit without errors of poses, which would
     make up for reversed joints."""
-    model, prior = problem.model, problem.prior
-    starts = [rigid]
+    model, prior = fit.model, problem.prior
+    starts = [exact]
     has_prior = prior.sd_mm is not None and prior.sd_rad is not None
     if has_prior and overlap(problem, fit) < LINKED.usual_overlap:  # a reversed joint may have led it astray
-        starts.append(replace(rigid, world_from_base=prior.world_from_base, parameters=model.means.copy()))
+        starts.append(replace(exact, world_from_base=prior.world_from_base, parameters=model.means.copy()))
     reversed_ = [
         reading
-        for reading in motion.tree.readings
-        if any(_reversed(problem, rigid, start, motion, reading) for start in starts)
+        for reading in problem.readings
+        if tree is not None and any(_reversed(problem, exact, start, tree, reading) for start in starts)
     ]
     doubts = [f"what moves fits better with the sign of {reading} reversed: check its gain" for reading in reversed_]
     if prior.sd_mm is not None and prior.sd_rad is not None:
@@ -315,8 +461,10 @@ def _doubts(
                 f"the base found is {max(off):.1f} standard deviations from the one stated: check its transform, "
                 "axes and unit, and which arm it is of"
             )
+    if tree is None or reversed_:  # nothing is stated, or follows from the reversed joint
+        return doubts
     sds = (fit.parameters - model.means) / model.sds
-    for index in np.flatnonzero(np.abs(sds) > LINKED.max_sds) if not reversed_ else ():  # they follow from it
+    for index in np.flatnonzero(np.abs(sds) > LINKED.max_sds):
         part = model.names[index]
         if part.startswith(("pivot", "offset")) and not any(part in words for words in doubts):
             doubts.append(
@@ -327,12 +475,12 @@ def _doubts(
 
 
 def _reversed(
-    problem: ArticulatedProblem, fit: ArticulatedFit, start: ArticulatedFit, motion: ArticulatedMotion, reading: str
+    problem: ArticulatedProblem, fit: ArticulatedFit, start: ArticulatedFit, tree: KinematicTree, reading: str
 ) -> bool:
     """Whether the masks are explained clearly better than by a fit with a reading's sign reversed, from a start."""
-    count = len(motion.tree.links)
+    count = len(tree.links)
     values = problem.values[..., :count].copy()
-    for index, link in enumerate(motion.tree.links):
+    for index, link in enumerate(tree.links):
         values[:, :, index] -= 2 * link.value.get(reading, 0.0) * problem.readings[reading]
     other = replace(problem, values=with_motion(values))
     widths = LINKED_FIT.widths_px[1:3] if start is fit else LINKED_FIT.widths_px[:3]

@@ -10,6 +10,7 @@ motion of the shaft would seem to determine the base far better than it does.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
@@ -17,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.ingest.foreground.silhouettes import SHAFT_LINES, border_of
-from neeco.ingest.registration.silhouette_fit import POSE_SDS, BasePrior
-from neeco.ingest.registration.silhouette_model import (
+from neeco.ingest.registration.logged import (
     BASE,
     CLOCK_SHIFTS_S,
+    BasePrior,
     LoggedSilhouettes,
     moved_base,
     poses_at_clock,
@@ -46,16 +47,25 @@ class ArticulatedFitSettings:
     damping: float = 1e-2  # initial Levenberg-Marquardt damping
     tolerance: float = 1e-4  # share of the cost below which steps end
     pose_blocks: int = 2  # blocks of the recording after which errors of logged poses are independent
+    # errors of a log's poses that last, rad and mm along each axis: trackers and robots drift by 0.2 to 0.4 mm
+    pose_sd_rad: float = 0.0015
+    pose_sd_mm: float = 0.3
+    # of a head about which nothing is stated, in each frame: standard deviations of its turns, and of its place along
+    # itself, which opening jaws and further joints change
+    swing_sd_rad: float = 0.4
+    slide_sd_mm: float = 0.7
 
 
 LINKED_FIT = ArticulatedFitSettings()
 
+SWING_SDS = np.array([LINKED_FIT.swing_sd_rad, LINKED_FIT.swing_sd_rad, LINKED_FIT.slide_sd_mm])
+POSE_SDS = np.repeat([LINKED_FIT.pose_sd_rad, LINKED_FIT.pose_sd_mm], 3)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArticulatedProblem(LoggedSilhouettes):
-    """Silhouettes, joint values at the clocks of the poses, and the model that is to explain them."""
+    """Silhouettes, and joint values at the clocks of the poses."""
 
-    model: ArticulatedModel
     contours: np.ndarray  # [F, N, 2] px of the masks' outlines; NaN: no point
     readings: dict[str, np.ndarray]  # [S, F] by name
     values: np.ndarray  # [S, F, 2 L] of all links' joints, rad or mm, as `with_motion` has them
@@ -75,16 +85,51 @@ class ArticulatedProblem(LoggedSilhouettes):
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ArticulatedFit:
-    """A base, the clock s by which the log is ahead, and the model's parameters [P]."""
+    """A base, the clock s by which the log is ahead, and a model of the instrument with its parameters [P] and what it
+    has of its own in every frame."""
 
+    model: ArticulatedModel
     world_from_base: np.ndarray
-    clock: float
     parameters: np.ndarray
-    pose_errors: np.ndarray | None = None  # [F, 6] rad, mm: turns about the root, shifts, world; None: not fitted
+    clock: float = 0.0
+    swings: np.ndarray  # [F, 3 or 0] rad and mm, added to the values of the first joints: turns and slide of a head
+    pose_errors: np.ndarray  # [F, 6 or 0] rad, mm: turns about the root and shifts, world; 0: not fitted
     cost: float = np.inf  # robust loss of the residuals and the priors' squares
     residual_px: float = np.inf  # median
+
+    @classmethod
+    def start(cls, model: ArticulatedModel, world_from_base: np.ndarray) -> Self:
+        """A model as expected, in some base, of no frames yet."""
+        none = np.zeros((0, 0))
+        return cls(
+            model=model,
+            world_from_base=world_from_base,
+            parameters=model.means.copy(),
+            swings=none,
+            pose_errors=none,
+        )
+
+    def in_frames(self, problem: ArticulatedProblem) -> ArticulatedFit:
+        """The fit with what is expected in a problem's frames; where no readings bend the instrument, a head swings."""
+        count, swings = len(problem.blocks), 0 if problem.readings else len(SWING_SDS)
+        return replace(self, swings=np.zeros((count, swings)), pose_errors=np.zeros((count, 0)))
+
+    @property
+    def own(self) -> np.ndarray:
+        """Return what every frame has of its own [F, K]: swings, then errors of poses."""
+        return np.concatenate([self.swings, self.pose_errors], 1)
+
+    def with_own(self, own: np.ndarray) -> ArticulatedFit:
+        """The fit with other values [F, K] of every frame."""
+        swings, pose_errors = np.split(own, [self.swings.shape[1]], axis=1)
+        return replace(self, swings=swings, pose_errors=pose_errors)
+
+    @property
+    def own_sds(self) -> np.ndarray:
+        """Standard deviations [K] of what every frame has of its own."""
+        return np.append(SWING_SDS[: self.swings.shape[1]], POSE_SDS[: self.pose_errors.shape[1]])
 
 
 def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
@@ -116,18 +161,21 @@ class _Points:
 def outlines(problem: ArticulatedProblem, fit: ArticulatedFit) -> Outlines:
     """Project the fit's cones."""
     root = fit.world_from_base @ poses_at_clock(problem.poses, fit.clock)
-    if fit.pose_errors is not None:
+    if fit.pose_errors.size:
         root = root.copy()
         root[:, :3, :3] = Rotation.from_rotvec(fit.pose_errors[:, :3]).as_matrix() @ root[:, :3, :3]
         root[:, :3, 3] += fit.pose_errors[:, 3:]
     root = problem.camera_from_world @ root
     values = poses_at_clock(problem.values, fit.clock)
-    return problem.model.outlines(fit.parameters, values, root, problem.silhouettes.intrinsics)
+    if fit.swings.size:
+        values = values.copy()
+        values[:, 1 : 1 + len(SWING_SDS)] += fit.swings
+    return fit.model.outlines(fit.parameters, values, root, problem.silhouettes.intrinsics)
 
 
 def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
-    projected, owner = outlines(problem, fit), problem.model.owner
-    points = problem.model.outline_points(projected)
+    projected, owner = outlines(problem, fit), fit.model.owner
+    points = fit.model.outline_points(projected)
     others = projected.distances(points)[0]
     others[:, owner, np.arange(len(owner))] = -1e3
     others[:, 1, owner == 0] = others[:, 0, owner == 1] = -1e3  # the tube continues in its end
@@ -140,27 +188,28 @@ def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
 def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points) -> np.ndarray:
     """Residuals [F, N + M] px: positive where the model is too small."""
     projected = outlines(problem, fit)
-    ahead, _ = problem.silhouettes.look_up(problem.model.outline_points(projected))
+    ahead, _ = problem.silhouettes.look_up(fit.model.outline_points(projected))
     back = -projected.distances(use.contours)[0].max(1)
     return np.concatenate([np.where(use.model, ahead, 0.0), np.where(use.masks, back, 0.0)], 1)
 
 
 def moved(problem: ArticulatedProblem, fit: ArticulatedFit, step: np.ndarray) -> ArticulatedFit:
-    """The fit after a step [BASE + P] in its parameters, or [BASE + P + 6 F] with the poses' errors."""
+    """The fit after a step in its parameters [BASE + P], or in these and what every frame has of its own
+    [BASE + P + F K]."""
     count = BASE + len(fit.parameters)
-    errors = fit.pose_errors
-    return ArticulatedFit(
-        moved_base(fit.world_from_base, problem.pivot(fit.world_from_base), step[:6]),
-        float(np.clip(fit.clock + step[6], CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])),
-        fit.parameters + step[BASE:count],
-        errors if errors is None or len(step) == count else errors + step[count:].reshape(errors.shape),
+    own = fit.own + step[count:].reshape(fit.own.shape) if len(step) > count else fit.own
+    return replace(
+        fit.with_own(own),
+        world_from_base=moved_base(fit.world_from_base, problem.pivot(fit.world_from_base), step[:6]),
+        parameters=fit.parameters + step[BASE:count],
+        clock=float(np.clip(fit.clock + step[6], CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])),
     )
 
 
 def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, free: np.ndarray) -> np.ndarray:
     """Derivatives [F, N + M, free] of the residuals, through those of the cones' images; and where poses' errors are
     fitted, by those of the own frame [F, N + M, free + 6]."""
-    projected, model = outlines(problem, fit), problem.model
+    projected, model = outlines(problem, fit), fit.model
     _, slope = problem.silhouettes.look_up(model.outline_points(projected))
     distances, places, ways = projected.distances(use.contours)
     nearest = distances.argmax(1)
@@ -188,11 +237,8 @@ def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, fr
     for index in free:
         step = steps[index] * np.eye(len(steps))[index]
         columns.append(slopes(moved(problem, fit, step), moved(problem, fit, -step), steps[index]))
-    errors = fit.pose_errors
-    if errors is not None:
-        for k, step in enumerate(np.diag(steps[:6])):  # all frames at once: each depends on its own pose only
-            plus_fit, minus_fit = replace(fit, pose_errors=errors + step), replace(fit, pose_errors=errors - step)
-            columns.append(slopes(plus_fit, minus_fit, steps[k]))
+    for step in np.diag(LINKED_FIT.parameter_step * fit.own_sds):  # all frames at once: each depends on its own only
+        columns.append(slopes(fit.with_own(fit.own + step), fit.with_own(fit.own - step), step.sum()))
     return np.stack(columns, -1)
 
 
@@ -224,21 +270,22 @@ def _scores(columns: np.ndarray, weighted: np.ndarray, free: int) -> np.ndarray:
 
 
 def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals [BASE + P] of all priors in standard deviations, and the inverse standard deviations [BASE + P]; with
-    poses' errors [BASE + P + 6 F]."""
-    model = problem.model
+    """Residuals [BASE + P + F K] of all priors in standard deviations, and the inverse standard deviations
+    [BASE + P + F K]; 0 of parameters that are not fitted."""
+    model = fit.model
     off, sds = problem.prior.offsets(problem, fit.world_from_base, fit.clock)
     off, sds = np.append(off, fit.parameters - model.means), np.append(sds, model.sds)
-    if fit.pose_errors is not None:
-        off, sds = np.append(off, fit.pose_errors), np.append(sds, np.tile(POSE_SDS, len(fit.pose_errors)))
-    return off * (1 / sds), 1 / sds
+    off, sds = np.append(off, fit.own), np.append(sds, np.tile(fit.own_sds, len(fit.own)))
+    scale = np.divide(1, sds, out=np.zeros(len(sds)), where=sds > 0)
+    return off * scale, scale
 
 
-def _free(problem: ArticulatedProblem, rough: bool = False) -> np.ndarray:
-    """Parameters that are fitted; rough: base, clock and the most important of the model's."""
-    model = problem.model
+def _free(problem: ArticulatedProblem, model: ArticulatedModel, rough: bool = False) -> np.ndarray:
+    """Parameters that are fitted, those with a standard deviation; rough: base, clock and the most important of the
+    model's."""
     count = BASE + len(model.means)
     free = np.isin(np.arange(count), [*range(BASE), BASE + model.tube, BASE + model.mean_length]) | (not rough)
+    free[BASE:] &= model.sds > 0
     free[6] = problem.prior.sd_clock > 0
     return np.flatnonzero(free)
 
@@ -255,8 +302,8 @@ def minimise(
     problem: ArticulatedProblem, fit: ArticulatedFit, width: float, max_steps: int = 12, *, rough: bool = False
 ) -> ArticulatedFit:
     """The nearest fit under a Cauchy loss of a width px (of masks 160 wide); rough: of few parameters."""
-    free, width, noise = _free(problem, rough), width * problem.px_scale, LINKED_FIT.noise_px * problem.px_scale
-    sds = problem.model.sds
+    free, sds = _free(problem, fit.model, rough), fit.model.sds
+    width, noise = width * problem.px_scale, LINKED_FIT.noise_px * problem.px_scale
     count = BASE + len(sds)
 
     def linearise(fit: ArticulatedFit) -> Linearisation[ArticulatedFit]:
@@ -310,15 +357,14 @@ def fit_articulated(
 
 def with_pose_errors(problem: ArticulatedProblem, fit: ArticulatedFit, max_steps: int = 20) -> ArticulatedFit:
     """The nearest fit in which every frame's pose has an error of its own, under the narrowest loss."""
-    return minimise(
-        problem, replace(fit, pose_errors=np.zeros((len(problem.blocks), 6))), LINKED_FIT.widths_px[-1], max_steps
-    )
+    exact = replace(fit, pose_errors=np.zeros((len(problem.blocks), 6)))
+    return minimise(problem, exact, LINKED_FIT.widths_px[-1], max_steps)
 
 
 def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     """Covariance [BASE + P, BASE + P] at a minimum, with outlines' and poses' errors that are correlated within the
     recording's blocks (sandwich estimator); the clock's rows are 0 where it is known."""
-    free, px_scale = _free(problem), problem.px_scale
+    free, px_scale = _free(problem, fit.model), problem.px_scale
     width, noise = LINKED_FIT.widths_px[-1] * px_scale, LINKED_FIT.noise_px * px_scale
     use = _points(problem, fit)
     px = _residuals(problem, fit, use)
@@ -326,7 +372,7 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     weights = _weights(px, width, noise)
     scores = _scores(columns, weights * px, len(free))
     scale = prior_residuals(problem, fit)[1]
-    count = BASE + len(problem.model.means)
+    count = BASE + len(fit.parameters)
     prior = np.diag(scale[free] ** 2)
     prior_information = np.diag(np.append(scale[free], scale[count:]) ** 2)
     inverse = np.linalg.inv(_information(columns, weights, len(free)) + prior_information)[: len(free)]
@@ -334,9 +380,9 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     blocks = blocks - blocks.mean(0)
     scatter = blocks.T @ blocks * len(blocks) / max(len(blocks) - 1, 1)
     scatter[: len(free), : len(free)] += prior
-    if fit.pose_errors is not None:  # they last for a block or two, though the fit takes them to be independent
+    if fit.own.size:  # they last for a block or two, though the fit takes them to be independent
         apart = np.abs(problem.blocks[:, None] - problem.blocks) / LINKED_FIT.pose_blocks
-        scatter[len(free) :, len(free) :] += np.kron(np.clip(1 - apart, 0, 1), np.diag(scale[count : count + 6] ** 2))
+        scatter[len(free) :, len(free) :] += np.kron(np.clip(1 - apart, 0, 1), np.diag(fit.own_sds**-2.0))
     full = np.zeros((count, count))
     full[np.ix_(free, free)] = inverse @ scatter @ inverse.T
     return full

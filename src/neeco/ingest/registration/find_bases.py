@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
+from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid
-from neeco.geometry.trocar import line_through_trocar
-from neeco.ingest.frames.images import StageProgress, Views, reduced
+from neeco.ingest.frames.images import StageProgress, Views
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import ReadingLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
-from neeco.ingest.registration.articulated import ArticulatedMotion, find_articulated_base
-from neeco.ingest.registration.base import BASES, BaseRegistration, base_from_layers, find_base
+from neeco.ingest.registration.articulated import LoggedMotion, find_base
+from neeco.ingest.registration.base import BASES, BaseRegistration
 from neeco.ingest.registration.hand_eye import HAND_EYE, Registration
-from neeco.ingest.registration.layers import ArmImages, covered_by, evenly_lit, fit_layers
-from neeco.ingest.registration.silhouette_fit import RIGID_FIT
-from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S
+from neeco.ingest.registration.logged import Prior
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, ClockOffset
 from neeco.ingest.timing.episodes import Episode, Episodes
 
@@ -35,8 +34,7 @@ class FindBasesSettings:
     """Thresholds of what is corrected by images."""
 
     n_frames: int = 140  # maximum number of frames that are searched, evenly spaced
-    min_bend_mm: float = 2.0  # minimum distance from the root to the logged link: nearer, nothing bends there
-    min_read_share: float = 0.5  # minimum share of the frames that a joint's log covers; others are left out
+    nearest_mm: float = 5.0  # minimum depth at which an arm's place in the image is known
     min_overlap: float = 0.85  # minimum overlap of an instrument's outline with what moves, to correct its place
     min_overlap_gain: float = 0.2  # minimum gain of that overlap over the one before
     max_prior_mm: float = 8.0  # maximum standard deviation of a place that outlines find
@@ -111,17 +109,12 @@ def find_bases(
         return data, {}
     progress("finding the robot's base", 0, 0)
     observed = _Observed(views, moving)
-    usable = observed.visible
     arms = [_among_cameras(_arm(data, item, observed), registration) for item in unknown]
     bases = {}
-    # what moves most is found most easily, and then out of the way
-    for number, arm in enumerate(sorted(arms, key=lambda arm: -arm.travel)):
+    for number, arm in enumerate(arms):
         progress("finding the robot's base", number, len(arms) if number else 0)
         name, clock = arm.item.name, arm.clock
-        base, covered = _find(arm, observed, usable, alone=len(arms) == 1)
-        usable = usable & ~covered
-        if base is None:
-            assert arm.prior is not None
+        if len(arms) > 1 and arm.prior is not None and arm.travel < PLACING.min_travel_mm:
             stated, sd_mm, sd_deg = arm.prior
             data = data.with_base(name, stated)
             data.notes.add(
@@ -135,9 +128,9 @@ def find_bases(
                 covariance=np.diag(np.repeat([np.radians(sd_deg) ** 2, sd_mm**2], 3)),
                 open_directions=(),
                 frames=0,
-                from_masks=False,
             )
             continue
+        base = _find(arm, observed, arms)
         if clock.source not in KNOWN:
             clock = replace(clock.later(base.clock_s), sd=base.clock_sd_s, source=FOUND)
         data = data.with_base(name, base.world_from_base).with_moved_clock(logs[name].clock, clock)
@@ -185,15 +178,11 @@ def correct_placement(
     observed = _Observed(views, moving)
     arm = _among_cameras(_arm(data, replace(items[0], world_from_base=stated), observed), registration)
     try:
-        base, _ = _find(arm, observed, observed.visible, alone=True)
+        base = _find(arm, observed, [arm])
     except NeecoError:  # the images do not determine it
         return data, {}
-    least = (
-        PLACING.min_overlap
-        if base is None
-        else max(PLACING.min_overlap, base.overlap_before + PLACING.min_overlap_gain)
-    )
-    if base is None or base.doubts or not base.overlap > least:
+    least = max(PLACING.min_overlap, base.overlap_before + PLACING.min_overlap_gain)
+    if base.doubts or not base.overlap > least:
         return data, {}
     data.notes.add(
         f"instrument {name!r}: its place was corrected by {base.moved_mm:.1f} mm and {base.turned_deg:.1f} deg from "
@@ -235,29 +224,14 @@ class _Observed:
         return np.array(evenly_spaced(len(self.views.times), PLACING.n_frames))
 
     @cached_property
-    def images(self) -> np.ndarray:
-        """Reduced images uint8 [F, h, w, 3]."""
-        return np.stack([reduced(self.views.load(int(row))) for row in self.rows])
-
-    @cached_property
     def masks(self) -> np.ndarray:
         """Pixels that move, bool [F, h, w]."""
         return self.moving(self.rows)
 
     @cached_property
-    def lit(self) -> np.ndarray:
-        return evenly_lit(self.images)
-
-    @cached_property
     def hidden(self) -> np.ndarray | None:
         """Pixels beyond a round border, bool [h, w]."""
         return self.views.reduced_border
-
-    @property
-    def visible(self) -> np.ndarray:
-        """Pixels within the border, bool [F, h, w]."""
-        shape = self.images.shape[:3]
-        return np.ones(shape, bool) if self.hidden is None else np.tile(~self.hidden, (shape[0], 1, 1))
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:
@@ -281,11 +255,10 @@ class _Arm:
     item: InstrumentLogs
     where: str
     clock: ClockOffset
-    readings: dict[str, np.ndarray]  # [F] of each joint
-    prior: tuple[np.ndarray, float, float] | None  # as `find_base` takes it
-    readings_at: Callable[[float], dict[str, np.ndarray]]  # as `readings`, so many s later, NaN where a log has none
+    prior: Prior | None
+    readings_at: Callable[[float], dict[str, np.ndarray]]  # [F] by joint, so many s later, NaN where a log has none
     poses_at: Callable[[float], np.ndarray]  # base_from_instrument [F, 4, 4], so many s later; with links, the root's
-    wrists: np.ndarray | None  # [F, 3] mm in the root's frame, with links: where the link is whose pose is logged
+    places: np.ndarray  # [F, 3] mm in the base's frame, where the frame is that is logged
 
     @property
     def travel(self) -> float:
@@ -314,11 +287,6 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
             later_readings[joint] = readings_at(reading, reading_clock.at(times) + later)[0]
         return later_readings
 
-    readings = {
-        joint: values
-        for joint, values in readings_later(0.0).items()
-        if np.isfinite(values).mean() > PLACING.min_read_share
-    }
     tree = None if item.kinematics is None or item.kinematics.pose_of is None else item.kinematics
 
     def root_from_logged(tree: KinematicTree, shift: float) -> np.ndarray:
@@ -331,17 +299,14 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
         poses, _ = poses_at(log, clock.at(times) + shift)
         return poses if tree is None else poses @ np.linalg.inv(root_from_logged(tree, shift))
 
-    wrists = None if tree is None else root_from_logged(tree, 0.0)[:, :3, 3]
-    if wrists is not None and not np.nanmin(np.linalg.norm(wrists, axis=1), initial=np.inf) > PLACING.min_bend_mm:
-        wrists = None
     prior = None
     if stated.matrix is not None:
         assert stated.sd_mm is not None
         assert stated.sd_deg is not None
         prior = (_in_world(stated, observed.cameras), stated.sd_mm, stated.sd_deg)
     return _Arm(
-        item=item, where=str(data.recording.path), clock=clock, readings=readings, prior=prior,
-        readings_at=readings_later, poses_at=base_from_shaft, wrists=wrists,
+        item=item, where=str(data.recording.path), clock=clock, prior=prior, readings_at=readings_later,
+        poses_at=base_from_shaft, places=poses_at(log, clock.at(times))[0][:, :3, 3],
     )  # fmt: skip
 
 
@@ -359,76 +324,42 @@ def _among_cameras(arm: _Arm, registration: Registration | None) -> _Arm:
     return replace(arm, prior=(base, float(np.hypot(sd_mm, placed_mm)), float(np.hypot(sd_deg, placed_deg))))
 
 
-def _find(
-    arm: _Arm, observed: _Observed, usable: np.ndarray, *, alone: bool
-) -> tuple[BaseRegistration | None, np.ndarray]:
-    """Find a base from the outlines of what moves where one arm is there and they show it, else from the background.
-
-    Return it with the pixels bool [F, h, w] that belong to no other arm. None for one of several arms that hardly
-    moves: what is given has to do.
-    """
-    if not alone and (by_layers := _without_masks(arm, observed, usable)) is not None:
-        return by_layers
-    readings = np.stack(list(arm.readings.values()), -1) if arm.readings else None
-    tree, clock_known = arm.item.kinematics, arm.clock.source in KNOWN
-    motion = None if tree is None else ArticulatedMotion(tree=tree, poses_at=arm.poses_at, readings_at=arm.readings_at)
+def _find(arm: _Arm, observed: _Observed, arms: Sequence[_Arm]) -> BaseRegistration:
+    """Find a base from the outlines of what moves, of several arms from what is nearest to its own."""
+    motion = LoggedMotion(tree=arm.item.kinematics, poses_at=arm.poses_at, readings_at=arm.readings_at)
     try:
-        if motion is not None and alone and motion.bends:
-            registration = find_articulated_base(
-                observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), motion, arm.prior,
-                hidden=observed.hidden, clock_known=clock_known,
-            )  # fmt: skip
-            return registration, np.zeros_like(usable)
-        registration = find_base(
-            observed.masks, observed.intrinsics, np.linalg.inv(observed.cameras), arm.poses_at,
-            observed.times, prior=arm.prior, readings=readings, hidden=observed.hidden, images=observed.images,
-            clock_known=clock_known,
+        return find_base(
+            _own_masks(arm, observed, arms), observed.intrinsics, np.linalg.inv(observed.cameras), motion, arm.prior,
+            hidden=observed.hidden, clock_known=arm.clock.source in KNOWN,
         )  # fmt: skip
     except NeecoError as error:
-        if alone and (by_layers := _without_masks(arm, observed, usable)) is not None:
-            return by_layers
-        if not alone and arm.prior is not None and arm.travel < PLACING.min_travel_mm:
-            return None, np.zeros_like(usable)
         assert arm.item.base is not None
         raise NeecoError(f"{arm.where}: instrument {arm.item.name!r}: {arm.item.base.key}: {error}") from error
-    return registration, np.zeros_like(usable)
 
 
-def _without_masks(arm: _Arm, observed: _Observed, usable: np.ndarray) -> tuple[BaseRegistration, np.ndarray] | None:
-    """Find a base by `fit_layers`, with the pixels that its arm covers.
-
-    None where that cannot determine it: the scope moves, nothing is given, no line goes through a trocar, or other
-    moments' poses explain the images as well.
-    """
-    cameras = observed.cameras
-    if arm.prior is None or float(np.ptp(cameras, axis=0).max()) >= 1e-6:
-        return None
-    poses = np.stack([arm.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
-    rows = np.flatnonzero(np.isfinite(poses).all((0, 2, 3)))
-    if arm.clock.source in KNOWN:  # no other clock is tried
-        poses = np.tile(arm.poses_at(0.0), (len(CLOCK_SHIFTS_S), 1, 1, 1))
-        rows = np.flatnonzero(np.isfinite(poses[0]).all((1, 2)))
-    line = line_through_trocar(poses[len(CLOCK_SHIFTS_S) // 2, rows]) if len(rows) >= BASES.min_frames else None
-    if line is None:
-        return None
-    wrists = None if arm.wrists is None else arm.wrists[rows]
-    base, sd_mm, sd_deg = arm.prior
-    images = ArmImages(
-        images=observed.lit[rows],
-        intrinsics=observed.intrinsics,
-        poses=poses[:, rows],
-        line=line,
-        usable=usable[rows],
-        wrists=wrists,
-    )
-    prior = np.linalg.inv(cameras[0]) @ base, sd_mm, sd_deg
-    sd_clock = 0.0 if arm.clock.source in KNOWN else RIGID_FIT.clock_sd_s
-    fit = fit_layers(images, prior, sd_clock, np.random.default_rng(0))
-    if not fit.found:
-        return None
-    covered = np.zeros_like(usable)
-    covered[rows] = covered_by(fit, images)
-    return base_from_layers(arm.prior, fit, cameras[0], images.poses[len(CLOCK_SHIFTS_S) // 2], line), covered
+def _own_masks(arm: _Arm, observed: _Observed, arms: Sequence[_Arm]) -> np.ndarray:
+    """Masks bool [F, h, w] of the pieces of what moves that are nearest to where an arm is logged, of all whose base is
+    known roughly; of one whose base is not, all of them."""
+    known = [other for other in arms if other.prior is not None]
+    if arm.prior is None or len(known) < 2:
+        return observed.masks
+    camera_from_world = np.linalg.inv(observed.cameras)
+    pixels = []  # of each arm [F, 2]
+    for other in known:
+        assert other.prior is not None
+        bases = camera_from_world @ other.prior[0]
+        places = np.einsum("fij,fj->fi", bases[:, :3, :3], other.places) + bases[:, :3, 3]
+        pixels.append(np.stack(project(places, *observed.intrinsics, nearest=PLACING.nearest_mm), -1))
+    own = np.zeros_like(observed.masks)
+    for row, mask in enumerate(observed.masks):
+        count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+        for label in range(1, count):
+            piece = labels == label
+            corners = np.argwhere(piece)[:, ::-1] + 0.5
+            distances = [np.linalg.norm(corners - of[row], axis=1).min() for of in pixels]
+            if known[int(np.argmin(np.nan_to_num(distances, nan=np.inf)))] is arm:
+                own[row] |= piece
+    return own
 
 
 def _in_world(stated: StatedBase, cameras: np.ndarray) -> np.ndarray:
@@ -450,10 +381,7 @@ def describe(name: str, base: BaseRegistration) -> str:
         f"; standard deviations {listed(base.sd_mm)} mm and {listed(base.sd_deg)} deg (right, down, forward of the "
         "camera); "
     )
-    if not base.from_masks:
-        words += f"without outlines: its shaft explains {base.explained:.0%} of what changes in the images"
-    else:
-        words += f"its outline and what moves overlap by {base.overlap:.2f}"
+    words += f"its outline and what moves overlap by {base.overlap:.2f}"
     if np.isfinite(base.overlap_before):
         words += f" ({base.overlap_before:.2f} as given)"
     if base.open_directions:

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.lines import unit
 from neeco.ingest.foreground.silhouettes import ShaftLines
-from neeco.ingest.registration.silhouette_fit import BasePrior
-from neeco.ingest.registration.silhouette_model import CLOCK_SHIFTS_S, LoggedSilhouettes
+from neeco.ingest.registration.logged import MIDDLE, BasePrior, LoggedSilhouettes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +138,7 @@ def search_bases(
         lines=problem.silhouettes.shafts if lines is None else lines,
         intrinsics=problem.silhouettes.intrinsics,
         camera_from_world=problem.camera_from_world,
-        base_from_instrument=problem.poses[len(CLOCK_SHIFTS_S) // 2],
+        base_from_instrument=problem.poses[MIDDLE],
         center=center,
         sd_mm=sd_mm,
         distance=distance,
