@@ -82,7 +82,15 @@ class CylinderViews:
 
     @staticmethod
     def of(
-        *, hits: Tensor, sizes: Tensor, intrinsics: Tensor, distance: float, width: int, **poses: Tensor
+        *,
+        hits: Tensor,
+        sizes: Tensor,
+        intrinsics: Tensor,
+        own: Tensor,
+        exchanged: Tensor,
+        world: Tensor,
+        distance: float,
+        width: int,
     ) -> CylinderViews:
         """Reduce evidence [F, H, W] in [0, 1] of images of `sizes` [F, 2] px to about `width` pixels."""
         pool = max(1, round(hits.shape[2] / width))
@@ -96,7 +104,7 @@ class CylinderViews:
         worth = torch.where(inside & moves, small - SETTINGS.threshold, 0.0)
         count = len(hits)
         rays = normalize(rays.reshape(count, -1, 3), dim=-1)
-        return CylinderViews(rays, worth.reshape(count, -1), distance=distance, **poses)
+        return CylinderViews(rays, worth.reshape(count, -1), own, exchanged, world, distance)
 
     def gains(
         self, transforms: Tensor, origins: Tensor, directions: Tensor, chunk: int = 64

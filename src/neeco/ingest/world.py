@@ -117,10 +117,17 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     check_reference_frames(data, moving=True)
     settings = data.recording.settings
     lens = images.lens
-    pinhole, episodes = lens.pinhole(images.size) if lens else None, data.episode_of(images.selected)
-    begin = partial(StructureFromMotion, folder=images.folder / "raw", names=images.names, size=images.size)
-    begin = partial(begin, work=folder / "sfm", source=data.video.path, masks=images.masks)
-    motion = begin(pinhole=pinhole, settings=settings, episodes=episodes)
+    motion = StructureFromMotion(
+        work=folder / "sfm",
+        source=data.video.path,
+        folder=images.folder / "raw",
+        names=images.names,
+        size=images.size,
+        pinhole=lens.pinhole(images.size) if lens else None,
+        masks=images.masks,
+        settings=settings,
+        episodes=data.episode_of(images.selected),
+    )
     sfm = motion.reconstruct(progress)
     _check_joined(data, images.selected[sfm.indices])
     if lens is None:

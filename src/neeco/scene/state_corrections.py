@@ -48,7 +48,8 @@ class StateCorrections(nn.Module):
         self.names = tuple(item.name for item in instruments)
         self.readings = tuple(recorded_readings(item) for item in instruments)
         slide, angle = CORRECTIONS.slide_mm, CORRECTIONS.angle_rad
-        units = [[slide if item.slides(name) else angle for name in recorded_readings(item)] for item in instruments]
+        recorded = zip(instruments, self.readings, strict=True)
+        units = [[slide if item.slides(name) else angle for name in readings] for item, readings in recorded]
         self._units = units
         most = max(map(len, self.readings), default=0)
         zeros = partial(torch.zeros, device=device)

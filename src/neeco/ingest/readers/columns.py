@@ -25,13 +25,21 @@ UNITS = {
     "angle": {"rad": 1.0, "deg": 0.017453292519943295},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
 }  # kind -> unit -> its scale to mm, rad or s
-_ALIASES = dict.fromkeys(("millimeter", "millimeters", "millimetre", "millimetres"), "mm")
-_ALIASES |= dict.fromkeys(("meter", "meters", "metre", "metres"), "m")
-_ALIASES |= dict.fromkeys(("centimeters", "centimetres"), "cm")
-_ALIASES |= dict.fromkeys(("radian", "radians"), "rad") | dict.fromkeys(("degree", "degrees", "°"), "deg")
-_ALIASES |= dict.fromkeys(("sec", "secs", "second", "seconds"), "s")
-_ALIASES |= dict.fromkeys(("msec", "millis", "milliseconds"), "ms") | dict.fromkeys(("usec", "microseconds"), "us")
-_ALIASES |= dict.fromkeys(("nsec", "nsecs", "nanosec", "nanoseconds"), "ns")
+_ALIASES = {
+    alias: unit
+    for unit, aliases in {
+        "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
+        "m": ("meter", "meters", "metre", "metres"),
+        "cm": ("centimeters", "centimetres"),
+        "rad": ("radian", "radians"),
+        "deg": ("degree", "degrees", "°"),
+        "s": ("sec", "secs", "second", "seconds"),
+        "ms": ("msec", "millis", "milliseconds"),
+        "us": ("usec", "microseconds"),
+        "ns": ("nsec", "nsecs", "nanosec", "nanoseconds"),
+    }.items()
+    for alias in aliases
+}
 _UNIT_SUFFIX = re.compile(r"^(?P<base>.*?)(?:[\s_\-/]+|[\s_]*[\[(]\s*)(?P<unit>[a-zµ°]+)\s*[\])]?$")
 
 
@@ -155,8 +163,10 @@ def scale_of(
 
 
 # column names without their unit, in order of preference; a name also matches behind a prefix ("tool_timestamp")
-_TIMES: tuple[str, ...] = ("header_stamp", "timestamp", "time_stamp", "stamp", "time", "t", "elapsed")
-_TIMES += ("secs", "sec", "seconds", "__time")
+_TIMES = (
+    *("header_stamp", "timestamp", "time_stamp", "stamp"),
+    *("time", "t", "elapsed", "secs", "sec", "seconds", "__time"),
+)
 _Given = Mapping[str, Sequence[str]]  # columns by what they mean
 _NOTHING: _Given = MappingProxyType({})
 _Choices = list[tuple[bool, list[str]]]  # (may all stand behind one prefix, names)

@@ -9,8 +9,6 @@ The layout is that of the data set's readme (Gao et al. 2014, "The JHU-ISI Gestu
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -43,10 +41,21 @@ class JigsawsKinematics(RecordingFormat):
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         count = len(_lines(path)[0])
-        title, hint = "tool tip in the arm's base", "poses are stated in the frame of this arm's own base"
-        stream = partial(Stream, joints=(("gripper_angle", GRIPPER),), clock=VIDEO_CLOCK, hints=(hint,))
-        streams = [stream(arm, Kind.POSES, title, count, RATE_HZ, body=arm.replace(" ", "_")) for arm in ARMS]
-        return tuple(replace(each, offered=each.name.startswith("slave")) for each in streams)
+        return tuple(
+            Stream(
+                arm,
+                Kind.POSES,
+                "tool tip in the arm's base",
+                count,
+                RATE_HZ,
+                offered=arm.startswith("slave"),
+                body=arm.replace(" ", "_"),
+                joints=(("gripper_angle", GRIPPER),),
+                clock=VIDEO_CLOCK,
+                hints=("poses are stated in the frame of this arm's own base",),
+            )
+            for arm in ARMS
+        )
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         arm = self.choose(path, stream, Kind.POSES).name

@@ -99,10 +99,18 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     if frame != named.BASE and source.frame is None and table.meaning is not None:
         rows.repairs.append(f"poses are stated in {table.meaning.why}")
     positions, quats = in_opencv(frame, positions[order], quats)
-    stated_in = table.stated_in if source.frame is None else None
-    frame = named.BASE if frame == named.BASE else named.CAMERA
-    log = PoseLog(table.path, source.clock, times, positions, quats, frame=frame, stated_in=stated_in)
-    return replace(log, gaps=gaps, notes=rows.notes(), image_hz=table.image_hz)
+    return PoseLog(
+        table.path,
+        source.clock,
+        times,
+        positions,
+        quats,
+        gaps=gaps,
+        notes=rows.notes(),
+        image_hz=table.image_hz,
+        frame=named.BASE if frame == named.BASE else named.CAMERA,
+        stated_in=table.stated_in if source.frame is None else None,
+    )
 
 
 def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,8 +71,16 @@ class SurgPose(RecordingFormat):
             header = ("t_s", *JOINT_NAMES[: values.shape[1]])
         rows = np.column_stack([frames / FRAMES_PER_SECOND, values])
         stated_in = f"{chosen.name}_base" if chosen.kind == Kind.POSES else None
-        table = Table(path, header, rows, frames, stream=chosen.name, record="frame", stated_in=stated_in)
-        return replace(table, image_hz=FRAMES_PER_SECOND)
+        return Table(
+            path,
+            header,
+            rows,
+            frames,
+            stream=chosen.name,
+            record="frame",
+            stated_in=stated_in,
+            image_hz=FRAMES_PER_SECOND,
+        )
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         return open_video(path / self.choose(path, stream, Kind.IMAGES).name)

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -317,12 +317,19 @@ class _Scan:
             if fps is None:
                 notes.append(f"its frames have no times; taken as {stated:g} a second")
             times = np.array(order) / stated
-        notes = [f"{self.path.name}: {note}" for note in notes]
-        buffered = tuple(self.buffered) if len(self.buffered) == len(self.stamps) else ()
-        video = _Video(
-            self.path, self.size, tuple(notes), times, stamps=tuple(order), numbered=numbered, threads=self.threads
+        return _Video(
+            self.path,
+            self.size,
+            tuple(f"{self.path.name}: {note}" for note in notes),
+            times,
+            stamps=tuple(order),
+            numbered=numbered,
+            threads=self.threads,
+            part=self.part,
+            own_fps=own_rate,
+            pixel_aspect=self.pixel_aspect,
+            buffered=tuple(self.buffered) if len(self.buffered) == len(self.stamps) else (),
         )
-        return replace(video, part=self.part, own_fps=own_rate, pixel_aspect=self.pixel_aspect, buffered=buffered)
 
     def _notes(self, stamps: list[int]) -> list[str]:
         notes, read = [], len(self.stamps)

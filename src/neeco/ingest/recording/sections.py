@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -180,19 +180,37 @@ def pose_log(node: Node) -> PoseColumns:
     """Return a log of poses; its clock is "" where the recording names none."""
     log: PoseSection = read(PoseSection, node)
     (rotation, form), stated = log.columns.rotation, log.columns
-    source = PoseColumns(log.file, log.clock, units=log.units, rate_hz=log.rate_hz, frame=log.frame)
-    source = replace(source, time=stated.time, position=stated.position, rotation=rotation, form=form)
-    source = replace(source, euler_convention=stated.euler_convention, stream=log.stream or log.tool)
-    return replace(source, state=stated.state, good=stated.good)
+    return PoseColumns(
+        log.file,
+        log.clock,
+        time=stated.time,
+        position=stated.position,
+        rotation=rotation,
+        form=form,
+        euler_convention=stated.euler_convention,
+        state=stated.state,
+        good=stated.good,
+        units=log.units,
+        rate_hz=log.rate_hz,
+        stream=log.stream or log.tool,
+        frame=log.frame,
+    )
 
 
 def joint_log(node: Node) -> JointColumns:
     """Return a log of a joint; its clock as that of `pose_log`."""
     log: JointSection = read(JointSection, node)
-    value = (log.columns.value or (None,))[0]
-    source = JointColumns(log.file, log.clock, time=log.columns.time, value=value, units=log.units)
-    limited = replace(source, calibration=log.calibration, limits=log.limits)
-    return replace(limited, rate_hz=log.rate_hz, stream=log.stream)
+    return JointColumns(
+        log.file,
+        log.clock,
+        time=log.columns.time,
+        value=(log.columns.value or (None,))[0],
+        units=log.units,
+        rate_hz=log.rate_hz,
+        calibration=log.calibration,
+        limits=log.limits,
+        stream=log.stream,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
