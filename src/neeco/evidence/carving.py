@@ -20,7 +20,7 @@ from torch.nn.functional import avg_pool2d, pad
 from neeco.base.errors import NeecoError
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.evidence.shaft_search import SETTINGS as SHAFT
-from neeco.evidence.shaft_search import CylinderViews, find_shaft
+from neeco.evidence.shaft_search import CylinderViews, find_shaft, reduced_evidence
 from neeco.geometry.projection import project
 from neeco.raster import rasterize
 from neeco.scene.gaussian_scene import GaussianScene
@@ -261,18 +261,10 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, settings: C
         return None
     rows = torch.tensor(evenly_spaced(len(evidence.frames), SHAFT.n_frames), device=evidence.device)
     world = torch.linalg.inv(evidence.camera_from_world[rows].double()) @ views.own[rows].double()
+    images = (evidence.hits[rows], evidence.sizes[rows], evidence.intrinsics[rows])
+    poses = (views.own[rows], views.exchanged[0][rows], world)
     coarse, fine = (
-        CylinderViews.of(
-            hits=evidence.hits[rows],
-            sizes=evidence.sizes[rows],
-            intrinsics=evidence.intrinsics[rows],
-            own=views.own[rows],
-            exchanged=views.exchanged[0][rows],
-            world=world,
-            distance=evidence.distance,
-            width=width,
-        )
-        for width in SHAFT.widths_px
+        CylinderViews(*reduced_evidence(*images, width), *poses, evidence.distance) for width in SHAFT.widths_px
     )
     shaft = find_shaft(coarse, fine, points, scores, generator)
     if shaft is None:

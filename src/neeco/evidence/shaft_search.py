@@ -67,6 +67,22 @@ class Shaft:
     rest: float
 
 
+def reduced_evidence(hits: Tensor, sizes: Tensor, intrinsics: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    """Reduce evidence [F, H, W] in [0, 1] of images of `sizes` [F, 2] px to about `width` pixels: rays and worth of
+    `CylinderViews`."""
+    pool = max(1, round(hits.shape[2] / width))
+    small = avg_pool2d(hits[:, None], pool)[:, 0]
+    rows, columns = ((torch.arange(side, device=hits.device) + 0.5) * pool for side in small.shape[1:])
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    fx, fy, cx, cy = (column[:, None, None] for column in intrinsics.unbind(1))
+    rays = torch.stack([(u - cx) / fx, (v - cy) / fy, torch.ones_like(u).expand_as(small)], -1)
+    inside = (u < sizes[:, :1, None]) & (v < sizes[:, 1:, None])
+    moves = (small > SETTINGS.threshold).float().mean(0) < SETTINGS.always
+    worth = torch.where(inside & moves, small - SETTINGS.threshold, 0.0)
+    count = len(hits)
+    return normalize(rays.reshape(count, -1, 3), dim=-1), worth.reshape(count, -1)
+
+
 @dataclass(frozen=True, eq=False)
 class CylinderViews:
     """Evidence of F frames for cylinders: unit rays [F, P, 3] of the cameras, the gain of each pixel [F, P],
@@ -79,32 +95,6 @@ class CylinderViews:
     exchanged: Tensor
     world: Tensor
     distance: float
-
-    @staticmethod
-    def of(
-        *,
-        hits: Tensor,
-        sizes: Tensor,
-        intrinsics: Tensor,
-        own: Tensor,
-        exchanged: Tensor,
-        world: Tensor,
-        distance: float,
-        width: int,
-    ) -> CylinderViews:
-        """Reduce evidence [F, H, W] in [0, 1] of images of `sizes` [F, 2] px to about `width` pixels."""
-        pool = max(1, round(hits.shape[2] / width))
-        small = avg_pool2d(hits[:, None], pool)[:, 0]
-        rows, columns = ((torch.arange(side, device=hits.device) + 0.5) * pool for side in small.shape[1:])
-        v, u = torch.meshgrid(rows, columns, indexing="ij")
-        fx, fy, cx, cy = (column[:, None, None] for column in intrinsics.unbind(1))
-        rays = torch.stack([(u - cx) / fx, (v - cy) / fy, torch.ones_like(u).expand_as(small)], -1)
-        inside = (u < sizes[:, :1, None]) & (v < sizes[:, 1:, None])
-        moves = (small > SETTINGS.threshold).float().mean(0) < SETTINGS.always
-        worth = torch.where(inside & moves, small - SETTINGS.threshold, 0.0)
-        count = len(hits)
-        rays = normalize(rays.reshape(count, -1, 3), dim=-1)
-        return CylinderViews(rays, worth.reshape(count, -1), own, exchanged, world, distance)
 
     def gains(
         self, transforms: Tensor, origins: Tensor, directions: Tensor, chunk: int = 64

@@ -49,13 +49,12 @@ class StateCorrections(nn.Module):
         self.readings = tuple(recorded_readings(item) for item in instruments)
         slide, angle = CORRECTIONS.slide_mm, CORRECTIONS.angle_rad
         recorded = zip(instruments, self.readings, strict=True)
-        units = [[slide if item.slides(name) else angle for name in readings] for item, readings in recorded]
-        self._units = units
+        self._units = [[slide if item.slides(name) else angle for name in readings] for item, readings in recorded]
         most = max(map(len, self.readings), default=0)
         zeros = partial(torch.zeros, device=device)
-        self.register_buffer("anchors", zeros(len(units), CORRECTIONS.max_anchors, N_POSE_FEATURES + most))
-        self.register_buffer("weights", zeros(len(units), CORRECTIONS.max_anchors, 6 + most))
-        self.register_buffer("lengths", zeros(len(units)) + 1)
+        self.register_buffer("anchors", zeros(len(self._units), CORRECTIONS.max_anchors, N_POSE_FEATURES + most))
+        self.register_buffer("weights", zeros(len(self._units), CORRECTIONS.max_anchors, 6 + most))
+        self.register_buffer("lengths", zeros(len(self._units)) + 1)
         self._corrects = CachedPredicate(lambda weights: weights.any())
 
     def features(self, index: int, state: InstrumentState) -> Tensor:

@@ -112,9 +112,8 @@ class ArticulatedModel:
         self.means, self.sds = np.zeros(0), np.zeros(0)
         self.rest = list(tree.rest_poses.values())
         self._hinges()
-        first = next(i for i in range(len(names)) if tree.links[i].type != FIXED)
-        self.first = first
-        self.axis = _tube_axis(tree, self.rest[first][:3, 3], poses)
+        self.first, self.first_pivot = next((i, pivot) for i, pivot in enumerate(self.pivots) if pivot is not None)
+        self.axis = _tube_axis(tree, self.rest[self.first][:3, 3], poses)
         self.tilt = self._add("shaft", [0] * 4, [MODEL.tilt_sd_rad] * 2 + [MODEL.aside_sd_mm] * 2)
         self.least_ears = 0.5  # mm
         self.ears = self._add("ears", [MODEL.ears_mm], [MODEL.ears_sd_mm])

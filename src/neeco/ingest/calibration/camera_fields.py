@@ -28,10 +28,8 @@ MAX_INDENT = 4 * MAX_DEPTH  # blanks
 
 # names without capitals and signs: Camera_Matrix, cameraMatrix and camera_matrix are one
 _MATRIX = ("cameramatrix", "intrinsicmatrix", "intrinsicsmatrix", "cammatrix", "cameramat", "mtx", "k", "m")
-_DISTORTION = (
-    *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distcoefs"),
-    *("distortion", "dist", "d"),
-)
+_DISTORTION: tuple[str, ...] = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distcoefs")
+_DISTORTION += ("distortion", "dist", "d")
 _INTRINSICS = ("intrinsics", "projectionparameters")  # four numbers, or by name
 _FOCAL = (("fx", "fy", "cx", "cy"), ("mu", "mv", "u0", "v0"))
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

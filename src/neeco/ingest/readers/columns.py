@@ -26,20 +26,12 @@ UNITS = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
 }  # kind -> unit -> its scale to mm, rad or s
 _ALIASES = {
-    alias: unit
-    for unit, aliases in {
-        "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
-        "m": ("meter", "meters", "metre", "metres"),
-        "cm": ("centimeters", "centimetres"),
-        "rad": ("radian", "radians"),
-        "deg": ("degree", "degrees", "°"),
-        "s": ("sec", "secs", "second", "seconds"),
-        "ms": ("msec", "millis", "milliseconds"),
-        "us": ("usec", "microseconds"),
-        "ns": ("nsec", "nsecs", "nanosec", "nanoseconds"),
-    }.items()
-    for alias in aliases
-}
+    "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",
+    "meter": "m", "meters": "m", "metre": "m", "metres": "m", "centimeters": "cm", "centimetres": "cm",
+    "radian": "rad", "radians": "rad", "degree": "deg", "degrees": "deg", "°": "deg",
+    "sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "millis": "ms", "milliseconds": "ms",
+    "usec": "us", "microseconds": "us", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanoseconds": "ns",
+}  # fmt: skip
 _UNIT_SUFFIX = re.compile(r"^(?P<base>.*?)(?:[\s_\-/]+|[\s_]*[\[(]\s*)(?P<unit>[a-zµ°]+)\s*[\])]?$")
 
 
@@ -163,10 +155,8 @@ def scale_of(
 
 
 # column names without their unit, in order of preference; a name also matches behind a prefix ("tool_timestamp")
-_TIMES = (
-    *("header_stamp", "timestamp", "time_stamp", "stamp"),
-    *("time", "t", "elapsed", "secs", "sec", "seconds", "__time"),
-)
+_TIMES: tuple[str, ...] = ("header_stamp", "timestamp", "time_stamp", "stamp", "time", "t", "elapsed")
+_TIMES += ("secs", "sec", "seconds", "__time")
 _Given = Mapping[str, Sequence[str]]  # columns by what they mean
 _NOTHING: _Given = MappingProxyType({})
 _Choices = list[tuple[bool, list[str]]]  # (may all stand behind one prefix, names)

@@ -36,11 +36,8 @@ _ENDS = re.compile(r"(\w+?)To([A-Z0-9]\w*)")
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w{1,200})")
 _UCHAR = ("uchar", "unsigned char", "uint8", "uint8_t", "met_uchar")
 _META_READ = {
-    "ElementType": _UCHAR,
-    "BinaryData": ("", "true"),
-    "HeaderSize": ("", "0"),
-    "CompressedData": ("", "true", "false"),
-}
+    "ElementType": _UCHAR, "BinaryData": ("", "true"), "HeaderSize": ("", "0"), "CompressedData": ("", "true", "false"),
+}  # fmt: skip
 _SKIPS = dict.fromkeys(("line skip", "lineskip", "byte skip", "byteskip"), ("", "0"))
 _NRRD_READ = {"type": _UCHAR, "encoding": ("raw", "gzip", "gz"), **_SKIPS}  # the values of fields that can be read
 

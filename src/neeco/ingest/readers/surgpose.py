@@ -64,22 +64,15 @@ class SurgPose(RecordingFormat):
     def read(self, path: Path, stream: str | None = None) -> Table:
         poses, joints = _read(path)
         chosen = self.choose(path, stream, Kind.POSES, Kind.READINGS)
+        name, stated_in = chosen.name, None
         if chosen.kind == Kind.POSES:
-            (frames, values), header = poses[chosen.name], POSE_HEADER
+            (frames, values), header, stated_in = poses[name], POSE_HEADER, f"{name}_base"
         else:
-            frames, values = joints[chosen.name.removesuffix(JOINTS_BEHIND)]
+            frames, values = joints[name.removesuffix(JOINTS_BEHIND)]
             header = ("t_s", *JOINT_NAMES[: values.shape[1]])
         rows = np.column_stack([frames / FRAMES_PER_SECOND, values])
-        stated_in = f"{chosen.name}_base" if chosen.kind == Kind.POSES else None
         return Table(
-            path,
-            header,
-            rows,
-            frames,
-            stream=chosen.name,
-            record="frame",
-            stated_in=stated_in,
-            image_hz=FRAMES_PER_SECOND,
+            path, header, rows, frames, stream=name, record="frame", stated_in=stated_in, image_hz=FRAMES_PER_SECOND
         )
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:

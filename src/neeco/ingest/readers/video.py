@@ -318,18 +318,10 @@ class _Scan:
                 notes.append(f"its frames have no times; taken as {stated:g} a second")
             times = np.array(order) / stated
         return _Video(
-            self.path,
-            self.size,
-            tuple(f"{self.path.name}: {note}" for note in notes),
-            times,
-            stamps=tuple(order),
-            numbered=numbered,
-            threads=self.threads,
-            part=self.part,
-            own_fps=own_rate,
-            pixel_aspect=self.pixel_aspect,
+            self.path, self.size, tuple(f"{self.path.name}: {note}" for note in notes), times, stamps=tuple(order),
+            numbered=numbered, threads=self.threads, part=self.part, own_fps=own_rate, pixel_aspect=self.pixel_aspect,
             buffered=tuple(self.buffered) if len(self.buffered) == len(self.stamps) else (),
-        )
+        )  # fmt: skip
 
     def _notes(self, stamps: list[int]) -> list[str]:
         notes, read = [], len(self.stamps)

@@ -150,14 +150,8 @@ class InstrumentLogs(StatedBases):
         }
         roll = None if self.roll is None else with_clock(self.roll, "roll", file, poses)
         bases = StatedBases() if poses is None or poses.frame in CAMERA_FRAMES else self if self.base else stated
-        return replace(
-            self,
-            poses=poses,
-            joints=joints,
-            roll=roll,
-            camera_from_base=bases.camera_from_base,
-            world_from_base=bases.world_from_base,
-        )
+        camera, world = bases.camera_from_base, bases.world_from_base
+        return replace(self, poses=poses, joints=joints, roll=roll, camera_from_base=camera, world_from_base=world)
 
 
 def with_clock(log: Log, own: str, file: Path | None, poses: PoseColumns | None = None) -> Log:

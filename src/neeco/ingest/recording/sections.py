@@ -181,36 +181,19 @@ def pose_log(node: Node) -> PoseColumns:
     log: PoseSection = read(PoseSection, node)
     (rotation, form), stated = log.columns.rotation, log.columns
     return PoseColumns(
-        log.file,
-        log.clock,
-        time=stated.time,
-        position=stated.position,
-        rotation=rotation,
-        form=form,
-        euler_convention=stated.euler_convention,
-        state=stated.state,
-        good=stated.good,
-        units=log.units,
-        rate_hz=log.rate_hz,
-        stream=log.stream or log.tool,
-        frame=log.frame,
-    )
+        log.file, log.clock, time=stated.time, position=stated.position, rotation=rotation, form=form,
+        euler_convention=stated.euler_convention, state=stated.state, good=stated.good, units=log.units,
+        rate_hz=log.rate_hz, stream=log.stream or log.tool, frame=log.frame,
+    )  # fmt: skip
 
 
 def joint_log(node: Node) -> JointColumns:
     """Return a log of a joint; its clock as that of `pose_log`."""
     log: JointSection = read(JointSection, node)
     return JointColumns(
-        log.file,
-        log.clock,
-        time=log.columns.time,
-        value=(log.columns.value or (None,))[0],
-        units=log.units,
-        rate_hz=log.rate_hz,
-        calibration=log.calibration,
-        limits=log.limits,
-        stream=log.stream,
-    )
+        log.file, log.clock, time=log.columns.time, value=(log.columns.value or (None,))[0], units=log.units,
+        rate_hz=log.rate_hz, calibration=log.calibration, limits=log.limits, stream=log.stream,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

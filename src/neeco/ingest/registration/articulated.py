@@ -1,9 +1,10 @@
 """Base registration from images: where a robot's base stands, from foreground masks and the poses that its arm logs.
 
 The instrument's silhouette is fitted to the masks: with links that recorded readings bend as these are stated, and
-where it bends is then known along the shaft; any other as a tube with a head, of which lines and tips in the masks give
-a first guess (`silhouette_search`). Such a shape absorbs a constant offset or turn of the instrument's own frame, and
-motion that is the same in every frame stays undetermined, such as a shift of the base when the instrument never turns.
+where it bends is then known along the shaft; any other as a tube with a head that swings freely in every frame, of
+which lines and tips in the masks give a first guess (`silhouette_search`). Such a shape absorbs a constant offset or
+turn of the instrument's own frame, and motion that is the same in every frame stays undetermined, such as a shift of
+the base when the instrument never turns.
 
 The fit starts from several hypotheses, and their disagreement counts as uncertainty. What contradicts the recording's
 statements becomes a doubt.
@@ -26,6 +27,7 @@ from neeco.geometry.rotations import rigid
 from neeco.ingest.foreground.silhouettes import ShaftLines, shaft_lines, silhouettes_of
 from neeco.ingest.registration.articulated_fit import (
     LINKED_FIT,
+    SWING_SDS,
     ArticulatedFit,
     ArticulatedProblem,
     contours_of,
@@ -91,7 +93,7 @@ class ArticulatedSettings:
     # maximum standard deviation of a head's turns before a still camera, of an unknown base: with more, the base may
     # be mirrored
     max_swing_rad: float = 0.2
-    rigid_scatter: float = 1.6  # factor on standard deviations: its shape makes up for slow errors of logs
+    swinging_scatter: float = 1.6  # factor on standard deviations: its shape makes up for slow errors of logs
     head_mm: float = 12.0  # distance from the tip to the tube's end
     head_sd_mm: float = 6.0  # standard deviation of the head's length
     bend_sd_rad: float = 0.4  # standard deviation of its mean turns
@@ -166,18 +168,15 @@ def find_base(
 
 
 def _explaining(problem: ArticulatedProblem, starts: list[ArticulatedFit]) -> list[ArticulatedFit]:
-    """Fits from starts, the best first; none where that does not explain the masks, or poses of other moments
-    do so about as well."""
+    """Fits from starts, the best first; none where that does not explain the masks, or poses of other moments, or a
+    mirrored base with other turns of the head, do so about as well."""
     fits = _fits(problem, starts)
     if not fits or fits[0].residual_px > LINKED.max_residual_px or overlap(problem, fits[0]) < LINKED.least_overlap:
         return []
-    return [] if _exchangeable(problem, fits[0]) or _mirrorable(problem, fits[0]) else fits
-
-
-def _mirrorable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
-    """Whether another base may explain the masks with other turns of the head."""
-    unknown = problem.prior.sd_mm is None and problem.still and fit.swings.size > 0
-    return unknown and float(fit.swings[:, :2].std(0).max()) > LINKED.max_swing_rad
+    swings = fits[0].swings[:, :2].std(0)
+    if problem.prior.sd_mm is None and problem.still and (swings > LINKED.max_swing_rad).any():
+        return []
+    return [] if _exchangeable(problem, fits[0]) else fits
 
 
 def _elsewhere(problem: ArticulatedProblem, model: ArticulatedModel, reached: float, seed: int) -> str:
@@ -212,7 +211,7 @@ def problem_of(
     tree = motion.bending
     poses = np.stack([motion.poses_at(float(shift)) for shift in CLOCK_SHIFTS_S])
     readings: dict[str, np.ndarray] = {}
-    values = np.zeros((*poses.shape[:2], len(_swinging_links(np.zeros(3), np.eye(3)))))
+    values = np.zeros((*poses.shape[:2], 1 + len(SWING_SDS)))  # of the tube and of its head's joints
     if tree is not None:
         by_shift = [motion.readings_at(float(shift)) for shift in CLOCK_SHIFTS_S]
         readings = {key: np.stack([at[key] for at in by_shift]) for key in tree.readings}
@@ -269,12 +268,8 @@ def _fits(problem: ArticulatedProblem, starts: list[ArticulatedFit]) -> list[Art
 def _changes(problem: ArticulatedProblem) -> list[Callable[[ArticulatedFit], ArticulatedFit]]:
     """Changes of a tube's fit to which the masks respond little, so that least squares end before they make them."""
 
-    def size(factor: float, fit: ArticulatedFit) -> ArticulatedFit:
-        return _resized(problem, fit, factor)
-
     def end(shift: float, fit: ArticulatedFit) -> ArticulatedFit:
-        parameters, pivot = fit.parameters.copy(), fit.model.pivots[fit.model.first]
-        assert pivot is not None
+        parameters, pivot = fit.parameters.copy(), fit.model.first_pivot
         parameters[pivot : pivot + 3] += shift * fit.model.shaft_axis(parameters)
         parameters[fit.model.mean_length] = max(parameters[fit.model.mean_length] - shift, MODEL.min_length_mm)
         return replace(fit, parameters=parameters)
@@ -283,7 +278,7 @@ def _changes(problem: ArticulatedProblem) -> list[Callable[[ArticulatedFit], Art
         return replace(fit, clock=float(np.clip(fit.clock + shift, CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])))
 
     changes: list[Callable[[ArticulatedFit], ArticulatedFit]] = [
-        partial(size, factor) for factor in LINKED.sizes if problem.still
+        partial(_resized, problem, factor) for factor in LINKED.sizes if problem.still
     ]
     changes += [partial(end, shift) for shift in LINKED.end_steps_mm]
     changes += [partial(clock, shift) for shift in LINKED.clock_steps_s if problem.prior.sd_clock > 0]
@@ -293,7 +288,7 @@ def _changes(problem: ArticulatedProblem) -> list[Callable[[ArticulatedFit], Art
 def _tube_in_world(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np.ndarray, np.ndarray]:
     """Places [F, 3] mm where the tube of an instrument without links ends, and its directions [F, 3]."""
     poses = fit.world_from_base @ poses_at_clock(problem.poses, fit.clock)
-    end = fit.model.link_poses(fit.parameters, np.zeros((1, 8)))[1][fit.model.first][0]
+    end = fit.model.link_poses(fit.parameters, problem.values[MIDDLE, :1])[1][fit.model.first][0]
     return poses[:, :3, :3] @ end + poses[:, :3, 3], poses[:, :3, :3] @ fit.model.shaft_axis(fit.parameters)
 
 
@@ -302,7 +297,7 @@ def _trocar(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     return nearest_point(*_tube_in_world(problem, fit), ridge=1e-3)
 
 
-def _resized(problem: ArticulatedProblem, fit: ArticulatedFit, factor: float) -> ArticulatedFit:
+def _resized(problem: ArticulatedProblem, factor: float, fit: ArticulatedFit) -> ArticulatedFit:
     """The fit scaled about a still camera, with the robot's motion as it is."""
     camera = np.linalg.inv(problem.camera_from_world[0])[:3, 3]
     ends, _ = _tube_in_world(problem, fit)
@@ -311,8 +306,7 @@ def _resized(problem: ArticulatedProblem, fit: ArticulatedFit, factor: float) ->
     moved = replace(fit, world_from_base=base)
     off = camera + factor * (ends - camera) - _tube_in_world(problem, moved)[0]
     turns = (base @ poses_at_clock(problem.poses, fit.clock))[:, :3, :3]
-    pivot = fit.model.pivots[fit.model.first]
-    assert pivot is not None
+    pivot = fit.model.first_pivot
     parameters[pivot : pivot + 3] += np.einsum("fji,fj->fi", turns, off).mean(0)
     parameters[fit.model.tube] += np.log(factor)
     parameters[fit.model.mean_length] *= factor
@@ -342,25 +336,25 @@ def searched_starts(problem: ArticulatedProblem, model: ArticulatedModel | None,
     distance, generator = distance_to(problem, problem.prior), np.random.default_rng(seed)
     found = search_bases(problem, problem.prior, distance, generator, **stated)
     return [
-        ArticulatedFit.start(model or _rigid_model(tip, axis), base)
+        ArticulatedFit.start(model or _tube_model(tip, axis), base)
         for base, tip, axis in zip(found.world_from_base, found.tips, found.axes, strict=True)
     ]
 
 
 def _swinging_links(end: np.ndarray, basis: np.ndarray) -> tuple[Link, ...]:
-    """A tube to `end` [3] mm and a head, which swings as nothing states; basis [3, 3]: columns across and along."""
+    """A tube to `end` [3] mm and a head with the joints of `ArticulatedFit.swings`; basis [3, 3]: columns across and
+    along."""
     pitch = Link("pitch", "shaft", REVOLUTE, rigid(np.eye(3), end), basis[:, 0], body=False)
     yaw = Link("yaw", "pitch", REVOLUTE, np.eye(4), basis[:, 1], body=False)
     return Link("shaft"), pitch, yaw, Link("head", "yaw", PRISMATIC, np.eye(4), basis[:, 2])
 
 
-def _rigid_model(tip: np.ndarray, axis: np.ndarray) -> ArticulatedModel:
+def _tube_model(tip: np.ndarray, axis: np.ndarray) -> ArticulatedModel:
     """A tube with a head, of roughly a tip [3] mm and a direction [3] in the instrument's frame."""
     links = _swinging_links(tip - LINKED.head_mm * axis, frame_about(axis))
     model = ArticulatedModel(KinematicTree(links), np.eye(4)[None])
     model.axis = axis
-    pivot, head = model.pivots[model.first], model.cones[-1]
-    assert pivot is not None
+    pivot, head = model.first_pivot, model.cones[-1]
     shape = [*range(model.tube, model.tube + 2), *range(head.radii, head.radii + 4)]
     sds = np.zeros(len(model.sds))
     sds[shape] = model.sds[shape]
@@ -387,11 +381,11 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
     """Whether poses and readings of other moments explain the masks about as well."""
     least = LINKED.min_exchanged if problem.readings else LINKED.swinging_exchanged[problem.prior.sd_mm is None]
     width = LINKED_FIT.widths_px[1]
+    limit = least * minimise(problem, fit, width, 3).cost
     for share in LINKED.exchanged_shares:
         by = round(share * len(problem.blocks))
         poses, values = (np.roll(part, by, axis=1) for part in (problem.poses, problem.values))
-        other = minimise(replace(problem, poses=poses, values=values), fit, width, 6)
-        if other.cost < least * minimise(problem, fit, width, 3).cost:
+        if minimise(replace(problem, poses=poses, values=values), fit, width, 6).cost < limit:
             return True
     return False
 
@@ -400,7 +394,7 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], tree: Kinem
     with_errors, prior = with_pose_errors(problem, fits[0]), problem.prior
     full = covariance(problem, with_errors)
     best = fits[0] if tree is None else with_errors  # errors of poses beside swings make up for too much
-    scatter = LINKED.rigid_scatter if tree is None else LINKED.scatter
+    scatter = LINKED.swinging_scatter if tree is None else LINKED.scatter
     spread = scatter**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
         weight = float(np.exp(-0.5 * (other.cost - fits[0].cost) / scatter**2))

@@ -17,12 +17,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
-from neeco.ingest.foreground.silhouettes import SHAFT_LINES, border_of
+from neeco.ingest.foreground.silhouettes import SHAFT_LINES, Silhouettes, border_of
 from neeco.ingest.registration.logged import (
     BASE,
     CLOCK_SHIFTS_S,
+    MIDDLE,
     BasePrior,
-    LoggedSilhouettes,
     moved_base,
     poses_at_clock,
 )
@@ -63,13 +63,37 @@ POSE_SDS = np.repeat([LINKED_FIT.pose_sd_rad, LINKED_FIT.pose_sd_mm], 3)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ArticulatedProblem(LoggedSilhouettes):
-    """Silhouettes, and joint values at the clocks of the poses."""
+class ArticulatedProblem:
+    """Silhouettes of frames [F], their cameras, and an instrument's log at the clock's first guess moved by
+    CLOCK_SHIFTS_S."""
 
+    silhouettes: Silhouettes
+    camera_from_world: np.ndarray  # [F, 4, 4]
+    poses: np.ndarray  # [S, F, 4, 4] base_from_instrument; of one with links, of its root
+    blocks: np.ndarray  # [F] stretch of the recording, within which errors are correlated
     contours: np.ndarray  # [F, N, 2] px of the masks' outlines; NaN: no point
     readings: dict[str, np.ndarray]  # [S, F] by name
     values: np.ndarray  # [S, F, 2 L] of all links' joints, rad or mm, as `with_motion` has them
     prior: BasePrior
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Mean position [3] mm of the instrument in the base's frame."""
+        return np.asarray(self.poses[MIDDLE, :, :3, 3].mean(0))
+
+    @property
+    def px_scale(self) -> float:
+        """Pixels of these masks per pixel of masks 160 wide, in which losses are stated."""
+        return self.silhouettes.distances.shape[2] / 160
+
+    @property
+    def still(self) -> bool:
+        """Whether the camera stands still."""
+        return len(np.unique(self.camera_from_world.round(3), axis=0)) == 1
+
+    def pivot(self, world_from_base: np.ndarray) -> np.ndarray:
+        """Mean position [3] mm of the instrument in the world."""
+        return np.asarray(world_from_base[:3, :3] @ self.middle + world_from_base[:3, 3])
 
     def take(self, rows: np.ndarray) -> ArticulatedProblem:
         """Return the problem of some of the frames."""
@@ -87,8 +111,8 @@ class ArticulatedProblem(LoggedSilhouettes):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArticulatedFit:
-    """A base, the clock s by which the log is ahead, and a model of the instrument with its parameters [P] and what it
-    has of its own in every frame."""
+    """A base, the clock s by which the log is ahead, a model of the instrument with its parameters [P], and unknowns of
+    every frame."""
 
     model: ArticulatedModel
     world_from_base: np.ndarray
@@ -101,34 +125,29 @@ class ArticulatedFit:
 
     @classmethod
     def start(cls, model: ArticulatedModel, world_from_base: np.ndarray) -> Self:
-        """A model as expected, in some base, of no frames yet."""
+        """Return the model with the means of its parameters, in a base, without frames (see `in_frames`)."""
         none = np.zeros((0, 0))
-        return cls(
-            model=model,
-            world_from_base=world_from_base,
-            parameters=model.means.copy(),
-            swings=none,
-            pose_errors=none,
-        )
+        means = model.means.copy()
+        return cls(model=model, world_from_base=world_from_base, parameters=means, swings=none, pose_errors=none)
 
     def in_frames(self, problem: ArticulatedProblem) -> ArticulatedFit:
-        """The fit with what is expected in a problem's frames; where no readings bend the instrument, a head swings."""
+        """Return the fit with the frames of a problem, their unknowns at zero; without readings the head swings."""
         count, swings = len(problem.blocks), 0 if problem.readings else len(SWING_SDS)
         return replace(self, swings=np.zeros((count, swings)), pose_errors=np.zeros((count, 0)))
 
     @property
-    def own(self) -> np.ndarray:
-        """Return what every frame has of its own [F, K]: swings, then errors of poses."""
+    def of_frames(self) -> np.ndarray:
+        """Unknowns of every frame [F, K]: swings, then errors of poses."""
         return np.concatenate([self.swings, self.pose_errors], 1)
 
-    def with_own(self, own: np.ndarray) -> ArticulatedFit:
-        """The fit with other values [F, K] of every frame."""
-        swings, pose_errors = np.split(own, [self.swings.shape[1]], axis=1)
+    def with_frames(self, unknowns: np.ndarray) -> ArticulatedFit:
+        """Return the fit with other unknowns of every frame [F, K]."""
+        swings, pose_errors = np.split(unknowns, [self.swings.shape[1]], axis=1)
         return replace(self, swings=swings, pose_errors=pose_errors)
 
     @property
-    def own_sds(self) -> np.ndarray:
-        """Standard deviations [K] of what every frame has of its own."""
+    def frame_sds(self) -> np.ndarray:
+        """Standard deviations [K] of a frame's unknowns."""
         return np.append(SWING_SDS[: self.swings.shape[1]], POSE_SDS[: self.pose_errors.shape[1]])
 
 
@@ -194,12 +213,12 @@ def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points) -
 
 
 def moved(problem: ArticulatedProblem, fit: ArticulatedFit, step: np.ndarray) -> ArticulatedFit:
-    """The fit after a step in its parameters [BASE + P], or in these and what every frame has of its own
-    [BASE + P + F K]."""
+    """The fit after a step in its parameters [BASE + P], or in these and all frames' unknowns [BASE + P + F K]."""
     count = BASE + len(fit.parameters)
-    own = fit.own + step[count:].reshape(fit.own.shape) if len(step) > count else fit.own
+    if len(step) > count:
+        fit = fit.with_frames(fit.of_frames + step[count:].reshape(fit.of_frames.shape))
     return replace(
-        fit.with_own(own),
+        fit,
         world_from_base=moved_base(fit.world_from_base, problem.pivot(fit.world_from_base), step[:6]),
         parameters=fit.parameters + step[BASE:count],
         clock=float(np.clip(fit.clock + step[6], CLOCK_SHIFTS_S[0], CLOCK_SHIFTS_S[-1])),
@@ -207,8 +226,8 @@ def moved(problem: ArticulatedProblem, fit: ArticulatedFit, step: np.ndarray) ->
 
 
 def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, free: np.ndarray) -> np.ndarray:
-    """Derivatives [F, N + M, free] of the residuals, through those of the cones' images; and where poses' errors are
-    fitted, by those of the own frame [F, N + M, free + 6]."""
+    """Derivatives [F, N + M, free + K] of the residuals, through those of the cones' images: by the free parameters,
+    then by the unknowns of the frame itself."""
     projected, model = outlines(problem, fit), fit.model
     _, slope = problem.silhouettes.look_up(model.outline_points(projected))
     distances, places, ways = projected.distances(use.contours)
@@ -237,8 +256,9 @@ def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, fr
     for index in free:
         step = steps[index] * np.eye(len(steps))[index]
         columns.append(slopes(moved(problem, fit, step), moved(problem, fit, -step), steps[index]))
-    for step in np.diag(LINKED_FIT.parameter_step * fit.own_sds):  # all frames at once: each depends on its own only
-        columns.append(slopes(fit.with_own(fit.own + step), fit.with_own(fit.own - step), step.sum()))
+    unknowns = fit.of_frames
+    for step in np.diag(LINKED_FIT.parameter_step * fit.frame_sds):  # all frames at once, as they are independent
+        columns.append(slopes(fit.with_frames(unknowns + step), fit.with_frames(unknowns - step), step.sum()))
     return np.stack(columns, -1)
 
 
@@ -273,9 +293,9 @@ def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[n
     """Residuals [BASE + P + F K] of all priors in standard deviations, and the inverse standard deviations
     [BASE + P + F K]; 0 of parameters that are not fitted."""
     model = fit.model
-    off, sds = problem.prior.offsets(problem, fit.world_from_base, fit.clock)
+    off, sds = problem.prior.offsets(problem.middle, fit.world_from_base, fit.clock)
     off, sds = np.append(off, fit.parameters - model.means), np.append(sds, model.sds)
-    off, sds = np.append(off, fit.own), np.append(sds, np.tile(fit.own_sds, len(fit.own)))
+    off, sds = np.append(off, fit.of_frames), np.append(sds, np.tile(fit.frame_sds, len(fit.of_frames)))
     scale = np.divide(1, sds, out=np.zeros(len(sds)), where=sds > 0)
     return off * scale, scale
 
@@ -380,9 +400,9 @@ def covariance(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
     blocks = blocks - blocks.mean(0)
     scatter = blocks.T @ blocks * len(blocks) / max(len(blocks) - 1, 1)
     scatter[: len(free), : len(free)] += prior
-    if fit.own.size:  # they last for a block or two, though the fit takes them to be independent
+    if fit.of_frames.size:  # they last for a block or two, though the fit takes them to be independent
         apart = np.abs(problem.blocks[:, None] - problem.blocks) / LINKED_FIT.pose_blocks
-        scatter[len(free) :, len(free) :] += np.kron(np.clip(1 - apart, 0, 1), np.diag(fit.own_sds**-2.0))
+        scatter[len(free) :, len(free) :] += np.kron(np.clip(1 - apart, 0, 1), np.diag(fit.frame_sds**-2.0))
     full = np.zeros((count, count))
     full[np.ix_(free, free)] = inverse @ scatter @ inverse.T
     return full

@@ -33,11 +33,10 @@ class BaseRegistration:
     """A base and its uncertainty.
 
     `covariance` is of turns (rad) and then shifts (mm) of the base about the instrument's mean position, along the
-    first camera's right, down and forward; NaN where a direction is undetermined and has no prior. It includes errors
-    that a learned shape makes up for, such as a shift along a shaft that hardly tilts; `sd_motion_mm` does not: root
-    mean square over the recording, after the best constant offset in the instrument's frame. `shaft`: its mean
-    direction towards the tip, in the first camera's axes. `open_directions`: what the motion leaves undetermined, in
-    words.
+    first camera's right, down and forward. It includes errors that a learned shape makes up for, such as a shift
+    along a shaft that hardly tilts; `sd_motion_mm` does not: root mean square over the recording, after the best
+    constant offset in the instrument's frame. `shaft`: its mean direction towards the tip, in the first camera's
+    axes. `open_directions`: what the motion leaves undetermined, in words.
     """
 
     world_from_base: np.ndarray  # [4, 4]
@@ -62,35 +61,30 @@ class BaseRegistration:
         turned, shifted = (
             np.einsum("ni,ij,nj->n", axes, part, axes) for part in (self.covariance[:3, :3], self.covariance[3:, 3:])
         )
-        with np.errstate(invalid="ignore"):
-            return np.sqrt(shifted), np.degrees(np.sqrt(turned))
+        return np.sqrt(shifted), np.degrees(np.sqrt(turned))
 
     @property
     def sd_mm(self) -> np.ndarray:
         """Standard deviations [3] mm of shifts right, down and forward."""
-        with np.errstate(invalid="ignore"):
-            return np.asarray(np.sqrt(np.diag(self.covariance)[3:]))
+        return np.asarray(np.sqrt(np.diag(self.covariance)[3:]))
 
     @property
     def sd_deg(self) -> np.ndarray:
         """Standard deviations [3] degrees of turns about right, down and forward."""
-        with np.errstate(invalid="ignore"):
-            return np.asarray(np.degrees(np.sqrt(np.diag(self.covariance)[:3])))
+        return np.asarray(np.degrees(np.sqrt(np.diag(self.covariance)[:3])))
 
-    def uncertainty(self, world_from_camera: np.ndarray, poses: np.ndarray) -> BaseUncertainty | None:
-        """Return the covariance for a capture, in the world's axes; None where a direction is undetermined.
+    def uncertainty(self, world_from_camera: np.ndarray, poses: np.ndarray) -> BaseUncertainty:
+        """Return the covariance for a capture, in the world's axes.
 
         world_from_camera [4, 4] of the first camera; poses [F, 4, 4] world_from_instrument.
         """
-        if not np.isfinite(self.covariance).all():
-            return None
         covariance = in_camera(self.covariance, world_from_camera)
         return BaseUncertainty(
             tuple(poses[:, :3, 3].mean(0).tolist()), tuple(map(tuple, ((covariance + covariance.T) / 2).tolist()))
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Numbers for scripts: mm, degrees, s; None where a direction is undetermined and has no prior."""
+        """Numbers for scripts: mm, degrees, s; None for those compared with a base that was not stated."""
 
         def plain(values: np.ndarray | float) -> Any:
             listed = [float(value) if np.isfinite(value) else None for value in np.atleast_1d(values)]
@@ -102,7 +96,7 @@ class BaseRegistration:
             **{name: plain(getattr(self, name)) for name in numbers.split()},
             "open": list(self.open_directions),
             "doubts": list(self.doubts),
-            "covariance": [plain(row) for row in self.covariance],
+            "covariance": self.covariance.tolist(),
         }
 
 
@@ -138,7 +132,7 @@ def moved_from(reference: np.ndarray, base: np.ndarray, middle: np.ndarray) -> d
 
 def in_camera(covariance: np.ndarray, camera_from_world: np.ndarray) -> np.ndarray:
     """Covariance [6, 6] of turns and shifts along a camera's axes, from that along the world's; [4, 4]."""
-    view, blocks = camera_from_world[:3, :3], covariance.reshape(2, 3, 2, 3)  # blocks apart: some may be NaN
+    view, blocks = camera_from_world[:3, :3], covariance.reshape(2, 3, 2, 3)
     return np.einsum("ai,xiyj,bj->xayb", view, blocks, view).reshape(6, 6)
 
 

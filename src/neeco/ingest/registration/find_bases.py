@@ -372,16 +372,15 @@ def describe(name: str, base: BaseRegistration) -> str:
     """Return a sentence on a base that was found: its standard deviations, and what the recording leaves open."""
 
     def listed(values: np.ndarray) -> str:
-        return ", ".join("open" if not np.isfinite(value) else f"{value:.1f}" for value in values)
+        return ", ".join(f"{value:.1f}" for value in values)
 
     words = f"instrument {name!r}: its base was found from what moves in {base.frames} frames"
     if np.isfinite(base.moved_mm):
         words += f", {base.moved_mm:.1f} mm and {base.turned_deg:.1f} deg from what was given"
     words += (
         f"; standard deviations {listed(base.sd_mm)} mm and {listed(base.sd_deg)} deg (right, down, forward of the "
-        "camera); "
+        f"camera); its outline and what moves overlap by {base.overlap:.2f}"
     )
-    words += f"its outline and what moves overlap by {base.overlap:.2f}"
     if np.isfinite(base.overlap_before):
         words += f" ({base.overlap_before:.2f} as given)"
     if base.open_directions:

@@ -1,4 +1,4 @@
-"""Silhouettes of an instrument whose poses an arm logs, in a base that is not known, on a clock that may be off."""
+"""Poses that an arm logs, in a base that is not known, on a clock that may be off."""
 
 from __future__ import annotations
 
@@ -8,42 +8,11 @@ from typing import Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.ingest.foreground.silhouettes import Silhouettes
-
 CLOCK_SHIFTS_S = np.arange(-0.16, 0.161, 0.02)  # about the clock's first guess, at which poses are known
 MIDDLE = len(CLOCK_SHIFTS_S) // 2  # of these, the first guess itself
 BASE = 7  # parameters of the base (turn rad [3], shift mm [3]) and the clock (s)
 
 Prior = tuple[np.ndarray, float, float]  # world_from_base [4, 4], standard deviations mm at the instrument, and degrees
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LoggedSilhouettes:
-    """Silhouettes of frames [F], their cameras, and the poses at the clock's first guess moved by CLOCK_SHIFTS_S."""
-
-    silhouettes: Silhouettes
-    camera_from_world: np.ndarray  # [F, 4, 4]
-    poses: np.ndarray  # [S, F, 4, 4] base_from_instrument; of one with links, of its root
-    blocks: np.ndarray  # [F] stretch of the recording, within which errors are correlated
-
-    @property
-    def middle(self) -> np.ndarray:
-        """Mean position [3] mm of the instrument in the base's frame."""
-        return np.asarray(self.poses[MIDDLE, :, :3, 3].mean(0))
-
-    @property
-    def px_scale(self) -> float:
-        """Pixels of these masks per pixel of masks 160 wide, in which losses are stated."""
-        return self.silhouettes.distances.shape[2] / 160
-
-    @property
-    def still(self) -> bool:
-        """Whether the camera stands still."""
-        return len(np.unique(self.camera_from_world.round(3), axis=0)) == 1
-
-    def pivot(self, world_from_base: np.ndarray) -> np.ndarray:
-        """Mean position [3] mm of the instrument in the world."""
-        return np.asarray(world_from_base[:3, :3] @ self.middle + world_from_base[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +32,12 @@ class BasePrior:
             return cls(np.eye(4), None, None, sd_clock)
         return cls(stated[0], np.radians(stated[2]), stated[1], sd_clock)
 
-    def offsets(self, problem: LoggedSilhouettes, base: np.ndarray, clock: float) -> tuple[np.ndarray, np.ndarray]:
-        """Turn, shift and clock [BASE] of a base [4, 4] from the prior, and the standard deviations [BASE], inf where
-        nothing is known and where the clock is."""
+    def offsets(self, middle: np.ndarray, base: np.ndarray, clock: float) -> tuple[np.ndarray, np.ndarray]:
+        """Turn, shift and clock [BASE] of a base [4, 4] from the prior, at the instrument's mean position [3] mm in it,
+        and the standard deviations [BASE], inf where nothing is known and where the clock is."""
         off, sds = np.zeros(BASE), np.full(BASE, np.inf)
         if self.sd_rad is not None and self.sd_mm is not None:
-            off[:6] = step_between(self.world_from_base, base, problem.middle)
+            off[:6] = step_between(self.world_from_base, base, middle)
             sds[:3], sds[3:6] = self.sd_rad, self.sd_mm
         if self.sd_clock > 0:
             off[6], sds[6] = clock, self.sd_clock

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.lines import unit
 from neeco.ingest.foreground.silhouettes import ShaftLines
-from neeco.ingest.registration.logged import MIDDLE, BasePrior, LoggedSilhouettes
+from neeco.ingest.registration.articulated_fit import ArticulatedProblem
+from neeco.ingest.registration.logged import MIDDLE, BasePrior
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +106,7 @@ def rotations_about(center: np.ndarray, sd_rad: float, count: int, generator: np
     return Rotation.from_rotvec(vectors).as_matrix() @ center
 
 
-def distance_to(problem: LoggedSilhouettes, prior: BasePrior) -> float:
+def distance_to(problem: ArticulatedProblem, prior: BasePrior) -> float:
     """Approximate mm from the cameras to the instrument: by the prior, else by a shaft of typical size."""
     half = float(np.median([mask.max() for mask in problem.silhouettes.distances]))
     guess = COARSE.typical_radius_mm * problem.silhouettes.intrinsics[0] / max(half, 0.5)
@@ -117,7 +118,7 @@ def distance_to(problem: LoggedSilhouettes, prior: BasePrior) -> float:
 
 
 def search_bases(
-    problem: LoggedSilhouettes,
+    problem: ArticulatedProblem,
     prior: BasePrior,
     distance: float,
     generator: np.random.Generator,

@@ -154,10 +154,7 @@ def find_shaft(
     if share < SHAFT.usual_share:
         assert axes.covariance is not None
         axes = replace(axes, covariance=SHAFT.short_factor**2 * axes.covariance)
-        notes.append(
-            f"two diameters of shaft are visible in {share:.0%} of the frames only (usual: {SHAFT.usual_share:.0%} or "
-            "more), so that errors are twice as large; hold the scope back, or the instrument farther in"
-        )
+        notes.append("errors count twice where so little of the shaft shows; hold the scope back")
     by_color = bool(ends.any()) and heads is not None
     length = working_length or (
         float(np.nanquantile(heads, SHAFT.closed_quantile)) if heads is not None else _default_head(video)
