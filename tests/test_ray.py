@@ -13,18 +13,18 @@ from neeco.base.workers import cpu_share, joined, node_problem, require_shared
 
 
 @pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def cluster(environment) -> Iterator[Any]:
     """A head without CPUs and two nodes of one and two; RAY_ADDRESS names them."""
     pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    environment["RAY_USAGE_STATS_ENABLED"] = "0"
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     try:
         for count in (1, 2):
             made.add_node(num_cpus=count)
         made.wait_for_nodes()
-        monkeypatch.setenv("RAY_ADDRESS", made.address)
+        environment["RAY_ADDRESS"] = made.address
         yield made
     finally:
         made.shutdown()

@@ -50,9 +50,9 @@ def test_without_a_gpu_it_ends_in_one_line(script: ModuleType, capsys) -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_every_backend_and_kind_is_timed(device: str, script: ModuleType, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_every_backend_and_kind_is_timed(device: str, script: ModuleType, tmp_path: Path, environment, capsys) -> None:
     torch.set_num_threads(1)
-    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    environment["CUBLAS_WORKSPACE_CONFIG"] = ":4096:8"
     assert script.main([*SMALL, "--device", device, "--output", str(tmp_path)]) == 0
     result = json.loads((tmp_path / "gpu.json").read_text())
     assert (tmp_path / "gpu.md").read_text() == capsys.readouterr().out

@@ -1,4 +1,3 @@
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -112,8 +111,8 @@ def test_names_that_are_none_of_its_are_told(file: Path) -> None:
         read_urdf(file, root="arm")
 
 
-def test_without_the_package_the_extra_is_named(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "urdf_parser_py", None)
+def test_without_the_package_the_extra_is_named(file: Path, uninstalled) -> None:
+    uninstalled("urdf_parser_py")
     with pytest.raises(NeecoError, match=r"needs urdfdom-py to be read; pip install '\.\[urdf\]'"):
         read_urdf(file)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import subprocess
@@ -77,7 +78,7 @@ def test_letters_that_a_terminal_cannot_show_are_escaped(monkeypatch: pytest.Mon
     assert told.buffer.getvalue().startswith(rb"neeco: error: f\xfcr/transforms.json")  # type: ignore[attr-defined]
 
 
-def test_a_name_that_is_not_utf8_is_refused_before_anything_is_written(tmp_path, monkeypatch, capsys):
+def test_a_name_that_is_not_utf8_is_refused_before_anything_is_written(tmp_path, capsys):
     folder = tmp_path / NOT_UTF8
     for words in (["check", str(folder)], ["train", str(tmp_path), "--output", str(folder / "run")]):
         assert cli.main(words) == 1
@@ -88,8 +89,8 @@ def test_a_name_that_is_not_utf8_is_refused_before_anything_is_written(tmp_path,
             use(folder)
     assert list(tmp_path.iterdir()) == []
     folder.mkdir()
-    monkeypatch.chdir(folder)  # a run would note its capture's absolute path
-    assert cli.main(["train", "capture", "--output", "run"]) == 1
+    with contextlib.chdir(folder):  # a run would note its capture's absolute path
+        assert cli.main(["train", "capture", "--output", "run"]) == 1
     assert r"caf\xe9': the name is not in UTF-8" in capsys.readouterr().err
 
 

@@ -53,13 +53,13 @@ def test_a_full_mask_changes_nothing_and_ignored_pixels_do_not_count():
     assert network.distance(target, target) == 0.0
 
 
-def test_no_folder_means_no_networks_but_a_wrong_folder_is_an_error(tmp_path, monkeypatch):
+def test_no_folder_means_no_networks_but_a_wrong_folder_is_an_error(tmp_path, environment):
     assert find_lpips(None) == {}
     with pytest.raises(NeecoError, match="no such folder"):
         find_lpips(tmp_path / "nowhere")
     with pytest.raises(NeecoError, match="holds neither"):
         find_lpips(tmp_path)
-    monkeypatch.setenv("NEECO_LPIPS_WEIGHTS", str(tmp_path / "nowhere"))
+    environment["NEECO_LPIPS_WEIGHTS"] = str(tmp_path / "nowhere")
     with pytest.raises(NeecoError, match="NEECO_LPIPS_WEIGHTS"):
         find_lpips(None)
 

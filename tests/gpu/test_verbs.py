@@ -38,9 +38,8 @@ def run(capture: str, tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def verb(word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
+def verb(word: str, inside: Path) -> Call:
     """Has a verb do its work on the device; files go into a folder of the test's own."""
-    monkeypatch.chdir(tmp_path)
 
     def call(*words: str, here: bool = True) -> None:
         if word == "cuda":

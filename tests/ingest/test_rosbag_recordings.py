@@ -257,8 +257,8 @@ def test_a_type_that_is_defined_otherwise_is_not_read(tmp_path: Path, bags: dict
     assert "which defines geometry_msgs/PoseStamped otherwise than ROS, not poses" in refusal(lambda: read_arm(path))
 
 
-def test_without_rosbags_what_to_install_is_said(bags: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name, package=None: None)
+def test_without_rosbags_what_to_install_is_said(bags: dict[str, Path], uninstalled) -> None:
+    uninstalled("rosbags")
     for path in bags.values():
         for action in (read_arm, write_template):
             said = refusal(lambda action=action, path=path: action(path))

@@ -69,10 +69,10 @@ def test_only_cuda_multiplies_networks_in_fewer_bits_and_only_in_the_block() -> 
     assert torch.get_float32_matmul_precision() == "highest"
 
 
-def test_kernels_are_launched_for_float32_on_cuda_devices_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_launched_for_float32_on_cuda_devices_alone(uninstalled) -> None:
     assert not ready.runs_triton(torch.zeros(3))
     assert not ready.runs_triton(torch.zeros(3, device=META))
-    monkeypatch.setattr(ready, "installed", lambda: False)
+    uninstalled("triton")
     ready.require_triton.cache_clear()
     ready.starts_on.cache_clear()
     try:

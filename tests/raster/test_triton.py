@@ -72,7 +72,7 @@ class NoDevice:
 
 
 @pytest.fixture
-def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
+def compiled(tmp_path: Path, environment, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
     """By name, the kernels that were compiled instead of being started, with the arguments they would have got."""
     import triton
     from triton.runtime.jit import JITFunction
@@ -89,7 +89,7 @@ def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[s
         projected = project(*args)
         return replace(projected, counts=torch.ones_like(projected.counts), depths=torch.zeros_like(projected.depths))
 
-    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
+    environment["TRITON_CACHE_DIR"] = str(tmp_path)
     monkeypatch.setattr(JITFunction, "run", compile_only)
     monkeypatch.setattr(backend, "project", project_anything)
     yield started
@@ -193,8 +193,8 @@ def test_tensors_on_the_cpu_are_refused() -> None:
 
 
 @pytest.mark.usefixtures("never_asked")
-def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ready, "installed", lambda: False)
+def test_a_missing_package_is_named(uninstalled) -> None:
+    uninstalled("triton")
     _, gaussians, camera = leaves(make_scene(3), torch.float32)
     with pytest.raises(NeecoError, match=r"triton is missing; on Linux pip install '\.\[triton\]'"):
         rasterize(gaussians, camera, backend="triton")

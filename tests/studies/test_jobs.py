@@ -262,15 +262,15 @@ class FakeRay:
         return {"GPU": ["1"]}
 
 
-def test_a_task_on_a_node_sees_the_gpu_it_was_given(monkeypatch) -> None:
+def test_a_task_on_a_node_sees_the_gpu_it_was_given(environment, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", FakeRay())
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+    environment["CUDA_VISIBLE_DEVICES"] = "0,1"
     assert workers.work_on_node(seen_gpu, None, None, 1, os.getcwd()) == "1"
 
 
 @pytest.mark.parametrize(("shared", "visible", "seen"), [(None, "4,5", {"4", "5"}), (2, "", {"0", "1"})])
-def test_tasks_here_see_a_gpu_each_or_share_them_where_they_are_small(shared, visible, seen, monkeypatch) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+def test_tasks_here_see_a_gpu_each_or_share_them_where_they_are_small(shared, visible, seen, environment) -> None:
+    environment["CUDA_VISIBLE_DEVICES"] = visible
     count = 3 if shared else 2
     how = workers.Workers(count=count, threads=1, fresh=True, gpu=True, shared_gpus=shared)
     found = [event.value for event in workers.run_tasks(seen_gpu, None, range(4), how) if event.stage == "done"]
@@ -286,7 +286,9 @@ def test_tasks_here_see_a_gpu_each_or_share_them_where_they_are_small(shared, vi
         ("cpu", "head:6379", [False, True]),  # whose machines may have GPUs that this one lacks
     ],
 )
-def test_gpus_are_asked_for_where_jobs_compute_on_them(device, address, asked, make_job, monkeypatch) -> None:
+def test_gpus_are_asked_for_where_jobs_compute_on_them(device, address, asked, make_job, environment, monkeypatch):
+    device, address, asked, make_job, environment, monkeypatch
+) -> None:
     given: list[bool] = []
 
     def tasks(function, shared, jobs, how):
@@ -297,7 +299,7 @@ def test_gpus_are_asked_for_where_jobs_compute_on_them(device, address, asked, m
     monkeypatch.setattr(study, "run_tasks", tasks)
     monkeypatch.setattr(study, "check_workers", lambda *_: None)
     monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device(device))
-    monkeypatch.setenv("RAY_ADDRESS", address)
+    environment["RAY_ADDRESS"] = address
     for word in ("cpu", "auto"):
         run_jobs([replace(make_job(), device=word)], workers=2)
     assert given == asked
@@ -312,7 +314,7 @@ def test_a_worker_gives_the_same_numbers(trained_job, make_job) -> None:
 @pytest.mark.timeout(240)
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers in /proc")
 @pytest.mark.parametrize("where", ["this machine", "a cluster"])
-def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(where, make_job, tmp_path, monkeypatch) -> None:
+def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(where, make_job, tmp_path, environment) -> None:
     values = {"checkpoint_interval": 20, "iterations": 300}
     here, there = (make_job(values=values, folder=tmp_path / place / "run") for place in ("here", "there"))
     expected = without_times(run_jobs([here]))
@@ -320,7 +322,7 @@ def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(where, make_jo
     with contextlib.ExitStack() as stack:
         count, names = 2, lambda: [process.pid for process in multiprocessing.active_children()]
         if where == "a cluster":
-            nodes = ray_nodes(2, monkeypatch)
+            nodes = ray_nodes(2, environment)
             stack.callback(nodes.shutdown)
             count, names = 1, ray_workers
         watcher = threading.Thread(target=kill_when, args=(checkpoint_path(there.folder), names, killed))
@@ -348,16 +350,16 @@ def test_interrupted_workers_leave_their_checkpoints(make_job, tmp_path) -> None
     assert not multiprocessing.active_children()
 
 
-def ray_nodes(count: int, monkeypatch: pytest.MonkeyPatch) -> Any:
+def ray_nodes(count: int, environment) -> Any:
     """A head and so many nodes of one CPU; RAY_ADDRESS names them."""
     pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    environment["RAY_USAGE_STATS_ENABLED"] = "0"
     nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     for _ in range(count):
         nodes.add_node(num_cpus=1)
-    monkeypatch.setenv("RAY_ADDRESS", nodes.address)
+    environment["RAY_ADDRESS"] = nodes.address
     return nodes
 
 

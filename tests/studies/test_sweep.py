@@ -339,8 +339,8 @@ def test_settings_reach_the_methods_that_have_them(capture: Path, tmp_path: Path
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="Ray is installed")
-def test_a_cluster_without_ray_is_refused_before_anything_is_written(capture, study, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
+def test_a_cluster_without_ray_is_refused_before_anything_is_written(capture, study, tmp_path, environment, capsys):
+    environment["RAY_ADDRESS"] = "head:6379"
     assert sweep(capture, study, tmp_path / "out", "--workers", "2") == 1
     assert "[cluster]" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -58,7 +58,7 @@ def drawing_processes() -> list[int]:
 
 
 @pytest.fixture
-def cluster(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def cluster(tmp_path_factory: pytest.TempPathFactory, environment) -> Iterator[None]:
     """A head and two working nodes; RAY_ADDRESS names them."""
     pytest.importorskip("ray")
     address = f"127.0.0.1:{free_port()}"
@@ -74,7 +74,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monkey
                 break
             time.sleep(0.3)
         started += [node([f"--address={address}", "--num-cpus=1", "--node-ip-address=127.0.0.1"]) for _ in range(2)]
-        monkeypatch.setenv("RAY_ADDRESS", address)
+        environment["RAY_ADDRESS"] = address
         yield
     finally:
         for process in reversed(started):
@@ -85,7 +85,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monkey
 @pytest.mark.timeout(120)
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers in /proc")
 @pytest.mark.usefixtures("cluster")
-def test_a_cluster_of_which_a_worker_is_killed_makes_the_same_bytes(tmp_path: Path, monkeypatch) -> None:
+def test_a_cluster_of_which_a_worker_is_killed_makes_the_same_bytes(tmp_path: Path, environment) -> None:
     run = run_of(ball_scene("ball", [(-8, 0, 55), (4, 2, 60), (9, 4, 58)]), tmp_path / "run")
     killed: list[int] = []
 
@@ -98,15 +98,15 @@ def test_a_cluster_of_which_a_worker_is_killed_makes_the_same_bytes(tmp_path: Pa
     with torch_threads(1):
         synthesize(run, tmp_path / "there", SETTINGS, on_progress=kill_one, workers=2)  # type: ignore[arg-type]
         assert killed
-        monkeypatch.delenv("RAY_ADDRESS")
+        del environment["RAY_ADDRESS"]
         synthesize(run, tmp_path / "here", SETTINGS)  # type: ignore[arg-type]
     assert contents(tmp_path / "there") == contents(tmp_path / "here")
 
 
-def test_a_cluster_that_does_not_answer_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_does_not_answer_is_reported(tmp_path: Path, environment) -> None:
     pytest.importorskip("ray")
     run = run_of(ball_scene("ball", [(-8, 0, 55), (4, 2, 60)]), tmp_path / "run")
-    monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{free_port()}")
+    environment["RAY_ADDRESS"] = f"127.0.0.1:{free_port()}"
     with pytest.raises(NeecoError, match=r"RAY_ADDRESS: no Ray cluster answers at 127\.0\.0\.1") as error:
         synthesize(run, tmp_path / "set", SETTINGS, workers=2)  # type: ignore[arg-type]
     assert "\n" not in str(error.value)

@@ -77,12 +77,12 @@ class Call(BaseHTTPRequestHandler):
 
 
 @pytest.fixture
-def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+def hub(monkeypatch: pytest.MonkeyPatch, environment) -> Iterator[Hub]:
     constants = pytest.importorskip("huggingface_hub.constants", reason="the extra hub")
     served = Hub()
     threading.Thread(target=served.serve_forever, daemon=True).start()
     monkeypatch.setattr(constants, "ENDPOINT", served.address)
-    monkeypatch.setenv("HF_TOKEN", TOKEN)
+    environment["HF_TOKEN"] = TOKEN
     yield served
     served.shutdown()
     served.server_close()
@@ -113,8 +113,8 @@ def test_the_hub_gets_the_data_set_its_card_and_nothing_else(hub: Hub, dataset: 
     assert hub.files == {name: (dataset / name).read_bytes() for name in names}
 
 
-def test_whoever_is_not_logged_in_learns_it_before_anything_is_rendered(hub, monkeypatch):
-    monkeypatch.setenv("HF_TOKEN", "hf_expired")
+def test_whoever_is_not_logged_in_learns_it_before_anything_is_rendered(hub, environment):
+    environment["HF_TOKEN"] = "hf_expired"
     with pytest.raises(NeecoError, match=r"^--push-to-hub lab/rods: .+; log in with `hf auth login`") as caught:
         check_hub("lab/rods")
     assert "\n" not in str(caught.value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,9 +56,8 @@ def test_the_film_shows_the_rendered_images_in_order(run: FakeRun, tmp_path: Pat
     assert errors.diagonal().max() < 4  # of 255; colours are stored for two by two pixels
 
 
-def test_a_missing_package_is_named(run: FakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+def test_a_missing_package_is_named(run: FakeRun, tmp_path: Path, uninstalled) -> None:
+    uninstalled("av")
     with pytest.raises(NeecoError, match=r"--video: needs PyAV; pip install '\.\[ingest\]'"):
         write_video(run.scene, KEYS, tmp_path / "film.mp4")
     assert not list(tmp_path.glob("film*"))

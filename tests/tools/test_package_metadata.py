@@ -22,9 +22,8 @@ def package_metadata() -> Iterator[ModuleType]:
         yield importlib.import_module("package_metadata")
 
 
-def test_links_of_the_page_on_an_index_lead_to_the_files_of_the_version(package_metadata, monkeypatch):
-    monkeypatch.setenv("GITHUB_SERVER_URL", "https://forge.example")
-    monkeypatch.setenv("GITHUB_REPOSITORY", "surgery/neeco")
+def test_links_of_the_page_on_an_index_lead_to_the_files_of_the_version(package_metadata, environment):
+    environment.update(GITHUB_SERVER_URL="https://forge.example", GITHUB_REPOSITORY="surgery/neeco")
     fields = package_metadata.dynamic_metadata({}, {"version": "9.1"})
     links = re.findall(r"(!?)\[[^]]*\]\(([^)]+)\)", fields["readme"]["text"])
     prefix = re.compile("https://forge.example/surgery/neeco/(blob|raw)/v9.1/([^#]+)")
@@ -38,8 +37,8 @@ def test_links_of_the_page_on_an_index_lead_to_the_files_of_the_version(package_
     assert fields["urls"]["Repository"] == "https://forge.example/surgery/neeco"
 
 
-def test_without_an_address_nothing_is_invented(package_metadata: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("GITHUB_REPOSITORY", raising=False)
+def test_without_an_address_nothing_is_invented(package_metadata, environment):
+    environment.pop("GITHUB_REPOSITORY", None)
     fields = package_metadata.dynamic_metadata({}, {"version": "9.1"})
     assert fields["readme"]["text"] == (ROOT / "README.md").read_text()
     assert fields["urls"] == {}

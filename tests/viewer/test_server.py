@@ -103,8 +103,8 @@ def test_a_server_that_the_guard_does_not_see_is_not_left_running(made_run, monk
     assert len(stopped) == 1
 
 
-def test_without_viser_it_says_what_to_install(made_run: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.setitem(sys.modules, "viser", None)
+def test_without_viser_it_says_what_to_install(made_run: Path, uninstalled, capsys) -> None:
+    uninstalled("viser")
     assert main(["view", str(made_run), "--no-browser"]) == 1
     assert capsys.readouterr().err == f"neeco: error: {server.MISSING}\n"
 

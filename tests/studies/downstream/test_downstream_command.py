@@ -14,10 +14,10 @@ SHORT = ["--steps", "2", "--batch", "2", "--size", "48", "--folds", "1", "--devi
 
 
 @pytest.fixture(autouse=True)
-def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def alone(monkeypatch: pytest.MonkeyPatch, environment) -> None:
     """A small model."""
     monkeypatch.setattr("neeco.studies.downstream.models.unet.UNet.channels", (4, 4, 8, 8, 8))
-    monkeypatch.setenv("COLUMNS", "160")
+    environment["COLUMNS"] = "160"
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ from neeco.ingest.readers.frame_names import NamedFrame
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
 HUGE = 1e20
 MAX_LISTED = 3  # lines named in a message
-MAX_UNLIKE = 0.1  # share by which a video may differ in length from the states of its images
+MAX_UNLIKE = 0.1  # relative tolerance of a video's length, compared with the states of its images
 DELIMITED = (".csv", ".tsv", ".txt")
 _Read = TypeVar("_Read", bound=Callable[..., Any])
 ENTRY_POINTS = "neeco.readers"  # the group in which installed packages name their formats
@@ -39,10 +39,10 @@ ENTRY_POINTS = "neeco.readers"  # the group in which installed packages name the
 class Table:
     """The content of a log file, or of one stream of it. header: column names, all different; rows [R, C]: cells as
     text, stripped, "" where missing (dtype object), or numbers, NaN where missing; lines: int64 [R] the file's line (or
-    record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in:
-    the file's own name of the frame that poses are stated in, meaning: what that says (None: nothing, taken as a base);
-    notes: what reading it changed or left out, in words; image_hz: images a second of the video, where every row is the
-    state of one of its images; None: rows have times of their own."""
+    record) of each row, from 1; stream: name of the file's stream; record: noun for a row in messages; stated_in:
+    the file's name of the frame in which poses are expressed; meaning: its interpretation (None: unnamed, a base is
+    assumed); notes: changes and exclusions, as text; image_hz: frame rate of the video where each row is the state of
+    one of its images; None: rows have their own times."""
 
     path: Path
     header: tuple[str, ...]
@@ -58,21 +58,21 @@ class Table:
 
     @property
     def frame(self) -> str | None:
-        """The frame of poses, BASE or a camera's frame (`frame_names.CAMERA_FRAMES`), where the file states it."""
+        """Frame of the poses, BASE or a camera's frame (`frame_names.CAMERA_FRAMES`); None if the file names none."""
         return None if self.meaning is None else self.meaning.frame
 
     @property
     def where(self) -> str:
-        """The beginning of a message: the file, and the stream."""
+        """Prefix of error messages: the file and the stream."""
         return str(self.path) if self.stream is None else f"{self.path}: {self.stream}"
 
     @property
     def title(self) -> str:
-        """The beginning of a note: the same without folders."""
+        """Prefix of notes: as `where`, without folders."""
         return self.path.name if self.stream is None else f"{self.path.name}: {self.stream}"
 
     def list_rows(self, lines: Sequence[int] | np.ndarray) -> str:
-        """`lines 3, 7, 9, ...`, the first few."""
+        """Return the first line numbers as text: `lines 3, 7, 9, ...`."""
         names = ", ".join(str(int(line)) for line in lines[:MAX_LISTED])
         return f"{self.record}{'' if len(lines) == 1 else 's'} {names}{', ...' if len(lines) > MAX_LISTED else ''}"
 
@@ -85,14 +85,13 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Stream:
-    """A stream of a file. name: as a recording states it (`stream: NAME`); type: the format's own word for it;
-    count: of its samples; rate_hz: None where nobody knows.
+    """A stream of a file. name: as in a recording (`stream: NAME`); type: the format's own term; count: number of
+    samples; rate_hz: samples per second, None if unknown.
 
-    For a template: offered: is it what is recorded most likely, or only there, too? body: what it is of, where the
-    format tells; joints: (name, column) of the readings worth having, None: all angles; hints: remarks on the body;
-    columns: of the table, those that are the body's (None: all); asks: keys of the log that nothing in the file says,
-    as lines for the user to choose from; clock: that of a file without images; problem:
-    why it cannot be read, though the rest of the file can.
+    For a template: offered: whether `--init` enables it by default; body: the tracked body, if the format names it;
+    joints: (name, column) of the useful readings, None: all angles; hints: remarks on the body; columns: columns of
+    the table that belong to the body (None: all); asks: keys that the file does not determine, as lines for the user
+    to complete; clock: clock of a file without images; problem: reason why only this stream cannot be read.
     """
 
     name: str
@@ -113,7 +112,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class VideoSource:
-    """Frames with their times. size: (width, height) px, as stored; notes: what could not be read, in words; times [N]
+    """Frames with their times. size: (width, height) px, as stored; notes: unreadable parts, as text; times [N]
     s, increasing, of a video from its first frame; pixel_aspect: width of a stored pixel by its height."""
 
     path: Path
@@ -124,19 +123,19 @@ class VideoSource:
 
     @property
     def own_fps(self) -> float | None:
-        """Frames a second that the file itself says where others were asked for; None where it says none, or these."""
+        """Frame rate stated by the file if it differs from the requested one, else None."""
         return None
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        """(index, uint8 [H, W, 3] RGB) of the frames asked for, in increasing order. Raises NeecoError."""
+        """Yield (index, uint8 [H, W, 3] RGB) of the requested frames, in increasing order. Raises NeecoError."""
         raise NotImplementedError
 
 
 class RecordingFormat(ABC):
-    """A format of what was recorded: the protocol of a reader, in a file of this folder or in a package that names its
-    class as an entry point in the group `neeco.readers`.
+    """Base class of the reader of one recording format, in a file of this folder or in a package that names its class
+    as an entry point in the group `neeco.readers`.
 
-    Subclasses set `format`, `holds` and, unless they look into the files, `suffixes`; they have a constructor without
+    Subclasses set `format`, `holds` and, unless they inspect the files, `suffixes`; they have a constructor without
     arguments, and override `read`, `open_images` or both. Every method raises NeecoError naming the file, the place and
     the remedy.
     """
@@ -148,7 +147,7 @@ class RecordingFormat(ABC):
     extra: ClassVar[str | None] = None  # the extra of neeco that installs this module
 
     def claims(self, path: Path) -> bool:
-        """Return whether the file or folder is in this format. Looks at little of it, and raises nothing."""
+        """Return whether the file or folder is in this format. Reads only its beginning and never raises."""
         return path.suffix.lower() in self.suffixes
 
     def require_package(self, path: Path) -> None:
@@ -157,41 +156,41 @@ class RecordingFormat(ABC):
             raise NeecoError(f"{path}: {self.format}: needs {self.package}; {install_hint(self.extra or '')}")
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        """Return what the file holds; () where it is one table."""
+        """Return the file's streams; () if it is a single table."""
         return ()
 
-    def choose(self, path: Path, wanted: str | None, *kinds: Kind, streams: Sequence[Stream] | None = None) -> Stream:
+    def choose(self, path: Path, name: str | None, *kinds: Kind, streams: Sequence[Stream] | None = None) -> Stream:
         """Return the requested stream, or the only one of these kinds. streams: all existing ones. Raises NeecoError
         listing them."""
         streams = self.streams(path) if streams is None else streams
         of_kind = [stream for stream in streams if stream.kind in kinds]
-        fitting = [stream for stream in of_kind if stream.problem is None]
-        named = [stream for stream in streams if stream.name == wanted][:1]
-        candidates = named if wanted is not None else fitting or of_kind[:1]
+        readable = [stream for stream in of_kind if stream.problem is None]
+        named = [stream for stream in streams if stream.name == name][:1]
+        candidates = named if name is not None else readable or of_kind[:1]
         if len(candidates) == 1 and (only := candidates[0]).problem is not None:
             raise NeecoError(f"{path}: {only.name}: {only.problem}")
-        if len(candidates) == 1 and candidates[0] in fitting:
+        if len(candidates) == 1 and candidates[0] in readable:
             return candidates[0]
-        listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
+        listed = printable(", ".join(stream.name for stream in readable), 400).strip("'") or "none"
         sought = " or ".join(kinds)
-        if wanted is None:
-            problem = f"holds {len(fitting)} streams of {sought}; name one as `stream` in the recording: {listed}"
+        if name is None:
+            problem = f"has {len(readable)} streams of {sought}; set `stream` in the recording to one of: {listed}"
             raise NeecoError(f"{path}: {problem}")
-        problem = f"holds no {printable(wanted)}"
+        problem = f"{printable(name)} does not exist"
         if candidates:
-            problem = f"{printable(wanted)} is {candidates[0].type}, not {sought}"
-        raise NeecoError(f"{path}: stream: {problem}; name one of {listed}")
+            problem = f"{printable(name)} is {candidates[0].type}, not {sought}"
+        raise NeecoError(f"{path}: stream: {problem}; choose one of: {listed}")
 
     def read(self, path: Path, stream: str | None = None) -> Table:
-        """Return poses or readings as a table. stream: the name of one, where there are several."""
-        raise NeecoError(f"{path}: {self.format} holds no poses and no readings; name a log")
+        """Return poses or readings as a table. stream: name, if the file has several."""
+        raise NeecoError(f"{path}: {self.format} contains neither poses nor readings; give a log file")
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
-        """Return the images, with times on the clock that the tables share."""
-        raise NeecoError(f"{path}: {self.format} holds no images; name a video or a folder of images")
+        """Return the images, with times on the clock of the tables."""
+        raise NeecoError(f"{path}: {self.format} contains no images; give a video or a folder of images")
 
     def clock(self, path: Path, stream: str | None) -> str:
-        """Return the origin of a stream's times, by name: streams with the same one share a clock."""
+        """Return the name of a stream's time origin: streams with the same name share a clock."""
         return ""
 
     def of_episode(self, stream: str, episode: int) -> str | None:
@@ -210,7 +209,7 @@ class RecordingFormat(ABC):
 
 @cache
 def recording_formats() -> tuple[RecordingFormat, ...]:
-    """All formats; delimited text, which claims by its suffix what others know by what it holds, last."""
+    """Return all formats; delimited text, which claims by suffix what others recognise by content, is last."""
     kinds = plugins(RecordingFormat, "format", __name__, ENTRY_POINTS)
     return tuple(sorted((kind() for kind in kinds.values()), key=lambda kind: kind.suffixes == DELIMITED))
 
@@ -221,7 +220,7 @@ def format_of(path: Path) -> RecordingFormat | None:
 
 
 def read_table(path: Path, stream: str | None = None) -> Table:
-    """Read a log; what no format claims, as delimited text. stream: which, of a file that holds several. Raises
+    """Read a log, as delimited text if no format claims it. stream: name, if the file has several. Raises
     NeecoError."""
     path = Path(path)
     reader = format_of(path) or recording_formats()[-1]
@@ -230,7 +229,7 @@ def read_table(path: Path, stream: str | None = None) -> Table:
 
 
 def file_state(*files: Path) -> tuple[tuple[str, int, int], ...]:
-    """Return what distinguishes files from others of their names, for what is kept of them. Raises NeecoError."""
+    """Return path, size and modification time of files, as a cache key of their content. Raises NeecoError."""
     try:
         return tuple((str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files)
     except OSError as error:
@@ -238,21 +237,21 @@ def file_state(*files: Path) -> tuple[tuple[str, int, int], ...]:
 
 
 def read_once(read: _Read) -> _Read:
-    """Keep what a function reads of a file, its first argument, until that changes. Raises NeecoError where it is not
-    there."""
+    """Cache a function's result per file, its first argument, until the file changes. Raises NeecoError if it does not
+    exist."""
     cached = lru_cache(maxsize=4)(lambda state, *arguments: read(*arguments))
-    return cast(_Read, wraps(read)(lambda path, *more: cached(file_state(path), path, *more)))
+    return cast(_Read, wraps(read)(lambda path, *arguments: cached(file_state(path), path, *arguments)))
 
 
 def reason_of(error: BaseException) -> str:
-    """Return what a library says of a damaged file, in a few words of one line."""
+    """Return a library's message about a damaged file, shortened to one line."""
     text = visible(str(getattr(error, "strerror", None) or error)).strip(" .")
-    return text[:100] or "its parts do not fit together"
+    return text[:100] or "inconsistent content"
 
 
 @contextmanager
 def one_line(where: Path | str, problem: str, remedy: str) -> Iterator[None]:
-    """Turn what libraries raise of damaged files, which is nearly anything, into a NeecoError with their reason."""
+    """Convert any exception of a library that reads a damaged file into a NeecoError with the library's reason."""
     try:
         yield
     except NeecoError:
@@ -264,24 +263,26 @@ def one_line(where: Path | str, problem: str, remedy: str) -> Iterator[None]:
 def compare_counts(
     file: Path, images: int, rows: int, noun: str, unlike: float = 0.0, remedy: str = "give the whole video of this log"
 ) -> tuple[str, ...]:
-    """Return a note if images and the rows of a log that belong to them one by one differ in number.
+    """Return a note if the numbers of images and of log rows, which correspond one to one, differ.
 
-    file: of the images; noun: name of a row; unlike: share by which the numbers may differ, in addition to one. Raises
+    file: of the images; noun: for rows, in messages; unlike: relative tolerance, in addition to one row. Raises
     NeecoError, with the remedy, if they differ by more.
     """
     counts = f"has {images} images for {rows} {noun}"
     if abs(images - rows) > unlike * rows + 1:
-        raise NeecoError(f"{file}: {counts}; they do not belong together: {remedy}")
-    return () if images == rows else (f"{file.name}: {counts}; both are taken to begin together",)
+        raise NeecoError(f"{file}: {counts}; the numbers do not match: {remedy}")
+    return () if images == rows else (f"{file.name}: {counts}; both are assumed to start at the same time",)
 
 
 def compare_lengths(file: Path, video: VideoSource, rows: int, image_hz: float) -> tuple[str, ...]:
-    """`compare_counts` of states that are one for every image of a video of `image_hz` images a second, whatever rate
-    it has now."""
+    """`compare_counts` for states recorded one per image of a video at `image_hz` images per second, whatever rate the
+    video file states."""
     images = round(float(video.times[-1] - video.times[0]) * image_hz) + 1
     is_rate = images != rows and abs(len(video.times) - rows) <= 1
-    remedy = f"as it has {len(video.times)}, say `fps: {image_hz:g}` of it" if is_rate else "give the video of this log"
-    return compare_counts(file, images, rows, f"states at {image_hz:g} a second", MAX_UNLIKE, remedy)
+    fps = f"its {len(video.times)} images match the states: set `fps: {image_hz:g}`"
+    return compare_counts(
+        file, images, rows, f"states at {image_hz:g} Hz", MAX_UNLIKE, fps if is_rate else "give the video of this log"
+    )
 
 
 def numbers(table: Table, columns: Sequence[str]) -> np.ndarray:
@@ -291,7 +292,7 @@ def numbers(table: Table, columns: Sequence[str]) -> np.ndarray:
 
 
 def to_numbers(cells: np.ndarray) -> np.ndarray:
-    """Return texts or numbers [...] as numbers; NaN for what is no number, or so huge that it stands for none."""
+    """Return texts or numbers [...] as numbers; NaN for other text and for huge numbers that mark missing values."""
     if cells.dtype == object:
         cells = np.array([_number(cell) for cell in cells.ravel().tolist()], np.float64).reshape(cells.shape)
     return np.where(np.abs(cells) < HUGE, cells, np.nan)  # NaN compares false
@@ -305,7 +306,7 @@ def _number(text: str) -> float:
 
 
 def column_index(table: Table, name: str) -> int:
-    """The column called `name`, in any case of letters when only one is meant. Raises NeecoError."""
+    """Return the column called `name`, ignoring case if that is unambiguous. Raises NeecoError."""
     if name in table.header:
         return table.header.index(name)
     matches = [index for index, other in enumerate(table.header) if other.lower() == name.lower()]
@@ -316,6 +317,6 @@ def column_index(table: Table, name: str) -> int:
 
 
 def rate_of(times: np.ndarray) -> float | None:
-    """Samples a second, of their times s; None where these do not say."""
+    """Return the mean sampling rate Hz of times s; None if they span no time."""
     span = float(np.ptp(times)) if len(times) > 1 else 0.0
     return (len(times) - 1) / span if span > 0 else None

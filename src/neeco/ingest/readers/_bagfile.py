@@ -150,21 +150,21 @@ class Bag:
     def messages(
         self, topics: Collection[str], start: int | None = None, stop: int | None = None
     ) -> Iterator[tuple[str, int, Any]]:
-        """Yield (topic, time of receipt in ns since 1970, message or None where it is damaged) of the given topics,
-        received in [start, stop). The order of two messages does not depend on what else is asked for.
+        """Yield (topic, receipt time in ns since 1970, message or None if damaged) of the given topics, received in
+        [start, stop). The order of two messages does not depend on the other requested topics.
         Raises NeecoError."""
         deserialize = _store(True).deserialize_ros1 if self.is_ros1 else _store(False).deserialize_cdr
         packed = not self.is_ros1 and self.reader.metadata.compression_mode == "message"
         with _naming_damage(self.path):
             for source in self.sources:
-                wanted = [connection for connection in source.connections if connection.topic in topics]
-                for connection, received, data in source.messages(wanted, start, stop) if wanted else ():
+                requested = [connection for connection in source.connections if connection.topic in topics]
+                for connection, received, data in source.messages(requested, start, stop) if requested else ():
                     if not 0 <= received < 2**63:
-                        raise ReaderError("a message has an invalid time of receipt")
+                        raise ReaderError("a message has an invalid receipt time")
                     data = unpack(data, "zstd" if packed else "none", LIMITS.chunk_bytes)
                     try:
                         message = deserialize(data, connection.msgtype)
-                    except Exception:  # rosbags raises nearly anything of damaged ones; a message hides no other
+                    except Exception:  # rosbags raises many types for damaged messages; the others are still read
                         message = None
                     yield connection.topic, received, message
 
@@ -173,11 +173,11 @@ class Bag:
         kind, store = connection.msgtype, _store(self.is_ros1)
         encoding = "cdr" if self.is_ros1 else connection.ext.serialization_format
         if encoding != "cdr" and (kind in store.fielddefs or isinstance(self.reader, McapReader)):
-            return f"is written as {plain(encoding) or 'nothing named'}, not as cdr"
+            return f"is encoded as {plain(encoding) or 'an unnamed format'}, not as CDR"
         if kind in store.fielddefs and connection.digest not in ("", "*"):
             digest = store.generate_msgdef(kind)[1] if self.is_ros1 else store.hash_rihs01(kind)
             if connection.digest != digest:
-                return f"defines {kind.replace('/msg/', '/')} otherwise than ROS"
+                return f"defines {kind.replace('/msg/', '/')} differently from ROS"
         return None if plain(connection.topic) == connection.topic else "has an unprintable name"
 
 
@@ -189,9 +189,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
         require_content(file)
     metadata = path / "metadata.yaml"
     if metadata.is_file() and metadata.stat().st_size > LIMITS.metadata_bytes:
-        raise NeecoError(f"{metadata}: is too large; write it anew with `ros2 bag reindex`")
+        raise NeecoError(f"{metadata}: is too large; rewrite it with `ros2 bag reindex`")
     if re.search(rb"compression_mode: [\"']?file", read_head(metadata, 1 << 20), re.I):
-        raise NeecoError(f"{path}: its files are packed as a whole; unpack one with `zstd -d` and give that")
+        raise NeecoError(f"{path}: its files are compressed as a whole; decompress one with `zstd -d` and give that")
     kinds = {"": DirectoryReader, ".bag": Ros1Reader, ".mcap": _McapReader, ".db3": Sqlite3Reader}
     with ExitStack() as stack:
         with _naming_damage(path):
@@ -205,19 +205,19 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 
 def unpack(data: bytes, compression: str, max_bytes: int) -> bytes:
-    """Return the unpacked bytes, at most so many of them. Raises ReaderError."""
+    """Return the decompressed bytes. Raises ReaderError if they exceed `max_bytes` or are incomplete."""
     if compression == "none":
         return data
-    machine = _DECOMPRESSORS[compression]()
-    unpacked = machine.decompress(data, max_length=max_bytes + 1)
+    decompressor = _DECOMPRESSORS[compression]()
+    unpacked = decompressor.decompress(data, max_length=max_bytes + 1)
     _check_size(len(unpacked), max_bytes)
-    if not machine.eof:
-        raise ReaderError("a chunk of its messages ends early")
+    if not decompressor.eof:
+        raise ReaderError("a chunk of its messages is truncated")
     return unpacked
 
 
 def _limit_chunks(reader: Any) -> None:
-    """Have an open ROS 1 or MCAP reader refuse chunks that do not fit into memory. Raises ReaderError.
+    """Make an open ROS 1 or MCAP reader reject chunks above the memory limit. Raises ReaderError.
 
     An index states the unpacked size of MCAP's chunks; ROS 1 bags state none, so these are unpacked up to the limit.
     """
@@ -236,23 +236,23 @@ def _limit_chunks(reader: Any) -> None:
 
 def _check_size(size: int, max_bytes: int) -> None:
     if size > max_bytes:
-        raise ReaderError(f"a chunk of its messages has over {max_bytes >> 20} MiB")
+        raise ReaderError(f"a chunk of its messages is larger than {max_bytes >> 20} MiB")
 
 
 def _naming_damage(path: Path) -> AbstractContextManager[None]:
     repair = _REPAIRS.get("" if path.is_dir() else path.suffix.lower())
     remedy = f"repair it with {repair}, or copy it again" if repair else "copy it again"
-    return one_line(path, "is cut short or damaged, or no bag", remedy)
+    return one_line(path, "is truncated, damaged or not a bag", remedy)
 
 
 @dataclass
 class Samples:
-    """Samples of a stream, one per message. stamps, received: ns; a stamp is 0 where the header has none; frames: as
-    ROS 2 writes them, without a slash; columns: numbers by name, NaN where a message lacks one; bad: messages that
-    cannot be used, by the reason; static: valid at all times.
+    """Samples of a stream, one per message. stamps, received: ns; a stamp is 0 if the header has none; frames: frame
+    ids without a leading slash; columns: numbers by name, NaN where a message lacks one; bad: number of unusable
+    messages by reason; static: valid at all times.
 
-    Of images, instead of columns: arrived: ns, of every message; numbers: which message each sample is; sizes: (width,
-    height), and encodings, in the order of their appearance."""
+    Images have, instead of columns: arrived: receipt time of every message, ns; numbers: message index of each sample;
+    sizes: (width, height), and encodings, in order of first appearance."""
 
     type: str
     _: KW_ONLY
@@ -286,7 +286,7 @@ class Samples:
         self.frames.add(plain(message.header.frame_id).lstrip("/"))
 
     def _values(self, message: Any) -> dict[str, float]:
-        """Return numbers by column; of images none. Raises _UnusableError."""
+        """Return numbers by column, none for images. Raises _UnusableError."""
         if message is None:
             raise _UnusableError("is damaged")
         if self.type in IMAGE:
@@ -303,7 +303,7 @@ class Samples:
                 raise _UnusableError("is damaged")
             numbers: dict[str, float] = {}
             for name, value in zip(names, values, strict=True):
-                numbers.setdefault(name, value)  # of a joint named twice, the first
+                numbers.setdefault(name, value)  # the first of duplicate names
             return numbers
         if hasattr(message, "pose"):
             place, turn = message.pose.position, message.pose.orientation
@@ -318,16 +318,16 @@ class Samples:
 
     @property
     def problem(self) -> str | None:
-        """Why nothing of the stream can be used."""
+        """Reason why no message of the stream can be used, None if some can."""
         if self.stamps or not self.bad:
             return None
         return f"none of {self.bad.total()} messages can be used: one {self.bad.most_common(1)[0][0]}"
 
     @property
     def title(self) -> str:
-        """The type; of images `sensor_msgs/Image (rgb8, 640x480)`."""
-        words = [*self.encodings, *(f"{width}x{height}" for width, height in self.sizes)][:6]
-        return f"{self.type} ({', '.join(words)})" if words else self.type
+        """The type; for images as `sensor_msgs/Image (rgb8, 640x480)`."""
+        details = [*self.encodings, *(f"{width}x{height}" for width, height in self.sizes)][:6]
+        return f"{self.type} ({', '.join(details)})" if details else self.type
 
 
 def _inspect(message: Any) -> tuple[str, tuple[int, int]]:
@@ -335,9 +335,9 @@ def _inspect(message: Any) -> tuple[str, tuple[int, int]]:
     if hasattr(message, "encoding"):
         encoding, size = message.encoding, (message.width, message.height)
         if encoding not in ENCODINGS:
-            raise _UnusableError(f"is in encoding {printable(encoding, 24)}, which is not read")
+            raise _UnusableError(f"has the unsupported encoding {printable(encoding, 24)}")
         if message.step < size[0] * ENCODINGS[encoding][0] or len(message.data) < message.step * size[1]:
-            raise _UnusableError("has fewer pixels than its size says")
+            raise _UnusableError("has fewer pixels than its size states")
         return encoding, size
     try:
         with Image.open(BytesIO(message.data), formats=FORMATS) as image:
@@ -346,10 +346,10 @@ def _inspect(message: Any) -> tuple[str, tuple[int, int]]:
                 image.verify()
             elif b"\xff\xd9" not in message.data[-4096:].tobytes():
                 raise ValueError("cut short")
-    except Exception:  # Pillow's readers raise nearly anything
-        raise _UnusableError(f"is no whole JPEG or PNG ({printable(message.format, 24)})") from None
+    except Exception:  # Pillow's readers raise many types
+        raise _UnusableError(f"is not a complete JPEG or PNG ({printable(message.format, 24)})") from None
     if mode[0] in "IF":
-        raise _UnusableError("has 16 bits a channel, which is not read")
+        raise _UnusableError("has 16 bits per channel, which is not supported")
     return kind, size
 
 
@@ -365,8 +365,8 @@ def decode(message: Any) -> np.ndarray:
 
 @dataclass(kw_only=True, eq=False)  # cached by identity
 class Survey:
-    """Contents of a bag by stream, without the pixels of images. lenses: by topic, a CameraInfo and its numbers K, D, R
-    and P; origin: ns, of all times."""
+    """Contents of a bag by stream, without the pixels of images. lenses: a CameraInfo and its numbers K, D, R and P, by
+    topic; origin: time origin of all streams, ns."""
 
     path: Path
     poses: dict[str, Samples] = field(default_factory=dict)
@@ -395,39 +395,39 @@ class Survey:
                 streams[name].add(received, item)
 
     def seconds(self, log: Samples) -> np.ndarray:
-        """Return times [N] s from the origin: the stamps or, where those are 0, the times of receipt, ns."""
+        """Return times [N] s from the origin: the stamps or, where those are 0, the receipt times."""
         stamps, received = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
         return (np.where(stamps == 0, received, stamps) - self.origin) * 1e-9
 
-    def stream(self, name: str, log: Samples, kind: Kind, more: str = "") -> Stream:
-        """Return a stream by what was counted. more: of its title."""
+    def stream(self, name: str, log: Samples, kind: Kind, suffix: str = "") -> Stream:
+        """Return the description of a stream. suffix: added to its title."""
         count, rate = max(len(log.stamps), len(log.arrived)), rate_of(self.seconds(log))
-        return Stream(name, kind, log.title + more, count, rate, problem=log.problem)
+        return Stream(name, kind, log.title + suffix, count, rate, problem=log.problem)
 
     def table(self, name: str, log: Samples, header: tuple[str, ...], values: np.ndarray) -> Table:
-        """Return a table of numbers, one row a message."""
+        """Return a table of numbers, one row per message."""
         rows, lines = np.column_stack([self.seconds(log), values]), np.arange(1, len(values) + 1)
         notes = self.notes(name, log, "message")
         return Table(self.path, header, rows, lines, stream=name, record="message", notes=notes)
 
     def notes(self, name: str, log: Samples, noun: str) -> tuple[str, ...]:
-        """Return notes on missing stamps, on stamps of another clock, and on messages (`noun`) that are left out."""
+        """Return notes on missing stamps, on stamps of another clock, and on excluded messages (`noun`)."""
         stamps, received = np.array(log.stamps, np.int64), np.array(log.received, np.int64)
         none, notes = stamps == 0, []
         if none.any():
             missing = "its headers have no times" if none.all() else f"{int(none.sum())} headers have no time"
-            notes.append(f"{missing}; those of receipt are taken")
+            notes.append(f"{missing}; receipt times are used instead")
         late = 0.0 if none.all() else float(np.median((received - stamps)[~none])) * 1e-9
         if abs(late) > LIMITS.other_clock_s:
-            why = f"its headers' times are {late:.2f} s before those of receipt, on another clock"
-            notes.append(f"{why}; where the streams do not share one, name its `clock` and give `sync`")
+            why = f"its header times are {late:.2f} s before the receipt times, on another clock"
+            notes.append(f"{why}; if the streams do not share this clock, set `clock` and `sync`")
         notes += [f"{counted(count, noun)} left out: one {why}" for why, count in log.bad.items()]
         return tuple(f"{self.path.name}: {name}: {note}" for note in notes)
 
 
 @lru_cache(maxsize=4)
 def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
-    """Read a bag once; `state` of its files distinguishes it from another of its name."""
+    """Read a bag once; `state` (`file_state`) is part of the cache key."""
     survey = Survey(path=path)
     with open_bag(path) as bag:
         kinds: dict[str, str] = {}
@@ -443,10 +443,10 @@ def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
                     survey.images[topic] = Samples(types[0])
                 continue
             unread += [] if problem is None else [f"{plain(topic)} ({types[0]}) {problem}"]
-            words = types[0] if problem is None else f"{types[0]}, which {problem}"
-            survey.others.append(Stream(plain(topic), Kind.OTHER, words, sum(one.msgcount for one in of_topic)))
+            title = types[0] if problem is None else f"{types[0]}, which {problem}"
+            survey.others.append(Stream(plain(topic), Kind.OTHER, title, sum(one.msgcount for one in of_topic)))
         if unread and len(unread) == len(topics):
-            raise NeecoError(f"{path}: no topic can be read: {', '.join(unread)}; record or convert to ROS 2's cdr")
+            raise NeecoError(f"{path}: no topic can be read: {', '.join(unread)}; convert the bag to ROS 2 with CDR")
         for name, received, message in bag.messages(set(kinds)):
             survey.add(name, kinds[name], received, message)
     logs = [log for log in survey.images.values() if log.stamps]
@@ -457,18 +457,18 @@ def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
 
 @dataclass(frozen=True, kw_only=True)
 class BagImages(VideoSource):
-    """Images of a topic. arrived: ns, of each of its messages; numbers: which message each frame is."""
+    """Images of a topic. arrived: receipt time of each of its messages, ns; numbers: message index of each frame."""
 
     topic: str
     arrived: np.ndarray
     numbers: np.ndarray
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        wanted = np.array(sorted({int(index) for index in indices}), np.int64)
-        steps = np.diff(self.numbers[wanted])
+        requested = np.array(sorted({int(index) for index in indices}), np.int64)
+        steps = np.diff(self.numbers[requested])
         cuts = np.flatnonzero((steps <= 0) | (steps > LIMITS.skipped_images)) + 1
         with open_bag(self.path) as bag:
-            for stretch in np.split(wanted, cuts):
+            for stretch in np.split(requested, cuts):
                 numbers = {int(self.numbers[index]): int(index) for index in stretch}
                 times = self.arrived[list(numbers)]
                 start, stop = int(times.min(initial=2**62)), int(times.max(initial=-1)) + 1
@@ -477,13 +477,13 @@ class BagImages(VideoSource):
                 for number, (_, _, message) in zip(passed, messages, strict=False):
                     if number in numbers:
                         where = f"{self.path}: {self.topic}: message {number + 1}"
-                        with one_line(where, "cannot be decoded", "cut it out with `rosbag filter`"):
+                        with one_line(where, "cannot be decoded", "remove it with `rosbag filter`"):
                             pixels = decode(message)
                         if pixels.shape[1::-1] != self.size:
-                            raise NeecoError(f"{where}: has another size than it had; do not change the bag")
+                            raise NeecoError(f"{where}: changed its size; do not modify the bag during a run")
                         yield numbers.pop(number), pixels
                 if numbers:
-                    raise NeecoError(f"{self.path}: {self.topic}: is shorter than before; do not change the bag")
+                    raise NeecoError(f"{self.path}: {self.topic}: became shorter; do not modify the bag during a run")
 
 
 def open_topic(survey: Survey, topic: str) -> BagImages:
@@ -493,16 +493,17 @@ def open_topic(survey: Survey, topic: str) -> BagImages:
     times, order = np.unique(seconds, return_index=True)
     if len(times) < LIMITS.min_images:
         why, count = log.bad.most_common(1)[0] if log.bad else ("", 0)
-        problem = f": {count} are not: one {why}" if count else ", by their times" if len(seconds) > len(times) else ""
-        raise NeecoError(f"{where}: {len(times)} of {len(log.arrived)} images can be used{problem}; name another topic")
+        repeated = " (others share their time)" if len(seconds) > len(times) else ""
+        problem = f" ({count} left out: one {why})" if count else repeated
+        raise NeecoError(f"{where}: only {len(times)} of {len(log.arrived)} images usable{problem}; use another topic")
     if len(log.sizes) > 1:
         first, second = [f"{width}x{height}" for width, height in log.sizes][:2]
-        raise NeecoError(f"{where}: changes from {first} to {second} pixels midway; cut the bag there")
+        raise NeecoError(f"{where}: image size changes from {first} to {second} px; split the bag there")
     for place in restarts(seconds)[1]:
         jump = f"{seconds[place]:.6g} s, then {seconds[place + 1]:.6g} s"
-        raise NeecoError(f"{where}: image {place + 2}: time begins anew ({jump}); keep the images of one run in a bag")
+        raise NeecoError(f"{where}: image {place + 2}: time restarts ({jump}); use one bag per run")
     if doubled := len(seconds) - len(times):
-        left_out = f"{counted(doubled, 'image')} left out: one shares its time with another"
+        left_out = f"{counted(doubled, 'image')} left out: duplicate time"
         notes = (*notes, f"{survey.path.name}: {topic}: {left_out}")
     numbers, arrived = np.array(log.numbers, np.int64)[order], np.array(log.arrived, np.int64)
     return BagImages(survey.path, next(iter(log.sizes)), notes, times, topic=topic, arrived=arrived, numbers=numbers)

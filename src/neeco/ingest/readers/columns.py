@@ -13,10 +13,10 @@ from typing import Annotated
 from neeco.base.errors import NeecoError
 from neeco.capture.documents import Node, printable
 
-TRACKER_CLOCK = "em"  # what a tracker's clock is called unless the recording names it
-VIDEO_CLOCK = "video"  # that of the images, and of logs that stand in the same file
+TRACKER_CLOCK = "em"  # default name of a tracker's clock
+VIDEO_CLOCK = "video"  # clock of the images, and of logs in the same file
 QUATERNION_WXYZ, QUATERNION_XYZW = "quaternion_wxyz", "quaternion_xyzw"
-CAMERA, BASE = "camera", "base"  # frames that poses may be stated in: OpenCV's camera axes, or what registration places
+CAMERA, BASE = "camera", "base"  # frames of poses: the camera with OpenCV axes, or a base that registration places
 ROTATION_VECTOR, EULER, ROTATION_MATRIX, MATRIX = "rotation_vector", "euler", "rotation_matrix", "matrix"
 FORMS = (QUATERNION_WXYZ, QUATERNION_XYZW, ROTATION_VECTOR, EULER, ROTATION_MATRIX, MATRIX)  # matrices row by row
 
@@ -41,7 +41,7 @@ def _unit(kind: str) -> Callable[[Node], str]:
     def parse(node: Node) -> str:
         unit = canonical_unit(str(node.value))
         if unit not in UNITS[kind]:
-            node.fail(f"{printable(node.value)} is no unit of {kind}", f"use {', '.join(UNITS[kind])}")
+            node.fail(f"{printable(node.value)} is not a unit of {kind}", f"use one of: {', '.join(UNITS[kind])}")
         return unit
 
     return parse
@@ -49,7 +49,7 @@ def _unit(kind: str) -> Callable[[Node], str]:
 
 @dataclass(frozen=True)
 class Units:
-    """Units that a recording states; None: the columns' names state it."""
+    """Units stated in a recording; None: the column names state the unit."""
 
     time: Annotated[str, _unit("time")] | None = None
     length: Annotated[str, _unit("length")] | None = None
@@ -58,13 +58,13 @@ class Units:
 
 @dataclass(frozen=True)
 class PoseColumns:
-    """A log of poses (tracker_from_sensor). What is None is recognised from the header.
+    """Columns of a pose log (tracker_from_sensor). Fields that are None are recognised from the header.
 
     time: one column, or two (whole seconds, nanoseconds); position: x, y, z (not with a 4x4 matrix); rotation: as
     many columns as `form` takes; euler_convention: as scipy names it, "XYZ" intrinsic, "xyz" extrinsic; state: a
-    column of which only the values `good` mark measured rows; rate_hz: where time counts frames; stream: which, of a
-    file that holds several; frame: what the poses are stated in, of `frames.FRAMES` (CAMERA, BASE: a robot's base, a
-    tracker's frame); None: the file says so, else BASE.
+    column whose values `good` mark measured rows; rate_hz: frame rate if `time` counts frames; stream: name, if the
+    file has several; frame: frame of the poses, one of `frame_names.FRAMES` (CAMERA, BASE: a robot's base or a
+    tracker's frame); None: as stated by the file, else BASE.
     """
 
     path: Path
@@ -85,8 +85,8 @@ class PoseColumns:
 
 @dataclass(frozen=True)
 class JointColumns:
-    """A log of one joint sensor. calibration: a table from its counts to angles (None: the column holds angles);
-    limits: of the joint, rad, for the capture; stream: which, of a file that holds several."""
+    """Columns of one joint sensor's log. calibration: table from counts to angles (None: the column holds angles);
+    limits: joint limits for the capture, rad; stream: name, if the file has several."""
 
     path: Path
     clock: str
@@ -102,7 +102,7 @@ class JointColumns:
 
 @dataclass(frozen=True, kw_only=True)
 class RecognisedColumns:
-    """The columns that a header seems to name. None: not found; unclear: meanings found in several ways or in part."""
+    """Columns recognised in a header. None: not found; unclear: ambiguous or incomplete quantities, with the reason."""
 
     time: tuple[str, ...] | None = None
     position: tuple[str, ...] | None = None
@@ -116,13 +116,13 @@ class RecognisedColumns:
 
 
 def canonical_unit(text: str) -> str:
-    """`mm` for millimetres, `deg` for degrees ...; the text itself, in small letters, when it is no known unit."""
+    """Return the canonical unit (`mm` for millimetres, `deg` for degrees); the lower-case text if it is unknown."""
     lower = text.strip().lower().replace("µ", "u")
     return _ALIASES.get(lower, lower)
 
 
 def split_unit(name: str, kind: str) -> tuple[str, str | None]:
-    """A column's name without its unit, and the unit of that kind ("length", "angle", "time") or None."""
+    """Return a column's name without its unit, and the unit of that kind ("length", "angle", "time") or None."""
     match = _UNIT_SUFFIX.match(name.strip().lower())
     unit = canonical_unit(match["unit"]) if match else None
     if match and unit in UNITS[kind]:
@@ -133,23 +133,23 @@ def split_unit(name: str, kind: str) -> tuple[str, str | None]:
 def scale_of(
     where: Path | str, names: tuple[str, ...], kind: str, stated: str | None, implied: str | None, hint: str
 ) -> float:
-    """The factor to mm, rad or s of some columns; `where` begins messages.
+    """Return the factor that converts columns to mm, rad or s. where: prefix of messages.
 
     The unit is in their names, else `stated` by the recording, else `implied` by the file's format. hint: added to
-    the question when there is none. Raises NeecoError when nothing gives the unit or two sources disagree.
+    the message if there is none. Raises NeecoError if the unit is unknown or two sources disagree.
     """
     units = {unit for name in names if (unit := split_unit(name, kind)[1])}
     listed = ", ".join(names)
     if len(units) > 1:
-        raise NeecoError(f"{where}: columns {listed}: named in different units; write them in one {kind} unit")
+        raise NeecoError(f"{where}: columns {listed}: names have different units; use one {kind} unit")
     unit = next(iter(units), None)
     if unit and stated and unit != stated:
-        raise NeecoError(f"{where}: columns {listed}: named in {unit}, but units.{kind} says {stated}; correct one")
+        raise NeecoError(f"{where}: columns {listed}: names state {unit}, units.{kind} states {stated}; correct one")
     unit = unit or stated or implied
     if unit is None:
         raise NeecoError(
-            f"{where}: columns {listed}: in which {kind} unit?{hint} Say it in the header (for example "
-            f"{names[0]}_{next(iter(UNITS[kind]))}) or in the recording's units.{kind} ({', '.join(UNITS[kind])})"
+            f"{where}: columns {listed}: unknown {kind} unit{hint}; state it in the header (for example "
+            f"{names[0]}_{next(iter(UNITS[kind]))}) or as units.{kind} in the recording ({', '.join(UNITS[kind])})"
         )
     return UNITS[kind][unit]
 
@@ -157,8 +157,8 @@ def scale_of(
 # column names without their unit, in order of preference; a name also matches behind a prefix ("tool_timestamp")
 _TIMES: tuple[str, ...] = ("header_stamp", "timestamp", "time_stamp", "stamp", "time", "t", "elapsed")
 _TIMES += ("secs", "sec", "seconds", "__time")
-_Given = Mapping[str, Sequence[str]]  # columns by what they mean
-_NOTHING: _Given = MappingProxyType({})
+_NamedColumns = Mapping[str, Sequence[str]]  # columns by what they mean
+_NOTHING: _NamedColumns = MappingProxyType({})
 _Choices = list[tuple[bool, list[str]]]  # (may all stand behind one prefix, names)
 
 
@@ -182,17 +182,17 @@ _ROS = re.compile(r"(^|[._/])(pose|transform|transforms\d*)[._/]")
 
 
 def recognise_time(header: Sequence[str]) -> RecognisedColumns:
-    """The column of times."""
+    """Return the column of times."""
     plain, whole = _by_plain_name(header, "time"), {_plain(name): name for name in header}
     # `header.stamp.sec` reads as a stamp in seconds next to its nanoseconds
     seconds = [name for name in whole if name.endswith(("stamp_sec", "stamp_secs"))]
     fraction = [name for name in whole if name.endswith(("stamp_nanosec", "stamp_nsec", "stamp_nsecs"))]
     if len(seconds) == len(fraction) == 1:
         return RecognisedColumns(time=(whole[seconds[0]], whole[fraction[0]]))
-    for wanted in _TIMES:
-        behind = [name for name in plain if len(wanted) > 1 and name.endswith("_" + wanted)]
-        if wanted in plain or len(behind) == 1:
-            column = plain[wanted if wanted in plain else behind[0]]
+    for candidate in _TIMES:
+        prefixed = [name for name in plain if len(candidate) > 1 and name.endswith("_" + candidate)]
+        if candidate in plain or len(prefixed) == 1:
+            column = plain[candidate if candidate in plain else prefixed[0]]
             break
     else:
         frames = [name for name in header if _plain(name) in ("frame", "frame_number", "frame_id", "frame_no")]
@@ -203,9 +203,9 @@ def recognise_time(header: Sequence[str]) -> RecognisedColumns:
     return RecognisedColumns(time=(column,), time_unit="ns" if ros else "s" if spelled_out else None)
 
 
-def recognise_pose(header: Sequence[str], named: _Given = _NOTHING) -> RecognisedColumns:
-    """The columns of time, position and rotation in a log of poses, none of them for two things. named: the columns of
-    those that the recording names, by meaning: these are not looked for."""
+def recognise_pose(header: Sequence[str], named: _NamedColumns = _NOTHING) -> RecognisedColumns:
+    """Return the columns of time, position and rotation in a pose log, each with one meaning. named: columns that the
+    recording names, by meaning, which are not searched."""
     free = _left(header, named)
     when = RecognisedColumns() if "time" in named else recognise_time(free)
     free = [name for name in free if name not in (when.time or ())]
@@ -217,7 +217,7 @@ def recognise_pose(header: Sequence[str], named: _Given = _NOTHING) -> Recognise
     if "position" not in named and not (matrix and len(matrix) > 9):
         position = _group(free, _POSITIONS, "length", "position", unclear)
     if shared := [name for name in position or () if name in (rotation or ())]:
-        why = f"{', '.join(shared)} may be the position's or the quaternion's; name both under columns"
+        why = f"{', '.join(shared)} may belong to the position or the quaternion; name both under columns"
         unclear |= {"position": why, "rotation": why}
         position = rotation = form = None
     lower = [_plain(name) for name in header]
@@ -232,8 +232,8 @@ def recognise_pose(header: Sequence[str], named: _Given = _NOTHING) -> Recognise
 
 
 def pose_bodies(header: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Return the columns of every body that has a position, by the body's name: the words that distinguish the columns'
-    prefixes, or all before `pose` and the like; "" for one body without a prefix."""
+    """Return the columns of every body that has a position, by the body's name: the words that distinguish the column
+    prefixes, or the words before `pose` and similar; "" for one body without a prefix."""
     plain = _by_plain_name(header, "length")
     _, prefixes = _first_choice(plain, _POSITIONS)
     if prefixes == [""]:
@@ -249,8 +249,8 @@ def pose_bodies(header: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def _first_choice(plain: Mapping[str, str], choices: _Choices) -> tuple[list[str], list[str]]:
-    """Return the first choice of names that is there, and the prefixes behind which all of them stand: [""] where they
-    have none."""
+    """Return the first choice of names that is complete, and the prefixes under which it occurs: [""] without a
+    prefix."""
     for prefixed, names in choices:
         if all(name in plain for name in names):
             return names, [""]
@@ -260,8 +260,8 @@ def _first_choice(plain: Mapping[str, str], choices: _Choices) -> tuple[list[str
     return [], []
 
 
-def recognise_value(header: Sequence[str], named: _Given = _NOTHING) -> tuple[str | None, RecognisedColumns]:
-    """Return the only column, besides time, that can be a joint's reading; None without one, or with several. named: as
+def recognise_value(header: Sequence[str], named: _NamedColumns = _NOTHING) -> tuple[str | None, RecognisedColumns]:
+    """Return the only column, besides time, that can be a joint reading; None if there is none or several. named: as
     for `recognise_pose`."""
     header = _left(header, named)
     when = RecognisedColumns() if "time" in named else recognise_time(header)
@@ -272,8 +272,8 @@ def recognise_value(header: Sequence[str], named: _Given = _NOTHING) -> tuple[st
 
 
 def joint_columns(header: Sequence[str], bodies: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return the columns of a table of poses that are named like readings of joints and belong to no pose of its
-    `bodies` (`pose_bodies`), whose own names do not count: `gripper_vx` is none."""
+    """Return the columns of a pose table that are named like joint readings and belong to no pose of its `bodies`
+    (`pose_bodies`). The names of the bodies are ignored: `gripper_vx` is not a joint reading."""
     posing: set[str] = set()
     for columns in bodies.values():
         pose, words = recognise_pose(columns), [_plain(name).split("_") for name in columns]
@@ -283,14 +283,14 @@ def joint_columns(header: Sequence[str], bodies: Mapping[str, Sequence[str]]) ->
     return [name for name in header if _JOINT.search(name) and name not in posing]
 
 
-def _left(header: Sequence[str], named: _Given) -> list[str]:
-    """Return the columns without a meaning so far."""
+def _left(header: Sequence[str], named: _NamedColumns) -> list[str]:
+    """Return the columns that have no meaning yet."""
     taken = {name for names in named.values() for name in names}
     return [name for name in header if name not in taken]
 
 
 def quaternion_form(names: Sequence[str]) -> str | None:
-    """Return the form of four columns by the order of their names, w x y z or x y z w; None when they do not say."""
+    """Return the quaternion order of four columns by their names, w x y z or x y z w; None if unclear."""
     last = "".join(_plain(name)[-1:] for name in names)
     if last == "wxyz" or (last[1:] == "xyz" and _plain(names[0]).endswith("q0")):
         return QUATERNION_WXYZ
@@ -298,13 +298,13 @@ def quaternion_form(names: Sequence[str]) -> str | None:
 
 
 def _plain(name: str) -> str:
-    """Return a name in small letters, its words joined by _, without the number of columns of one name."""
+    """Return a name in lower case, its words joined by _, without the number of a repeated column."""
     name = re.sub(r"\s*#\d*$", "", name)
     return re.sub(r"[.\s/:\-]+", "_", name.strip().lower()).strip("%_" if name[:2] != "__" else "")
 
 
 def _by_plain_name(header: Sequence[str], kind: str) -> dict[str, str]:
-    """Columns by their plain names without the unit; of two that are equal, the first."""
+    """Return columns by their plain names without the unit; the first of duplicates."""
     plain: dict[str, str] = {}
     for name in header:
         plain.setdefault(_plain(split_unit(name, kind)[0]), name)
@@ -323,18 +323,18 @@ def _rotation(
     for angles in _EULER_ANGLES:
         if _group(header, [(True, angles)], "angle", "rotation", {}):
             unclear["rotation"] = (
-                f"{', '.join(angles)} have no one meaning; name them under columns.euler with an euler_convention "
+                f"{', '.join(angles)} are ambiguous; name them under columns.euler with an euler_convention "
                 "(or under columns.rotation_vector)"
             )
     if {"q0", "q1", "q2", "q3"} <= {_plain(name) for name in header}:
-        unclear["rotation"] = "q0, q1, q2, q3 come in two orders; name them under columns.quaternion_wxyz or _xyzw"
+        unclear["rotation"] = "the order of q0, q1, q2, q3 is ambiguous; use columns.quaternion_wxyz or _xyzw"
     return None, None
 
 
 def _group(
     header: Sequence[str], choices: _Choices, kind: str, what: str, unclear: dict[str, str]
 ) -> tuple[str, ...] | None:
-    """The columns of the first choice of names that is there, behind one prefix if it may be."""
+    """Return the columns of the first choice of names that is complete, with at most one prefix."""
     plain = _by_plain_name(header, kind)
     names, prefixes = _first_choice(plain, choices)
     if len(prefixes) > 1:

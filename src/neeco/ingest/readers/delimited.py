@@ -24,8 +24,8 @@ from neeco.ingest.readers.columns import TRACKER_CLOCK, UNITS, canonical_unit
 EXPECTED = "CSV with a header line"
 _COMMENT = re.compile(r"^\s*(?:#+|//|%\s)\s*")
 _PORT = re.compile(r"port\b\s*(?P<port>[^:]*?)\s*(?::\s*(?P<name>.*))?$", re.IGNORECASE)
-_NUMBERED = re.compile(r"#\d+$")  # what tells columns of one name apart
-MARKERS = "markers"  # the column behind which those of a tool's markers begin
+_NUMBERED = re.compile(r"#\d+$")  # suffix of repeated column names
+MARKERS = "markers"  # column after which those of a tool's markers begin
 _DECIMAL_COMMA = re.compile(r"[+-]?(?:\d+,\d*|,\d+)(?:[eE][+-]?\d+)?")
 
 
@@ -43,31 +43,31 @@ LIMITS = TextLimits()
 
 
 class DelimitedText(RecordingFormat):
-    """CSV and its relatives. The header is the last line of names before the rows of numbers, or stands there behind a
-    `#`; a line of units beneath it belongs to it. Columns of one name become `Tx`, `Tx#2`, `Tx#3`, or begin with what a
-    line above the header calls each group of them."""
+    """CSV and similar text. The header is the last line of names before the rows of numbers, also behind a `#`; a line
+    of units below it belongs to it. Repeated names become `Tx`, `Tx#2`, `Tx#3`, or get the group names of a line above
+    the header as prefix."""
 
     format = "delimited text"
-    holds = "poses or readings: CSV and its relatives with a header line, exports of NDI's trackers"
+    holds = "poses or readings: CSV and similar text with a header line, exports of NDI's trackers"
     suffixes = DELIMITED
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        """Return the tools of an export of several; () of other tables."""
+        """Return the tools of an export of several tools; () for other tables."""
         *_, lines, tools = _parsed(path)
         return tuple(tool_stream(tool.name, len(lines)) for tool in tools) if len(tools) > 1 else ()
 
     def read(self, path: Path, stream: str | None = None) -> Table:
-        """Return a table; of an export of NDI the columns of one tool, under their plain names, and those that stand
-        before all tools. Raises NeecoError when absent, empty, binary or without a header line."""
+        """Return a table; for an NDI export the columns of one tool, under their plain names, and those before the
+        first tool. Raises NeecoError if the file is missing, empty, binary or without a header line."""
         header, rows, lines, tools = _parsed(path)
         if not tools and stream is not None:
-            raise NeecoError(f"{path}: stream: a table has no streams; leave it out")
+            raise NeecoError(f"{path}: stream: this table has no streams; remove `stream`")
         if not tools:
             return Table(path, header, rows, lines)
-        wanted = None if stream is None else _canonical(stream)
-        meant = next((tool.name for tool in tools if wanted in tool.aliases), stream)
+        alias = None if stream is None else _canonical(stream)
+        tool_name = next((tool.name for tool in tools if alias in tool.aliases), stream)
         streams = [tool_stream(tool.name, len(lines)) for tool in tools]
-        chosen = tools[streams.index(self.choose(path, meant, Kind.POSES, streams=streams))]
+        chosen = tools[streams.index(self.choose(path, tool_name, Kind.POSES, streams=streams))]
         columns = [*range(tools[0].columns.start), *chosen.columns]
         names = tuple(_NUMBERED.sub("", header[index]) for index in columns)
         return Table(path, names, rows[:, columns], lines, stream=chosen.name if len(tools) > 1 else None)
@@ -94,9 +94,9 @@ def _parsed(path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, tuple[
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """The lines of a text that hold anything. cells [N, W]: stripped, "" where a line has fewer; lines [N]: their
-    numbers, from 1; counts [N]: of their own cells; comment [N]: are they behind a `#`, `//` or `% `, which is left
-    out?"""
+    """The non-empty lines of a text. cells [N, W]: stripped, "" where a line has fewer; lines [N]: their numbers, from
+    1; counts [N]: number of cells per line; comment [N]: whether a line begins with `#`, `//` or `% `, which is
+    removed."""
 
     cells: np.ndarray
     lines: np.ndarray
@@ -110,7 +110,7 @@ class Cells:
 
 
 def read_cells(path: Path) -> Cells:
-    """The lines of a text file that hold anything, of which one at least is no comment. Raises NeecoError."""
+    """Return the non-empty lines of a text file. Raises NeecoError if all are comments or the file is unreadable."""
     texts = [(number, text) for number, text in enumerate(_read_text(path).splitlines(), 1) if text.strip(",;\t ")]
     comment = np.array([_COMMENT.match(text) is not None for _, text in texts], dtype=bool)
     if comment.all():
@@ -120,7 +120,7 @@ def read_cells(path: Path) -> Cells:
     try:  # line by line: a quote left open must not swallow the rest of the file
         rows = [line.split() if sign == " " else next(csv.reader([line], delimiter=sign)) for line in lines]
     except csv.Error as error:
-        raise NeecoError(f"{path}: not readable as CSV ({error}); repair it") from None
+        raise NeecoError(f"{path}: cannot be read as CSV ({error}); repair it") from None
     counts = np.array([len(row) for row in rows])
     width = int(counts.max())
     if width > LIMITS.columns:
@@ -139,7 +139,7 @@ def read_cells(path: Path) -> Cells:
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of columns, of which the second of one name becomes `NAME#2`."""
+    """Return column names, of which the second `NAME` becomes `NAME#2`."""
     seen: Counter[str] = Counter()
     unique = []
     for name in names:
@@ -149,7 +149,7 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _header(path: Path, text: Cells) -> tuple[list[str], int]:
-    """The names of the columns, and the line from which the rows are. Raises NeecoError where nothing names them."""
+    """Return the column names, and the first line of the rows. Raises NeecoError if there is no header line."""
     plain = np.flatnonzero(~text.comment)
     sample = plain[len(plain) // 2 :][: LIMITS.sample_lines]
     numeric = np.flatnonzero(np.isfinite(to_numbers(text.cells[sample])).mean(axis=0) > 0.5)
@@ -172,7 +172,7 @@ def _header(path: Path, text: Cells) -> tuple[list[str], int]:
         else:
             units = [""] * len(units)
         names = text.names(place)
-        if higher:  # names of groups, where these tell columns of one name apart
+        if higher:  # names of groups, where they distinguish repeated names
             groups = accumulate(text.cells[higher[-1]].tolist(), lambda last, group: str(group or last))
             joined = ["_".join(filter(None, pair)) for pair in zip(groups, names, strict=False)]
             names = joined if len(set(names)) < len(set(joined)) else names
@@ -183,11 +183,11 @@ def _header(path: Path, text: Cells) -> tuple[list[str], int]:
             return text.names(row), starts[0]
     first_cells, where = printable(",".join(text.names(plain[0]))[:40]), f"{path}: line {text.lines[plain[0]]}"
     rows = f", and the rows of numbers begin at line {text.lines[starts[0]]}" if len(above) else ""
-    raise NeecoError(f"{where} is no header of columns (found {first_cells}){rows}; add a line that names the columns")
+    raise NeecoError(f"{where} is not a header line (found {first_cells}){rows}; add a line with the column names")
 
 
 def _delimiter(lines: Sequence[str]) -> str:
-    """Return the sign between the cells of the rows, which are most of the second half of a file."""
+    """Return the delimiter of the rows, by the second half of the file."""
     rows = lines[len(lines) // 2 :][: LIMITS.sample_lines]
     for delimiter in "\t;":  # before commas, which may be those of decimals then
         count, n_similar = Counter(row.count(delimiter) for row in rows).most_common(1)[0]
@@ -198,7 +198,7 @@ def _delimiter(lines: Sequence[str]) -> str:
 
 
 def _read_text(path: Path) -> str:
-    """A text file in UTF-8, UTF-16 with its mark, or Latin-1."""
+    """Return a text file in UTF-8, UTF-16 with a byte order mark, or Latin-1."""
     content = read_bytes(path, EXPECTED)
     is_utf16 = content[:2] in (b"\xff\xfe", b"\xfe\xff")
     try:
@@ -212,7 +212,7 @@ def _read_text(path: Path) -> str:
 
 @dataclass(frozen=True)
 class _Tool:
-    """A tool of an export of NDI. columns: by index; aliases: the words that mean it and no other."""
+    """A tool of an NDI export. columns: by index; aliases: names that identify this tool alone."""
 
     name: str
     columns: range
@@ -220,8 +220,8 @@ class _Tool:
 
 
 def _find_tools(header: Sequence[str], rows: np.ndarray) -> tuple[_Tool, ...]:
-    """Return NDI's tools: the columns of each from its `Port` to its markers; named by name or serial number, else by
-    port, where that is no other's."""
+    """Return NDI's tools: the columns of each from its `Port` to its markers, named by the first unique one of name,
+    serial number and port."""
     plain = [_NUMBERED.sub("", name).strip() for name in header]
     starts = [index for index, name in enumerate(plain) if _PORT.match(name)]
     tools: list[tuple[range, list[str]]] = []
@@ -242,7 +242,7 @@ def _find_tools(header: Sequence[str], rows: np.ndarray) -> tuple[_Tool, ...]:
 
 
 def _canonical(name: str) -> str:
-    """A name in small letters; of a number, as ports have in several spellings, its value."""
+    """Return a name in lower case; for a port number in any notation, its value."""
     text = re.sub(r"^port\s*", "", name.strip().lower())
     try:
         return str(int(text, 16 if text.startswith("0x") else 10))

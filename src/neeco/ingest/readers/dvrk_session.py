@@ -1,4 +1,4 @@
-"""Sessions of the dVRK's data_collection: videos with the time of every frame, and topics in a bag.
+"""Sessions of the dVRK's data_collection: videos with a time per frame, and topics in a bag.
 
 A session is a folder with `index.json`, videos, next to each a JSON file with its frames' times, and a bag. Both count
 Unix time.
@@ -23,8 +23,8 @@ from neeco.ingest.readers.rosbag import RosBag
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
 INDEX, TYPES = "index.json", ("dc_index_v1", "dc::index@", "dvrk_data:index@")
-UNLIKE = 0.02  # share by which a video's frames and their times may differ in number
-NO_BAG = "rosbags: names no bag that is there; put the session's bag, which holds its topics, next to it"
+UNLIKE = 0.02  # relative tolerance between the numbers of a video's frames and of their times
+NO_BAG = "rosbags: the session's bag does not exist; put it, with its topics, next to index.json"
 HALVES = {"LR": ("left", "right"), "RL": ("right", "left")}  # what the halves of a video show, from the left on
 
 
@@ -38,8 +38,8 @@ class _Film:
 
 
 class DvrkSession(RecordingFormat):
-    """A stream is a topic of the bag, or a video by its name, with `.left` and `.right` where it shows both. Times
-    count from the first image on."""
+    """A stream is a topic of the bag, or a video by its name, with `.left` and `.right` if it shows both. Times start
+    at the first image."""
 
     format = "dVRK data_collection"
     holds = "videos with times, poses and joints by topic: folders of a session with its bag"
@@ -77,10 +77,10 @@ class DvrkSession(RecordingFormat):
             raise NeecoError(why)
         name = self.choose(path, stream, Kind.IMAGES).name
         if name not in films:
-            raise NeecoError(f"{path}: stream: {printable(name)} is in the bag; name the bag as the video's file")
+            raise NeecoError(f"{path}: stream: {printable(name)} is in the bag; give the bag as the video's file")
         film, times = films[name], films[name].times - _start(path)
         keep = np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0
-        early = f"{name}: {int((~keep).sum())} frames are no later than the one before; left out"
+        early = f"{name}: {int((~keep).sum())} frames left out: their times do not increase"
         video = open_video(film.file)
         notes = (() if keep.all() else (early,)) + compare_counts(
             film.file, len(video.times), len(times), "times", UNLIKE
@@ -95,7 +95,7 @@ class DvrkSession(RecordingFormat):
 
 
 def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:
-    """A session's videos by stream, and why others cannot be used."""
+    """Return a session's videos by stream, and why others cannot be used."""
     document = read_json(path / INDEX)
     videos = [video for entry in [document, *_list(document, "streams")] for video in _list(entry, "videos")]
     names = [video.get("file") for video in videos if isinstance(video, dict)]
@@ -103,7 +103,7 @@ def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:
     absent: dict[str, str] = {}
     for file in (path / str(name) for name in names if str(name).lower().endswith(".mp4") and _is_plain(name)):
         if not file.is_file():
-            absent[file.stem] = f"{path / INDEX}: videos: {printable(file.name)} is not there; put it next to {INDEX}"
+            absent[file.stem] = f"{path / INDEX}: videos: {printable(file.name)} is missing; put it next to {INDEX}"
             continue
         try:
             times, layout = _frame_times(file.with_suffix(".json"))
@@ -122,7 +122,7 @@ def _is_plain(name: Any) -> bool:
 
 
 def _frame_times(sidecar: Path) -> tuple[np.ndarray, str]:
-    """Unix times [N] s of a video's frames, less the camera's latency, and how it shows two cameras."""
+    """Return Unix times [N] s of a video's frames, minus the camera's latency, and its layout of two cameras."""
     document = read_json(sidecar)
     frames = _list(document, "frames")
     stamps = _list(document, "timestamps_ns") or [_entry(frame, "cpu_ts") for frame in frames]
@@ -144,12 +144,12 @@ def _list(document: Any, name: str) -> list[Any]:
 
 
 def _start(path: Path) -> float:
-    """Unix time s from which the times of all streams count: the first image's, else 0."""
+    """Return the time origin of all streams, Unix s: the first image's time, else 0."""
     return min((float(film.times[0]) for film in _films(path)[0].values()), default=0.0)
 
 
 def _bag(path: Path) -> Path | None:
-    """The session's bag, where it is there."""
+    """Return the session's bag, None if it does not exist."""
     document = read_json(path / INDEX)
     name = _entry(document, "rosbags") or _entry(document, "rosbag")
     name = _entry(name, "name") or name

@@ -1,11 +1,11 @@
 """Poses and readings at any time, from noisy logs: robust local regression (LOESS, Cleveland 1979), never across a gap.
 
 At each time a quadratic is fitted to the samples around it, weighted by nearness (tricube) and by their residuals
-(bisquare). Rotations are fitted as sign-continuous quaternions, which are normalised then. The window's width is the
-one that best predicts each sample from its neighbours. Where a cubic through the four samples around predicts better
-than any window, motion between samples exceeds their noise, as in logs of few samples a second. Then nothing is
+(bisquare). Rotations are fitted as sign-continuous quaternions, then normalised. The window width minimises the
+leave-one-out prediction error. If a cubic through the four nearest samples predicts better than any window, motion
+between samples exceeds their noise, as in logs with a low sampling rate. Then nothing is
 smoothed.
-SciPy's smoothing splines with robust weights are as exact on positions, but up to 28 % worse on rotations.
+SciPy's smoothing splines with robust weights are as accurate on positions, but up to 28 % worse on rotations.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from neeco.ingest.readers.logs import PoseLog, ReadingLog, SampleLog
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothingSettings:
-    """Choice of the windows, and the robust fit within one."""
+    """Choice of the window widths, and the robust fit within a window."""
 
     widths: tuple[float, ...] = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)  # half windows tried, in median steps
     max_width_s: float = 1.0
@@ -40,16 +40,16 @@ SETTINGS = SmoothingSettings()
 
 @dataclass(frozen=True)
 class Smoothing:
-    """Half widths s of the windows for positions (or readings) and rotations; 0: through the samples."""
+    """Half widths s of the windows for positions (or readings) and rotations; 0: interpolation."""
 
     position_s: float
     rotation_s: float
 
 
 def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses [N, 4, 4] (mm) at times [N] on the log's clock, and bool [N] where the log has any.
+    """Return poses [N, 4, 4] (mm) at times [N] on the log's clock, and bool [N] whether the log covers them.
 
-    smooth_s: half width of the window, s; None: by the log's own noise (`pose_smoothing`); 0: through the samples.
+    smooth_s: half width of the window, s; None: by the log's own noise (`pose_smoothing`); 0: interpolation.
     Outside the log and inside its gaps poses are NaN.
     """
     times = np.asarray(times, dtype=np.float64)
@@ -66,7 +66,7 @@ def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> 
 
 
 def readings_at(log: ReadingLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return readings [N] rad at times [N] on the log's clock, and bool [N] where the log has any; see `poses_at`."""
+    """Return readings [N] rad at times [N] on the log's clock, and bool [N] whether it covers them; see `poses_at`."""
     times = np.asarray(times, dtype=np.float64)
     width = reading_smoothing(log) if smooth_s is None else smooth_s
     series = _Series(log, log.values[:, None])
@@ -89,7 +89,7 @@ def reading_smoothing(log: ReadingLog) -> float:
 
 
 class _Series:
-    """Samples [T, D] of a log, in stretches without gaps."""
+    """Samples [T, D] of a log, split into segments without gaps."""
 
     def __init__(self, log: SampleLog, values: np.ndarray) -> None:
         self.times, self.values = log.times, values
@@ -102,22 +102,22 @@ class _Series:
         self.step = float(np.median(np.diff(self.times)))
 
     def covers(self, times: np.ndarray) -> np.ndarray:
-        """Whether each of times [N] lies within a stretch."""
+        """Return whether each of times [N] lies within a segment."""
         left, right = self._around(times)
         inside = (times >= self.times[0]) & (times <= self.times[-1])
         exact = (self.times[left] == times) | (self.times[right] == times)
         return inside & (exact | (self.stretch[left] == self.stretch[right]))
 
     def fit(self, times: np.ndarray, width: float, leave_out: np.ndarray | None = None) -> np.ndarray:
-        """Return values [N, D] at covered times [N]: local quadratics of half width `width` s where that has enough
-        samples, linear elsewhere; without a width, cubics through the two samples on each side where there are so many.
+        """Return values [N, D] at covered times [N]: local quadratics of half width `width` s where the window has
+        enough samples, linear elsewhere; for width 0, cubics through two samples on each side where available.
         leave_out [N]: a sample per time that is not used."""
         left, right = self._around(times) if leave_out is None else (leave_out - 1, leave_out + 1)
         span = self.times[right] - self.times[left]
         share = np.where(span > 0, (times - self.times[left]) / np.where(span > 0, span, 1), 0.0)
         if not len(times):
             return np.zeros((0, self.values.shape[1]))
-        start = self.values[left]  # of which differences are fitted: what never changes stays to the last digit
+        start = self.values[left]  # differences from it are fitted, so that constant values stay exact
         result = np.asarray(start + share[:, None] * (self.values[right] - start))
         if width == 0:
             outer = np.stack([left - 1, left, right, right + 1], axis=-1)  # [N, 4]
@@ -135,7 +135,7 @@ class _Series:
     def best_width(self) -> float:
         """Return the half width s with the smallest prediction errors."""
         inner = np.arange(len(self.times))
-        inner = inner[(inner > self.first) & (inner < self.last - 1)]  # never the end of a stretch
+        inner = inner[(inner > self.first) & (inner < self.last - 1)]  # without the ends of segments
         if not len(inner):
             return 0.0
         chosen = inner[evenly_spaced(len(inner), SETTINGS.validated, floor=True)]
@@ -143,7 +143,7 @@ class _Series:
         widths = [0.0, first, *(width for width in wider if width <= SETTINGS.max_width_s)]
         fitted = [self.fit(self.times[chosen], width, chosen) for width in widths]
         errors = [np.linalg.norm(values - self.values[chosen], axis=1) for values in fitted]
-        # outliers do not count for one width or another
+        # errors are capped, so that outliers do not affect the choice
         limit = 5 * max(float(np.median(errors[0])), 1e-12)
         scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in errors]
         return widths[int(np.argmin(scores))]
@@ -151,16 +151,16 @@ class _Series:
     def _windows(
         self, times: np.ndarray, width: float, leave_out: np.ndarray | None
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield times with enough samples within `width`, in chunks: rows [N], their samples [N, K], bool [N, K] of
-        those in use, and their offsets [N, K] in half widths."""
+        """Yield times with enough samples within `width`, in chunks: rows [N], their samples [N, K], bool [N, K]
+        whether a sample is used, and offsets [N, K] in half widths."""
         size = max(int(SETTINGS.chunk / max(2 * width / self.step, 8)), 1)
         for start in range(0, len(times), size):
             rows = np.arange(start, min(start + size, len(times)))
-            near = times[rows]
-            left, right = self._around(near)
-            home = np.where(self.times[right] == near, right, left)
-            low = np.maximum(np.searchsorted(self.times, near - width), self.first[home])
-            high = np.minimum(np.searchsorted(self.times, near + width, side="right"), self.last[home])
+            centers = times[rows]
+            left, right = self._around(centers)
+            nearest = np.where(self.times[right] == centers, right, left)
+            low = np.maximum(np.searchsorted(self.times, centers - width), self.first[nearest])
+            high = np.minimum(np.searchsorted(self.times, centers + width, side="right"), self.last[nearest])
             index = low[:, None] + np.arange(max(int((high - low).max(initial=0)), 1))
             index, used = np.minimum(index, len(self.times) - 1), index < high[:, None]
             if leave_out is not None:
@@ -171,7 +171,7 @@ class _Series:
                 yield rows, index, used, (self.times[index] - times[rows, None]) / width
 
     def _around(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Samples before and after each time [N] (twice the same where one is at it)."""
+        """Return the samples before and after each time [N] (the same sample twice at its own time)."""
         right = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
         left = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
         return left, right
@@ -181,11 +181,11 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
     """Return the value [N, D] at offset 0 of quadratics through values [N, K, D] at offsets [N, K] in [-1, 1]."""
     near = used * _tricube(offsets)
     powers = np.stack([np.ones_like(offsets), offsets, offsets**2], axis=-1)  # [N, K, 3]
-    # with few samples the curvature is held at 0; the rest only keeps the equations solvable
+    # the large ridge fixes the curvature at 0 for few samples; the small ones keep the equations solvable
     ridge = np.zeros((len(offsets), 3))
     ridge[:, 1] = 1e-9
     ridge[:, 2] = np.where(used.sum(axis=1) < SETTINGS.min_for_curvature, 1e6, 1e-9)
-    # start from what the middle of the window says, so that an outlier does not bend the first fit
+    # initial weights from the window's median, so that an outlier does not bias the first fit
     axis_first = np.moveaxis(values, -1, 0)  # [D, N, K]
     middle = np.moveaxis(_median(axis_first, np.broadcast_to(used, axis_first.shape)), 0, -1)[:, None]
     residuals = np.linalg.norm(values - middle, axis=-1)
@@ -202,14 +202,14 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
         residuals = np.linalg.norm(values - powers @ coefficients, axis=-1)
         scale = np.maximum(1.48 * _median(residuals, used) / axes, noise)
         weights = near * np.clip(1 - (residuals / (SETTINGS.cutoff_sd * axes * scale[:, None])) ** 2, 0, None) ** 2
-        # where too few samples are left, all count
+        # if too few samples remain, all are used
         too_few = (weights > 0).sum(axis=1) < SETTINGS.min_samples
         weights[too_few] = near[too_few]
     return coefficients[:, 0]
 
 
 def _lagrange(samples: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Weights [N, K] of values at samples [N, K] s in the polynomial through them, at times [N] s."""
+    """Lagrange weights [N, K] of values at samples [N, K] s, for times [N] s."""
     off_diagonal = ~np.eye(samples.shape[1], dtype=bool)
     steps = np.where(off_diagonal, samples[:, :, None] - samples[:, None], 1)
     return np.asarray(np.where(off_diagonal, (times[:, None] - samples)[:, None] / steps, 1).prod(axis=-1))

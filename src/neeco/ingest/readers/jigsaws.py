@@ -1,8 +1,8 @@
 """Kinematics of JIGSAWS: text of 76 columns without a header, one row per image of its 30 Hz video.
 
-Masters and slaves, each left and right, have 19 columns: the tool tip's place (m), its rotation matrix row by row,
-velocity, angular velocity, and the gripper's angle (rad). Every arm is in the frame of its own base, so two arms do not
-share one.
+Masters and slaves, each left and right, have 19 columns: the tool tip's position (m), its rotation matrix row by row,
+velocity, angular velocity, and the gripper's angle (rad). Every arm is expressed in the frame of its own base; the arms
+do not share a frame.
 
 The layout is that of the data set's readme (Gao et al. 2014, "The JHU-ISI Gesture and Skill Assessment Working Set").
 """
@@ -29,7 +29,7 @@ USED = (*range(12), 18)  # of an arm's columns; its velocities follow from them
 
 
 class JigsawsKinematics(RecordingFormat):
-    """A stream is an arm; those at the patient are the slaves."""
+    """A stream is an arm; the slaves are the patient-side arms."""
 
     format = "JIGSAWS kinematics"
     holds = "poses and gripper angles of the arms: text of 76 columns without a header"
@@ -52,7 +52,7 @@ class JigsawsKinematics(RecordingFormat):
                 body=arm.replace(" ", "_"),
                 joints=(("gripper_angle", GRIPPER),),
                 clock=VIDEO_CLOCK,
-                hints=("poses are stated in the frame of this arm's own base",),
+                hints=("poses are expressed in the frame of this arm's own base",),
             )
             for arm in ARMS
         )
@@ -62,8 +62,8 @@ class JigsawsKinematics(RecordingFormat):
         values, lines = _lines(path)
         bad = np.isnan(values).any(axis=1)
         if bad.any():
-            problem = f"has not {COLUMNS * len(ARMS)} numbers"
-            raise NeecoError(f"{path}: line {lines[bad][0]}: {problem}; repair it, or cut the file there")
+            problem = f"expected {COLUMNS * len(ARMS)} numbers"
+            raise NeecoError(f"{path}: line {lines[bad][0]}: {problem}; repair the line, or truncate the file there")
         used = [COLUMNS * ARMS.index(arm) + index for index in USED]
         rows = np.column_stack([np.arange(len(values)) / RATE_HZ, values[:, used]])
         return Table(path, HEADER, rows, lines, stream=arm, meaning=NamedFrame(BASE), image_hz=RATE_HZ)
@@ -71,7 +71,7 @@ class JigsawsKinematics(RecordingFormat):
 
 @read_once
 def _lines(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return numbers [R, 76], NaN in lines that have not as many, and the lines [R] that they stand in."""
+    """Return numbers [R, 76], NaN in lines with another number of cells, and their line numbers [R]."""
     text, count = read_cells(path), COLUMNS * len(ARMS)
     values = np.full((len(text.lines), count), np.nan)
     whole = text.counts == count

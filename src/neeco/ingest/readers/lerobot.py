@@ -1,8 +1,8 @@
 """LeRobot data sets, versions 2.0, 2.1 and 3.0: an episode's states as tables, and its cameras' images.
 
-A stream is a feature of an episode: `episode 3/observation.state`. Row i of an episode belongs to its image i: both
-have the row's `timestamp`, in s from the episode's first. Nothing in the format says the unit of a length, the order of
-a quaternion or the frame that poses are stated in; where the columns' names do not, the recording must.
+A stream is a feature of an episode: `episode 3/observation.state`. Row i of an episode corresponds to its image i: both
+have the row's `timestamp`, in s from the episode's first. The format defines neither length unit, quaternion order nor
+the frame of poses; if the column names do not state them, the recording must.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from neeco.ingest.readers.lerobot_files import FIXED, LIMITS, DataSet, Episode, 
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
 TIME = "timestamp_s"
-UNNAMED = "instrument"  # what a body is called that nothing names
-STORED = "stands in the table, image by image, which is not read; write the data set with videos"
+UNNAMED = "instrument"  # default name of a body
+STORED = "is stored as single images in the table, which is not supported; write the data set with videos"
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*/\s*(\S+)\s*", re.IGNORECASE)
 
 
@@ -40,7 +40,7 @@ class LeRobot(RecordingFormat):
         return b'"codebase_version"' in read_head(path / "meta" / "info.json", 2**20)
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
-        """Return those of the first episode that was downloaded; all others have the same."""
+        """Return the streams of the first downloaded episode; all episodes have the same."""
         data = self._data_set(path)
         episode, images, tables = data.first_present(), list[Stream](), list[Stream]()
         absent = data.absent(episode) | {key: STORED for key, each in data.features.items() if each.dtype == "image"}
@@ -76,17 +76,17 @@ class LeRobot(RecordingFormat):
         if key in episode.absent:
             raise NeecoError(episode.absent[key])
         film, part = episode.films[key]
-        count = int(places[-1]) + 1  # images that the states belong to, and those between
-        if part is not None and count > len(places):  # the part was counted without the rows that were removed
+        count = int(places[-1]) + 1  # images from the first to the last state
+        if part is not None and count > len(places):  # the part's end ignores removed rows
             part = part[0], max(part[1], part[0] + count / data.fps)
         video = open_video(film, part=part)
-        # the episode's frame of each of the video's, in which those that cannot be decoded are missing
+        # frame number in the episode of each decoded frame; undecodable frames are missing
         numbers = np.rint(video.times / float(np.median(np.diff(video.times)))).astype(np.int64)
         n_images = int(numbers[-1]) + 1
         noun, remedy = f"states of episode {episode.number}", "download the data set again, or name another episode"
         if count > len(times):
-            notes = (*notes, f"{film.name}: by timestamps, not all images have {noun}; the others are left out")
-            noun, n_images = f"that the timestamps of episode {episode.number} reach", min(n_images, count)
+            notes = (*notes, f"{film.name}: images without {noun} at their timestamp are left out")
+            noun, n_images = f"frames by the timestamps of episode {episode.number}", min(n_images, count)
         notes = (*notes, *compare_counts(film, n_images, count, noun, remedy=remedy), *video.notes)
         row = np.full(max(int(numbers[-1]) + 1, count), -1)
         row[places] = np.arange(len(times))
@@ -110,10 +110,10 @@ class LeRobot(RecordingFormat):
         return read_data_set(path)
 
     def _chosen(self, data: DataSet, stream: str | None, *kinds: Kind) -> tuple[Episode, str]:
-        """Return the episode and the feature that a stream names; the only ones there are where none is named."""
+        """Return the episode and feature of a stream; the only ones if `stream` is None."""
         match = _NAME.fullmatch(stream or "")
         number = int(match[1]) if match else min(data.records)
-        wanted = f"episode {number}/{match[2]}" if match else stream
+        name = f"episode {number}/{match[2]}" if match else stream
         streams = [
             Stream(
                 f"episode {number}/{key}", _kind(each), each.dtype, 0, problem=STORED if each.dtype == "image" else None
@@ -122,16 +122,16 @@ class LeRobot(RecordingFormat):
         ]
         if stream is None and len(data.records) > 1:
             examples = ", ".join(candidate.name for candidate in streams if candidate.kind in kinds)[:300]
-            problem = f"missing, and there are {data.range_words}; name one, as in {examples}"
+            problem = f"required, because the data set has {data.range_words}; choose one, for example {examples}"
             raise NeecoError(f"{data.path}: stream: {problem}")
-        key = self.choose(data.path, wanted, *kinds, streams=streams).name.partition("/")[2]
+        key = self.choose(data.path, name, *kinds, streams=streams).name.partition("/")[2]
         return data.episode(number), key
 
 
 def _bodies(feature: Feature, stream: Stream) -> list[Stream]:
-    """Return a stream for every body that the names of a feature's columns distinguish."""
+    """Return a stream for every body distinguished by the names of a feature's columns."""
     plain = replace(stream, offered=False)
-    if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
+    if not feature.key.startswith(("observation", "state")):  # an action is a command, not a measurement
         return [plain]
     bodies = named.pose_bodies(feature.names)
     readings, streams = named.joint_columns(feature.names, bodies), []
@@ -148,24 +148,24 @@ def _bodies(feature: Feature, stream: Stream) -> list[Stream]:
 
 
 def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return times [R] s of an episode's rows from the first on, the rows of its file in their order, the number of
-    each row's image in its film: the one nearest to its timestamp where no two share one, and notes."""
+    """Return times [R] s of an episode's rows from the first, the order of its file's rows, the image number of each
+    row in its film (the image nearest to the timestamp, if these are distinct), and notes."""
     table = data.columns(episode, {"timestamp": 1, "frame_index": 1})
     order = np.argsort(table["frame_index"][:, 0], kind="stable")
     frames, stamps = table["frame_index"][order, 0], table["timestamp"][order, 0]
     if len(frames) != episode.length:
-        problem = f"has {len(frames)} rows of episode {episode.number}, meta says {episode.length}"
+        problem = f"has {len(frames)} rows of episode {episode.number}, meta states {episode.length}"
         raise NeecoError(f"{episode.data}: {problem}; download the data set again")
     rows = np.arange(len(frames))
     if not np.array_equal(frames, rows):
-        raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")
+        raise NeecoError(f"{episode.data}: frame_index: must count from 0 in episode {episode.number}; repair it")
     title = f"{data.path.name}: episode {episode.number}: its timestamps"
     if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()):
-        return frames / data.fps, order, rows, (f"{title} do not increase; taken as {data.fps:g} a second",)
+        return frames / data.fps, order, rows, (f"{title} do not increase; {data.fps:g} Hz is assumed",)
     places = np.rint(stamps * data.fps)
     if (np.diff(places) > 0).all() and places[0] >= 0 and places[-1] < LIMITS.film_images:
         return stamps - stamps[0], order, places.astype(np.int64), ()
-    return stamps - stamps[0], order, rows, (f"{title} name no images; state i is taken to be of image i",)
+    return stamps - stamps[0], order, rows, (f"{title} match no image numbers; state i is assigned to image i",)
 
 
 def _kind(feature: Feature) -> Kind:
@@ -175,12 +175,12 @@ def _kind(feature: Feature) -> Kind:
 
 
 def _meaning(key: str, columns: Sequence[str]) -> NamedFrame:
-    """Return the meaning of the frame in a feature's name, or in those of all its columns."""
+    """Return the meaning of the frame in a feature's name, or in the names of all its columns."""
     dvrk = of_dvrk(key, *columns)
     return meaning_in([key], dvrk=dvrk) or meaning_in(columns, dvrk=dvrk) or unsaid(dvrk=dvrk)
 
 
 def _joint_name(column: str, body: str) -> str:
     """Return `jaw` of `psm1_jaw`, without the unit."""
-    words = [word for word in re.split(r"[_.\-/]+", named.split_unit(column, "angle")[0]) if word and word != body]
-    return "_".join(words) or column
+    parts = [part for part in re.split(r"[_.\-/]+", named.split_unit(column, "angle")[0]) if part and part != body]
+    return "_".join(parts) or column

@@ -42,12 +42,12 @@ LIMITS = LeRobotLimits()
 
 
 class _NotThere(NeecoError):
-    """A file or its description is missing, as where a data set was downloaded in part."""
+    """A file or its description is missing, as after a partial download."""
 
 
 @dataclass(frozen=True)
 class Feature:
-    """One column of a data set. names: of a vector's or matrix's numbers, all different; () for images and text."""
+    """One column of a data set. names: unique names of a vector's or matrix's numbers; () for images and text."""
 
     key: str
     dtype: str
@@ -58,8 +58,8 @@ class Feature:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode: its number, how many rows it has, and its files; films: the file of each camera's images, and the
-    part of it (s, None: all); absent: cameras whose file is not there, and why in words."""
+    """One episode: its number, number of rows, and files; films: the video file of each camera, and the episode's part
+    of it (s, None: all); absent: cameras whose file is missing, with the reason."""
 
     number: int
     length: int
@@ -70,8 +70,8 @@ class Episode:
 
 @dataclass(frozen=True, kw_only=True)
 class DataSet:
-    """A data set: its folder, the first number of its version, frames a second, features, names of files, and what is
-    stated of each episode, by its number."""
+    """A data set: its folder, major version, frame rate, features, file name templates, and the record of each episode,
+    by its number."""
 
     path: Path
     version: int
@@ -104,10 +104,10 @@ class DataSet:
         raise problems[0]
 
     def episode(self, number: int) -> Episode:
-        """Return one episode. Raises NeecoError when it is not there."""
+        """Return one episode. Raises NeecoError if it does not exist."""
         record = self.records.get(number)
         if record is None:
-            raise NeecoError(f"{self.path}: holds no episode {number}; there are {self.range_words}")
+            raise NeecoError(f"{self.path}: has no episode {number}; choose one of {self.range_words}")
         place: dict[str, Any] = {"episode_chunk": number // self.chunks_size, "episode_index": number}
         if self.version == 3:
             place = {name: record.get(f"data/{name}") for name in ("chunk_index", "file_index")}
@@ -120,16 +120,16 @@ class DataSet:
         return Episode(number, int(record["length"]), self._file("data_path", place), films, absent)
 
     def _film(self, key: str, record: Record, place: Mapping[str, Any]) -> tuple[Path, tuple[float, float] | None]:
-        """Return the place of one camera's images of an episode. Raises _NotThere, and NeecoError for an impossible
-        one."""
+        """Return the video file and part (s) of one camera's images of an episode. Raises _NotThere, and NeecoError for
+        an invalid part."""
         if self.version == 2:
             return self._file("video_path", {**place, "video_key": key}), None
         of_film = {name: record.get(f"videos/{key}/{name}") for name in FILM_COLUMNS}
         start, end = of_film["from_timestamp"], of_film["to_timestamp"]
         if None in of_film.values() or start is None or end is None:
-            raise _NotThere(f"{self.path / EPISODES_3}: states no images of {printable(key)}; download it again")
+            raise _NotThere(f"{self.path / EPISODES_3}: has no images of {printable(key)}; download it again")
         if not 0 <= start < end < 1e9:  # NaN compares false
-            raise NeecoError(f"{self.path}: {key}: from {start:g} to {end:g} s is no part of a video; correct meta")
+            raise NeecoError(f"{self.path}: {key}: invalid part of a video, {start:g} to {end:g} s; correct meta")
         return self._file("video_path", {**of_film, "video_key": key}), (start, end)
 
     def absent(self, episode: Episode) -> dict[str, str]:
@@ -143,7 +143,7 @@ class DataSet:
         return read_columns(episode.data, {"episode_index": 1, **widths}, episode.number)
 
     def _file(self, field: str, values: Mapping[str, Any]) -> Path:
-        """Return the file that a template of info.json names. Raises NeecoError when it leads out of the data set."""
+        """Return the file of a path template of info.json. Raises NeecoError if it is outside the data set."""
         template = getattr(self, field)
         try:
             name = _FIELD.sub(lambda match: format(values[match[1]], match[2] or ""), template)
@@ -151,15 +151,15 @@ class DataSet:
             name = ""
         parts = PurePosixPath(name)
         if not name or re.search(r"[{}\0\\]", name) or parts.is_absolute() or ".." in parts.parts:
-            problem = f"{printable(template)} is no path inside the data set"
+            problem = f"{printable(template)} is not a path inside the data set"
             raise NeecoError(f"{self.path / INFO}: {field}: {problem}; correct it")
         if not (self.path / parts).is_file():
-            raise _NotThere(f"{self.path / parts}: no such file; download the episode's files, too")
+            raise _NotThere(f"{self.path / parts}: no such file; download all files of the episode")
         return require_inside(self.path / parts, _boundary(self.path))
 
 
 def read_data_set(path: Path) -> DataSet:
-    """Read meta/info.json and the list of episodes, once while they stay the same. Raises NeecoError naming field and
+    """Read meta/info.json and the list of episodes, cached until they change. Raises NeecoError naming field and
     remedy."""
     folder = path / EPISODES_3
     files = [path / INFO, path / EPISODES_2, *(folder.glob("chunk-*/*.parquet") if folder.is_dir() else ())]
@@ -174,7 +174,7 @@ def _described(path: Path, state: tuple[object, ...]) -> DataSet:
         version, features = info.child("codebase_version"), info.child("features")
         match = VERSIONS.fullmatch(str(version.value))
         if match is None:
-            version.fail(f"{printable(version.value)} is not read", "convert the data set to v2.1 or v3.0")
+            version.fail(f"{printable(version.value)} is not supported", "convert the data set to v2.1 or v3.0")
         if not isinstance(features.value, dict) or not features.value:
             features.fail("expected an object of features", "download it again")
         feature_of = {key: _feature(features.child(key), key) for key in features.value}
@@ -184,7 +184,7 @@ def _described(path: Path, state: tuple[object, ...]) -> DataSet:
     films = [key for key, feature in feature_of.items() if feature.dtype == "video"]
     records = _records_3(path, films) if match[2] is not None else _records_2(path)
     if not records:
-        raise NeecoError(f"{path}: holds no episode; download the data set again, with all of meta")
+        raise NeecoError(f"{path}: has no episodes; download the data set again, with all of meta")
     return DataSet(
         path=path,
         version=2 if match[2] is None else 3,
@@ -198,7 +198,7 @@ def _described(path: Path, state: tuple[object, ...]) -> DataSet:
 
 
 def _records_2(path: Path) -> dict[int, Record]:
-    """The length of each episode, by its number."""
+    """Return the length of each episode, by its number."""
     file, records = path / EPISODES_2, dict[int, Record]()
     if file.exists():
         require_inside(file, _boundary(path))
@@ -215,7 +215,7 @@ def _records_2(path: Path) -> dict[int, Record]:
 
 
 def _records_3(path: Path, films: Sequence[str]) -> dict[int, Record]:
-    """The length of each episode, by its number, and the places of its rows and images."""
+    """Return the length of each episode and the files of its rows and images, by its number."""
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
     of_films = [f"videos/{key}/{name}" for key in films for name in FILM_COLUMNS]
     records: dict[int, Record] = {}
@@ -232,7 +232,7 @@ def _records_3(path: Path, films: Sequence[str]) -> dict[int, Record]:
 
 def _count(where: str, value: Any) -> int:
     if type(value) not in (int, float) or not 0 <= value < 1e9 or value != int(value):  # NaN compares false
-        raise NeecoError(f"{where}: is no episode with episode_index and length; download it again")
+        raise NeecoError(f"{where}: expected an episode with episode_index and length; download it again")
     return int(value)
 
 
@@ -242,40 +242,42 @@ def parquet_names(path: Path) -> list[str]:
 
 
 def read_columns(path: Path, widths: Mapping[str, int], episode: int | None = None) -> dict[str, np.ndarray]:
-    """Return columns of numbers, or of lists of them, as float64 [R, C], NaN for null; only the rows of an episode, if
-    given. widths: numbers per row of each. Raises NeecoError."""
+    """Return columns of numbers, or of lists of numbers, as float64 [R, C], NaN for null. episode: only its rows.
+    widths: numbers per row of each column. Raises NeecoError."""
     import pyarrow.dataset
 
     file = _fragment(path)
     if absent := [name for name in widths if name not in file.physical_schema.names]:
         listed = printable(", ".join(file.physical_schema.names), 300).strip("'")
         raise NeecoError(f"{path}: has no column {printable(absent[0])}; its columns are {listed}")
-    wanted = None if episode is None else pyarrow.dataset.field("episode_index") == episode
+    of_episode = None if episode is None else pyarrow.dataset.field("episode_index") == episode
     with one_line(path, *_DAMAGE):
-        part = file if wanted is None else file.subset(filter=wanted)  # by the statistics of its row groups
+        part = file if of_episode is None else file.subset(filter=of_episode)  # by the statistics of its row groups
         leaves = tuple(f"{name}." for name in widths)
         for group in part.row_groups:
             data = file.metadata.row_group(group.id).to_dict()["columns"]
             read = [chunk for chunk in data if f"{chunk['path_in_schema']}.".startswith(leaves)]
             if sum(chunk["total_uncompressed_size"] for chunk in read) > LIMITS.group_bytes:
-                raise NeecoError(f"{path}: unpacks to over {LIMITS.group_bytes >> 20} MiB; write smaller row groups")
-        table = part.to_table(columns=list(widths), filter=wanted, use_threads=False)
+                limit = f"{LIMITS.group_bytes >> 20} MiB"
+                raise NeecoError(f"{path}: decompresses to more than {limit}; write smaller row groups")
+        table = part.to_table(columns=list(widths), filter=of_episode, use_threads=False)
     columns = {}
     for name, width in widths.items():
         try:
             numbers = _numbers(table.column(name).combine_chunks()) if len(table) else np.zeros((0, width))
         except ValueError:
             kind = table.column(name).type
-            raise NeecoError(f"{path}: {name}: holds {kind}, no numbers, as many in each row; name another") from None
+            problem = f"holds {kind}, expected numbers, as many in each row"
+            raise NeecoError(f"{path}: {name}: {problem}; choose another feature") from None
         if numbers.shape[1] != width:
-            problem = f"has {numbers.shape[1]} numbers a row, not {width}"
+            problem = f"has {numbers.shape[1]} numbers per row, expected {width}"
             raise NeecoError(f"{path}: {name}: {problem}; download the data set again")
         columns[name] = numbers
     return columns
 
 
 def _numbers(column: Any) -> np.ndarray:
-    """Return [R, C] of numbers or of lists of them, all of one length; NaN of what is null. Raises ValueError."""
+    """Return numbers, or lists of one length, as [R, C]; NaN for null. Raises ValueError."""
     from pyarrow import ExtensionArray, FixedSizeListArray, LargeListArray, ListArray, compute, types
 
     count = len(column)
@@ -298,12 +300,12 @@ def _fragment(path: Path) -> Any:
     require_content(path)
     with one_line(path, *_DAMAGE):
         fragment = pyarrow.dataset.ParquetFileFormat().make_fragment(str(path), pyarrow.fs.LocalFileSystem())
-        fragment.physical_schema  # noqa: B018  # which reads the file's own description
+        fragment.physical_schema  # noqa: B018  # reads the file's schema
         return fragment
 
 
 def _boundary(path: Path) -> Path:
-    """Return the folder that links may not lead out of: the data set, or the hub's cache that holds its files."""
+    """Return the folder that links must not leave: the data set, or the hub cache that contains its files."""
     return path.resolve().parents[1] if path.resolve().parent.name == "snapshots" else path
 
 
@@ -312,7 +314,7 @@ def _feature(node: Node, key: str) -> Feature:
     dtype, shape, names = (node.child(name).value for name in ("dtype", "shape", "names"))
     sound = isinstance(shape, list) and all(type(side) is int and 0 <= side < 1e6 for side in shape)
     if not isinstance(dtype, str) or not sound:
-        node.fail("has no dtype and shape", "correct it")
+        node.fail("expected a dtype and a shape", "correct it")
     count = math.prod(shape)
     numeric = re.fullmatch(r"(float|int|uint)\d+|bool", dtype) is not None and count <= LIMITS.numbers
     places = [
@@ -323,7 +325,7 @@ def _feature(node: Node, key: str) -> Feature:
 
 
 def _names(key: str, shape: Sequence[int], count: int, stated: Any) -> tuple[str, ...]:
-    """Return a name of each number: as the data set names it, flat, nested, or by index, else `KEY[4]` or
+    """Return a name of each number: as stated by the data set (flat, nested, or by index), else `KEY[4]` or
     `KEY[0,3]`."""
     if isinstance(stated, dict) and all(type(index) is int for index in stated.values()):
         names = sorted(stated, key=lambda name: stated[name])
@@ -335,7 +337,7 @@ def _names(key: str, shape: Sequence[int], count: int, stated: Any) -> tuple[str
 
 
 def _flat(value: Any, depth: int = 0) -> Iterator[str]:
-    """Yield the texts in lists and objects of lists, as `[[x, y]]` and `{motors: [x, y]}`."""
+    """Yield the strings in nested lists and objects, as `[[x, y]]` and `{motors: [x, y]}`."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, list | dict) and depth < 3:

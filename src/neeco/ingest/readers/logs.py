@@ -1,7 +1,7 @@
 """Logs of trackers and joint sensors: read, converted to mm, rad, s and quaternions, put in order.
 
-What is left out is noted with how many rows and which. What may as well be a mistake in the recording (units, columns,
-most of the rows unusable) is refused.
+Excluded rows are noted with their number and lines. What suggests a mistake in the recording (units, columns, most rows
+unusable) raises NeecoError.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SETTINGS = LogSettings()
 @dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
 class SampleLog:
     """Samples over time, on the log's own clock: t_log = t_video + offset. times [T] s, increasing; gaps: (last time
-    before, first time after) where samples are missing; notes: what was dropped or repaired, in words; image_hz: as in
+    before, first time after) where samples are missing; notes: dropped and repaired rows, as text; image_hz: as in
     `Table`."""
 
     path: Path
@@ -59,9 +59,9 @@ class SampleLog:
 
 @dataclass(frozen=True, eq=False)
 class PoseLog(SampleLog):
-    """Poses tracker_from_sensor: positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; frame: what they are
-    stated in, CAMERA (OpenCV's axes) or BASE; stated_in: what the file calls it, None where it does not, or the
-    recording says."""
+    """Poses tracker_from_sensor: positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; frame: CAMERA (OpenCV's
+    axes) or BASE; stated_in: the file's name of the frame, None if it names none or the recording states the
+    frame."""
 
     positions: np.ndarray
     quats: np.ndarray
@@ -80,7 +80,7 @@ class ReadingLog(SampleLog):
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
     table = read_table(source.path, source.stream)
-    stated = _given(table, time=source.time, position=source.position, rotation=source.rotation)
+    stated = _stated_columns(table, time=source.time, position=source.position, rotation=source.rotation)
     recognised = named.recognise_pose(table.header, stated)
     table = with_named_frame(table, (*(source.position or recognised.position or ()), *(source.rotation or ())))
     frame = _frame_of(table, source)
@@ -91,13 +91,13 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     drop_stuck(rows, times, np.column_stack([positions, quats]))
     times, order = in_order(rows, times, source.rate_hz)
     if np.ptp(quats[order], axis=0).max() == 0 and np.ptp(positions[order], axis=0).max() > 0:
-        rows.repairs.append("its rotation never changes: does it hold positions alone?")
+        rows.repairs.append("its rotation is constant: the log may contain positions only")
     quats, flips = continuous(quats[order])
     if flips:
-        rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
+        rows.repairs.append(f"{counted(flips, 'sign flip')} of the quaternion corrected")
     gaps = find_gaps(rows, times)
     if frame != named.BASE and source.frame is None and table.meaning is not None:
-        rows.repairs.append(f"poses are stated in {table.meaning.why}")
+        rows.repairs.append(f"poses are expressed in {table.meaning.why}")
     positions, quats = in_opencv(frame, positions[order], quats)
     return PoseLog(
         table.path,
@@ -114,8 +114,8 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
 
 
 def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [T, 3] and quaternions [T, 4] wxyz stated in a camera's frame (`frames.CAMERA_FRAMES`), in OpenCV's
-    axes; what is stated in a base stays."""
+    """Convert positions [T, 3] and quaternions [T, 4] wxyz from a camera's frame (`frame_names.CAMERA_FRAMES`) to
+    OpenCV's axes; poses in a base are unchanged."""
     turn = CAMERA_FRAMES[frame].opencv_from_own[:3, :3] if frame != named.BASE else np.eye(3)
     if np.array_equal(turn, np.eye(3)):
         return positions, quats
@@ -124,8 +124,8 @@ def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.
 
 
 def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
-    """Return the table with the meaning of its poses' frame: by the names of their columns, else by the file, else by a
-    column of frames' names, else by the file's name. Raises NeecoError where the column names several."""
+    """Return the table with the meaning of its poses' frame: by the column names, else by the file, else by a column of
+    frame names, else by the file's name. Raises NeecoError if that column holds several."""
     dvrk = of_dvrk(table.path.stem, *columns)
     meaning = meaning_in(columns, dvrk=dvrk)
     if meaning is None and (table.meaning is not None or table.stream is not None):
@@ -137,14 +137,14 @@ def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
 
 
 def _frame_names(table: Table) -> list[str]:
-    """The name in a column such as `header.frame_id`; [] where there is none, or it counts or names images."""
+    """Return the name in a column such as `header.frame_id`; [] if there is none, or it numbers or names images."""
     for index, name in enumerate(table.header):
         if table.rows.dtype != object or not _FRAME_COLUMN.fullmatch(name.strip().lower()):
             continue
         names = sorted({cell.strip("/\"' ") for cell in table.rows[:, index]} - {""})
         if len(names) > 1 and any(meaning_of(cell).frame != named.BASE for cell in names):
             listed = ", ".join(names[:4])
-            raise NeecoError(f"{table.where}: {name}: poses are stated in several frames ({listed}); export one only")
+            raise NeecoError(f"{table.where}: {name}: poses are in several frames ({listed}); export one only")
         if len(names) == 1 and np.isnan(to_numbers(np.array(names, object))[0]):
             return names
     return []
@@ -160,9 +160,9 @@ def _frame_of(table: Table, source: PoseColumns) -> str:
     axes = CAMERA_FRAMES.get(table.frame or "")
     if source.frame == named.CAMERA and axes is not None and axes.words != OPENCV.words:
         raise NeecoError(
-            f"{table.where}: frame: {named.CAMERA} means OpenCV's axes ({OPENCV.words}), and the file states its poses "
-            f"in {table.stated_in or axes.name}, whose axes are {axes.words}; leave it out (or write frame: "
-            f"{axes.name}), or frame: {OPENCV.name} where they are turned already"
+            f"{table.where}: frame: {named.CAMERA} means OpenCV's axes ({OPENCV.words}), but the file's frame is "
+            f"{table.stated_in or axes.name} with axes {axes.words}; remove `frame` (or set frame: "
+            f"{axes.name}), or set frame: {OPENCV.name} if the poses are already converted"
         )
     return source.frame
 
@@ -171,18 +171,18 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     """Read a joint sensor's log, through its calibration table when there is one. Raises NeecoError naming file,
     row or column, and remedy."""
     table = read_table(source.path, source.stream)
-    stated = _given(table, time=source.time, value=None if source.value is None else (source.value,))
+    stated = _stated_columns(table, time=source.time, value=None if source.value is None else (source.value,))
     recognised, when = named.recognise_value(table.header, stated)
     value = source.value or recognised
     if value is None:
-        raise NeecoError(f"{source.path}: header: which column is the joint's reading? Name it as columns.value")
+        raise NeecoError(f"{source.path}: header: the joint's column is ambiguous; name it as columns.value")
     rows = Rows(table)
     times = read_times(rows, source, when)
     values = read_cells(rows, (value,))[:, 0]
     if source.calibration is not None:
         values = _calibrated(rows, value, values, source.calibration, source.units.angle)
     else:
-        hint = " Counts need a calibration table, `calibration`."
+        hint = " (counts need a table as `calibration`)"
         values = values * named.scale_of(table.where, (value,), "angle", source.units.angle, None, hint)
         impossible = np.abs(np.where(rows.keep, values, 0)) > SETTINGS.max_angle
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
@@ -192,9 +192,9 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     return ReadingLog(table.path, source.clock, times, values[order], gaps=gaps, notes=rows.notes(), image_hz=image_hz)
 
 
-def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
-    """The columns that a recording names, by meaning, as the file spells them. Raises NeecoError for one that is not
-    there, or is named for two things."""
+def _stated_columns(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
+    """Return the columns that a recording names, by meaning, as spelled in the file. Raises NeecoError for a missing
+    column, or one with two meanings."""
     stated = {
         meaning: tuple(table.header[column_index(table, name)] for name in names)
         for meaning, names in columns.items()
@@ -203,12 +203,12 @@ def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[s
     names = [name for group in stated.values() for name in group]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise NeecoError(f"{table.where}: columns: {twice} is named for two things; name a column for each")
+        raise NeecoError(f"{table.where}: columns: {twice} is named for two quantities; name a column for each")
     return stated
 
 
 def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
+    """Return positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
     table = rows.table
     rotation, form = (source.rotation, source.form) if source.rotation else (recognised.rotation, recognised.form)
     if rotation is None or form is None:
@@ -243,17 +243,17 @@ def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tu
 
 
 def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Unit quaternions wxyz [R, 4] of rotation columns [R, C], and bool [R] where they are rotations at all.
+    """Return unit quaternions wxyz [R, 4] of rotation columns [R, C], and bool [R] whether they are rotations.
 
-    form: see `columns.FORMS`; matrices by rows, of 4x4 ones the first 9 rotation cells; convention: of Euler angles;
-    scale: of angles, to rad. Rows that are no rotation (or hold NaN) are NaN: scipy would take any numbers for one.
+    form: see `columns.FORMS`; matrices by rows, 4x4 ones as their 9 rotation cells; convention: of Euler angles;
+    scale: of angles, to rad. Rows that are not rotations are NaN; scipy would accept any numbers.
     """
     quats, good = np.full((len(cells), 4), np.nan), np.isfinite(cells).all(axis=1)
     if form in (named.QUATERNION_WXYZ, named.QUATERNION_XYZW):
         good &= np.abs(np.linalg.norm(cells, axis=1) - 1) <= SETTINGS.norm_tolerance
         turns = Rotation.from_quat(cells[good], scalar_first=form == named.QUATERNION_WXYZ)
     elif form in (EULER, ROTATION_VECTOR):
-        good &= (np.abs(cells * scale) < 1e4).all(axis=1)  # beyond, they are no angles, or their sine is noise
+        good &= (np.abs(cells * scale) < 1e4).all(axis=1)  # larger values are not angles, or their sine is noise
         angles = cells[good] * scale
         turns = Rotation.from_euler(convention or "", angles) if form == EULER else Rotation.from_rotvec(angles)
     else:
@@ -266,7 +266,7 @@ def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: 
 
 
 def continuous(quats: np.ndarray) -> tuple[np.ndarray, int]:
-    """Quaternions [T, 4] with signs such that neighbours lie in one half space, and how often the sign flipped."""
+    """Return quaternions [T, 4] with continuous signs, and the number of sign flips removed."""
     flips = np.concatenate([[False], (quats[1:] * quats[:-1]).sum(axis=1) < 0])
     signs = np.where(np.cumsum(flips) % 2, -1.0, 1.0)
     return quats * signs[:, None], int(flips.sum())
@@ -281,19 +281,19 @@ def _unclear(table: Table, recognised: RecognisedColumns, what: str, expected: s
 
 
 def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [R, 3] in the file's unit and rotation cells [R, C]."""
+    """Return positions [R, 3] in the file's unit and rotation cells [R, C]."""
     if form != MATRIX:
         return cells[:, :3], cells[:, 3:]
     rows = cells[:, :12].reshape(-1, 3, 4)
     if cells.shape[1] == 16:
         last, column = cells[:, 12:], cells.reshape(-1, 4, 4)[:, :3, 3]
         if np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
-            raise NeecoError(f"{table.where}: matrix: is written by columns; list them in the recording row by row")
+            raise NeecoError(f"{table.where}: matrix: is in column-major order; list its columns row by row")
     return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
 
 
 def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """A joint sensor's calibration table: counts [K] increasing, angles [K] rad, increasing or decreasing.
+    """Read a joint sensor's calibration table: counts [K] increasing, angles [K] rad, increasing or decreasing.
 
     It has two columns; the angle is the one with an angle's unit in its name, else the second. The unit comes from
     there or from `angle_unit`. Raises NeecoError naming file, row and remedy.
@@ -308,7 +308,7 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     count_name = next(name for name in names if name != angle_name)
     unit = named.split_unit(angle_name, "angle")[1] or angle_unit
     if unit is None:
-        raise NeecoError(f"{path}: {angle_name}: radians or degrees? Name it {angle_name}_rad or {angle_name}_deg")
+        raise NeecoError(f"{path}: {angle_name}: unknown unit; rename it to {angle_name}_rad or {angle_name}_deg")
     values = numbers(table, (count_name, angle_name))
     if np.isnan(values).any():
         row, slot = np.argwhere(np.isnan(values))[0].tolist()
@@ -322,16 +322,16 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
             f"lines {' and '.join(map(str, lines[int(turning.argmax()) :][:2]))}" if len(counts) > 1 else "one point"
         )
         raise NeecoError(
-            f"{path}: {place}: expected two points or more, whose angles rise (or fall) as the counts do; measure again"
+            f"{path}: {place}: expected at least two points, whose angles are monotonic in the counts; measure again"
         )
     if np.abs(angles).max() > SETTINGS.max_angle:
-        raise NeecoError(f"{path}: {angle_name}: goes beyond two turns; correct the column's unit")
+        raise NeecoError(f"{path}: {angle_name}: exceeds two turns; correct the column's unit")
     return counts, angles
 
 
 def _calibrated(rows: Rows, name: str, readings: np.ndarray, path: Path, angle_unit: str | None) -> np.ndarray:
-    """Angles [R] rad of a column of counts, by PCHIP through the table (Fritsch & Carlson 1980), which is as monotone
-    as its points. Just outside the table, its end is taken, with a note; rows farther outside are dropped."""
+    """Return angles [R] rad of a column of counts, by monotone interpolation of the table (PCHIP, Fritsch & Carlson
+    1980). Readings just outside the table are clamped to its end, with a note; rows farther outside are dropped."""
     counts, angles = read_calibration(path, angle_unit)
     low, high = counts[0], counts[-1]
     readings = np.where(rows.keep, readings, low)
@@ -342,7 +342,7 @@ def _calibrated(rows: Rows, name: str, readings: np.ndarray, path: Path, angle_u
     if clamped.any():
         by = f"{low:g} to {high:g}, by at most {excess[clamped].max():g}"
         clamped_rows = f"{counted(int(clamped.sum()), 'row')} with {name} just outside the table {path.name} ({by})"
-        rows.repairs.append(f"{clamped_rows}: read as its end ({rows.table.list_rows(rows.table.lines[clamped])})")
-    reason = f"{name} lies far outside the calibration table {path.name}"
+        rows.repairs.append(f"{clamped_rows}: clamped to its end ({rows.table.list_rows(rows.table.lines[clamped])})")
+    reason = f"{name} is far outside the calibration table {path.name}"
     rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
     return np.asarray(values)

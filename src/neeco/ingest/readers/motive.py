@@ -1,8 +1,8 @@
 """Exports of OptiTrack's Motive as CSV: rigid bodies by name, units in the preamble.
 
-A preamble of pairs (`Length Units,Meters`), then a line each of the types, names and IDs (since Motive 3 of the
-parents, too) of what the columns belong to, one of what they hold (Rotation, Position), and one of their axes. Cells
-are empty where a body was not tracked.
+A preamble of pairs (`Length Units,Meters`) precedes header lines with type, name and ID (since Motive 3 also parent) of
+each column's body, its quantity (Rotation, Position) and its axis. Cells are empty where a body was not
+tracked.
 """
 
 from __future__ import annotations
@@ -39,31 +39,31 @@ class MotiveExport(RecordingFormat):
 
     def read(self, path: Path, stream: str | None = None) -> Table:
         (start, places), streams, text = _columns(path), self.streams(path), read_cells(path)
-        meant = next((name for name in places if name.lower() == str(stream).lower()), stream)
-        name = self.choose(path, meant, Kind.POSES, streams=streams).name
-        wanted = [*(("position", axis) for axis in "xyz"), *(("rotation", axis) for axis in "xyzw")]
-        if absent := [part for part, axis in wanted if (part, axis) not in places[name]]:
-            raise NeecoError(f"{path}: {absent[0]}: a rigid body has no columns of it; export the take with 6 DoF data")
+        matching = next((name for name in places if name.lower() == str(stream).lower()), stream)
+        name = self.choose(path, matching, Kind.POSES, streams=streams).name
+        required = [*(("position", axis) for axis in "xyz"), *(("rotation", axis) for axis in "xyzw")]
+        if absent := [part for part, axis in required if (part, axis) not in places[name]]:
+            raise NeecoError(f"{path}: {absent[0]}: missing for a rigid body; export the take with 6 DoF data")
         preamble = dict(zip(text.cells[0, ::2], text.cells[0, 1::2], strict=False))
         kind, unit = preamble.get("Rotation Type", QUATERNION).lower(), canonical_unit(preamble.get("Length Units", ""))
         if kind != QUATERNION:
-            raise NeecoError(f"{path}: Rotation Type: {printable(kind)} is not read; export quaternions")
+            raise NeecoError(f"{path}: Rotation Type: {printable(kind)} is not supported; export quaternions")
         suffix = f"_{unit}" if unit in UNITS["length"] else ""
-        values = to_numbers(text.cells[start:, [places[name][place] for place in wanted]])
+        values = to_numbers(text.cells[start:, [places[name][column] for column in required]])
         rows = np.column_stack([_times(path, text, start, preamble), values])
         header = ("t_s", *(axis + suffix for axis in "xyz"), *QUATS)
         return Table(path, header, rows, text.lines[start:], stream=name)
 
 
 def _columns(path: Path) -> tuple[int, dict[str, dict[tuple[str, str], int]]]:
-    """Return the first row of numbers, and the columns of each rigid body by what they hold and their axis. Raises
+    """Return the first row of numbers, and the columns of each rigid body by quantity and axis. Raises
     NeecoError."""
     text = read_cells(path)
     lower = np.char.lower(text.cells[:20].astype(str))
     types = np.flatnonzero((lower == BODY_TYPE).any(axis=1))
     starts = np.flatnonzero(lower[:, 0] == "frame")
     if not len(types) or not len(starts) or starts[0] < types[0] + 3:
-        raise NeecoError(f"{path}: holds no rigid bodies; export the take from Motive with its rigid bodies")
+        raise NeecoError(f"{path}: contains no rigid bodies; export the take from Motive with its rigid bodies")
     start = int(starts[0]) + 1
     if start == len(text.lines):
         raise NeecoError(f"{path}: has a header but no rows; export the take again")
@@ -75,7 +75,7 @@ def _columns(path: Path) -> tuple[int, dict[str, dict[tuple[str, str], int]]]:
 
 
 def _times(path: Path, text: Cells, start: int, preamble: dict[str, str]) -> np.ndarray:
-    """[R] s: as they stand there, else of the frames at the export's rate."""
+    """Return times [R] s: the time column, else the frame numbers at the export's rate."""
     for column, name in enumerate(text.cells[start - 1]):
         if name.lower().startswith("time (sec"):
             return to_numbers(text.cells[start:, column])

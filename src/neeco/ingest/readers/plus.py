@@ -1,7 +1,7 @@
-"""Sequences that the PLUS toolkit and 3D Slicer record: transforms of tools by name, and images, in MetaImage or NRRD.
+"""Sequences of the PLUS toolkit and 3D Slicer: transforms of tools by name, and images, in MetaImage or NRRD.
 
-The text stands before the data, and the images one after the other. A header may promise anything: nothing is allocated
-for what it says, and compressed data is unpacked frame by frame.
+A text header precedes the images. Sizes in the header are not trusted: no memory is allocated by them, and compressed
+data is decompressed frame by frame.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _NRRD_READ = {"type": _UCHAR, "encoding": ("raw", "gzip", "gz"), **_SKIPS}  # th
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceLimits:
-    """Limits on what a sequence's header may promise."""
+    """Limits on the sizes in a sequence's header."""
 
     line_bytes: int = 1 << 16
     header_bytes: int = 1 << 29  # limit on the bytes of a header: 100 000 frames of 20 transforms
@@ -60,9 +60,9 @@ LIMITS = SequenceLimits()
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameSequence:
-    """The header of a sequence. size: (width, height) px, (0, 0) without images; count: of its frames; channels: 1
-    or 3; fields: by name, each frame's text by its number; data: the file that holds the images, and from which byte;
-    packed: are the images compressed?"""
+    """The header of a sequence. size: (width, height) px, (0, 0) without images; count: number of frames; channels: 1
+    or 3; fields: by name, each frame's text by its number; data: the file of the images, and their first byte; packed:
+    whether the images are compressed."""
 
     path: Path
     size: tuple[int, int]
@@ -74,7 +74,7 @@ class FrameSequence:
 
     @property
     def has_images(self) -> bool:
-        return min(self.size) > 1  # where nothing but poses is recorded, images are 0 x 0 or 1 x 1
+        return min(self.size) > 1  # recordings of poses alone have images of 0 x 0 or 1 x 1
 
     @property
     def frame_bytes(self) -> int:
@@ -82,7 +82,7 @@ class FrameSequence:
 
     @property
     def transforms(self) -> list[str]:
-        """Names of the transforms, without the word."""
+        """Names of the transforms, without the suffix."""
         return sorted(name.removesuffix(TRANSFORM) for name in self.fields if name.endswith(TRANSFORM))
 
     @cached_property
@@ -96,13 +96,13 @@ class FrameSequence:
                 frames.append(frame)
                 latest = stamp
         bad, unstamped = self.count - len(good), len(good) - len(frames)
-        notes = [f"{bad} images are not OK and left out"] if bad else []
-        notes += [f"{unstamped} images have no {TIME} later than the one before; left out"] if unstamped else []
+        notes = [f"{bad} images left out: their status is not OK"] if bad else []
+        notes += [f"{unstamped} images left out: their {TIME} does not increase"] if unstamped else []
         return frames, tuple(f"{self.path.name}: {note}" for note in notes)
 
     @cached_property
     def times(self) -> dict[int, float]:
-        """Times s by frame, from the first usable image on where there are images. Raises NeecoError."""
+        """Times s by frame, from the first usable image if there are images. Raises NeecoError."""
         if not self._stamps:
             raise NeecoError(f"{self.path}: {TIME}: no frame has one (Seq_Frame0000_{TIME}); record again")
         frames = self.images[0] if self.has_images else []
@@ -117,22 +117,22 @@ class FrameSequence:
         return {frame: stamp for frame, stamp in zip(texts, stamps, strict=True) if np.isfinite(stamp)}
 
     def read_frames(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """Yield the numbers and bytes of frames: those asked for of raw data, all of packed data in their order, piece
-        by piece; the last may be shorter."""
+        """Yield the numbers and bytes of frames: the requested ones of raw data, all of compressed data in order. The
+        last one may be incomplete."""
         (file, start), length = self.data, self.frame_bytes
         with open_file(file, "images of a sequence") as stream:
             for number in () if self.packed else numbers:
                 stream.seek(start + number * length)
                 yield number, stream.read(length)
             stream.seek(start)
-            machine, frame, number = zlib.decompressobj(zlib.MAX_WBITS | 32), b"", 0  # zlib or gzip
+            decompressor, frame, number = zlib.decompressobj(zlib.MAX_WBITS | 32), b"", 0  # zlib or gzip
             while self.packed:
-                packed = machine.unconsumed_tail or stream.read(LIMITS.chunk_bytes)
-                frame += machine.decompress(packed, length - len(frame))
+                packed = decompressor.unconsumed_tail or stream.read(LIMITS.chunk_bytes)
+                frame += decompressor.decompress(packed, length - len(frame))
                 if len(frame) == length:
                     yield number, frame
                     frame, number = b"", number + 1
-                elif machine.eof or not packed:
+                elif decompressor.eof or not packed:
                     return
 
     def statuses(self, name: str) -> dict[int, str]:
@@ -143,15 +143,15 @@ class FrameSequence:
 
 @read_once
 def read_sequence(path: Path) -> FrameSequence:
-    """Read the header of a sequence. Raises NeecoError if it is none, is damaged, or promises more than the file
-    holds."""
+    """Read the header of a sequence. Raises NeecoError if the file is not a sequence, is damaged, or is shorter than
+    its header states."""
     require_content(path)
     is_nrrd = path.suffix.lower() in NRRD
     with one_line(path, "cannot read", "correct the path"), open_file(path, "a sequence") as stream:
         plain, frames, start = _read_header(path, stream, is_nrrd)
     if not frames:
-        problem = "holds no fields of frames (Seq_Frame0000_...), so it is no PLUS sequence"
-        raise NeecoError(f"{path}: {problem}; give one, or another file")
+        problem = "has no frame fields (Seq_Frame0000_...), so it is not a PLUS sequence"
+        raise NeecoError(f"{path}: {problem}; give a PLUS sequence, or another log")
     sizes = _integers(path, plain, "sizes" if is_nrrd else "DimSize")
     usual = "" if is_nrrd else " ".join(["domain"] * (len(sizes) - 1) + ["list"])
     size, count, channels = _dimensions(path, sizes, plain.get("kinds", usual).lower().split())
@@ -160,16 +160,16 @@ def read_sequence(path: Path) -> FrameSequence:
     if min(size) > 1:
         for name, allowed in (_NRRD_READ if is_nrrd else _META_READ).items():
             if (value := plain.get(name.lower(), "")).lower() not in allowed:
-                raise _fault(path, f"{name}: is {printable(value or 'nothing')}, and {allowed[-1]} is read")
+                raise _fault(path, f"{name}: {printable(value or 'nothing')} is not supported, {allowed[-1]} is")
         if channels not in (1, 3):
-            raise _fault(path, f"has {channels} channels, and grey or RGB is read")
+            raise _fault(path, f"has {channels} channels, expected 1 (grey) or 3 (RGB)")
     name = plain.get("data file", plain.get("datafile", plain.get("elementdatafile", "LOCAL")))
     file = path
     if name.upper() != "LOCAL":
         file, start = path.parent / name, 0
         if Path(name).name != name or not file.is_file():
-            problem = f"{printable(name)} is no file next to {path.name}"
-            raise NeecoError(f"{path}: {problem}; put there what was written with it")
+            problem = f"data file {printable(name)} is missing next to {path.name}"
+            raise NeecoError(f"{path}: {problem}; copy it there")
     packed = plain.get("encoding", "raw").lower() != "raw" or plain.get("compresseddata", "").lower() == "true"
     sequence = FrameSequence(
         path=path, size=size, count=count, channels=channels, fields=frames, data=(file, start), packed=packed
@@ -183,7 +183,7 @@ def read_sequence(path: Path) -> FrameSequence:
         if packed and re.fullmatch(r"\d{1,18}", stored) and available < int(stored):
             raise _fault(file, f"holds {available} bytes of compressed images, its header states {stored}")
         if packed and promised > LIMITS.zlib_ratio * (available + 64):
-            raise _fault(file, f"holds {available} bytes, of which no {count} images of {size} can come")
+            raise _fault(file, f"holds {available} bytes, too few for {count} images of {size}")
     return sequence
 
 
@@ -194,14 +194,14 @@ def _fault(file: Path, what: str) -> NeecoError:
 def _integers(path: Path, plain: dict[str, str], name: str) -> list[int]:
     words = plain.get(name.lower(), "").split()
     if not words or not all(re.fullmatch(r"\d{1,12}", word) for word in words):
-        raise _fault(path, f"{name}: expected whole numbers, found {printable(' '.join(words) or 'nothing')}")
+        raise _fault(path, f"{name}: expected integers, found {printable(' '.join(words) or 'nothing')}")
     return [int(word) for word in words]
 
 
 def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> tuple[dict[str, str], dict[str, dict[int, str]], int]:
-    """Return the fields of the file, in small letters, those of its frames, and the byte where the data begins.
+    """Return the fields of the file, in lower case, those of its frames, and the first byte of the data.
     MetaImage: `Name = value` lines, of which ElementDataFile is the last; NRRD: `field: value` and `key:=value` lines
-    up to an empty one, or to the end of a header by itself."""
+    up to an empty one, or to the end of a detached header."""
     plain, frames = dict[str, str](), dict[str, dict[int, str]]()
     if is_nrrd and not stream.readline(LIMITS.line_bytes).startswith(b"NRRD000"):
         raise _fault(path, "does not begin with NRRD000")
@@ -211,7 +211,7 @@ def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> tuple[dict[str,
         text = line.decode("utf-8", "replace").strip()
         name, sign, value = (part.strip() for part in text.partition(":" if is_nrrd else "="))
         if text and not sign and not text.startswith("#"):
-            raise _fault(path, f"{printable(text, 40)} is no {'`field: value`' if is_nrrd else '`Name = value`'}")
+            raise _fault(path, f"{printable(text, 40)} is not {'`field: value`' if is_nrrd else '`Name = value`'}")
         if match := _FRAME_FIELD.fullmatch(name):
             frames.setdefault(match[2], {})[int(match[1])] = value.removeprefix("=").strip()
         elif text:
@@ -219,19 +219,19 @@ def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> tuple[dict[str,
         if not text if is_nrrd else name.lower() == "elementdatafile":
             return plain, frames, stream.tell()
     if stream.read(1) or not plain.keys() & {"data file", "datafile"}:
-        raise _fault(path, "its header does not end")
+        raise _fault(path, "its header has no end")
     return plain, frames, stream.tell()
 
 
 def _dimensions(path: Path, sizes: list[int], kinds: list[str]) -> tuple[tuple[int, int], int, int]:
-    """(width, height), how many frames, and channels, of axes of which the last counts the frames."""
+    """Return (width, height), the number of frames, and channels; frames must be the last axis."""
     channels = 1
     if len(kinds) == len(sizes) and kinds and (kinds[0] == "vector" or kinds[0].endswith("color")):
         channels, sizes, kinds = sizes[0], sizes[1:], kinds[1:]
     if kinds != [*["domain"] * (len(sizes) - 1), kinds[-1] if kinds else ""] or kinds[-1] not in ("list", "time"):
-        raise _fault(path, "kinds: are not domain ... list, with the frames last")
+        raise _fault(path, "kinds: expected domain ... list, with the frames last")
     if len(sizes) not in (3, 4) or (len(sizes) == 4 and sizes[2] > 1):
-        raise _fault(path, f"{sizes} is no sequence of images; expected width, height, frames")
+        raise _fault(path, f"{sizes} is not a sequence of images, expected width, height, frames")
     if max(sizes[:2]) > LIMITS.side_px or sizes[-1] > LIMITS.frames:
         raise _fault(path, f"{sizes} is too large")
     return (sizes[0], sizes[1]), sizes[-1], channels
@@ -239,30 +239,30 @@ def _dimensions(path: Path, sizes: list[int], kinds: list[str]) -> tuple[tuple[i
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceImages(VideoSource):
-    """Images of a sequence; frames: the number in the file of each."""
+    """Images of a sequence; frames: frame number of each in the file."""
 
     sequence: FrameSequence
     frames: tuple[int, ...]
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        sequence, wanted = self.sequence, {self.frames[int(index)]: int(index) for index in indices}
+        sequence, remaining = self.sequence, {self.frames[int(index)]: int(index) for index in indices}
         file, shape = sequence.data[0], (sequence.size[1], sequence.size[0], sequence.channels)
         with one_line(file, "its images are damaged", "copy or export the sequence again"):
-            for number, content in sequence.read_frames(sorted(wanted)):
+            for number, content in sequence.read_frames(sorted(remaining)):
                 if number == sequence.count:
-                    raise _fault(file, "holds more images than its header says")
-                if number in wanted and len(content) == sequence.frame_bytes:
+                    raise _fault(file, "holds more images than its header states")
+                if number in remaining and len(content) == sequence.frame_bytes:
                     pixels = np.frombuffer(content, np.uint8).reshape(shape)
-                    yield wanted.pop(number), np.broadcast_to(pixels, (*shape[:2], 3)).copy()
-                if not wanted and number + 1 < sequence.count:
+                    yield remaining.pop(number), np.broadcast_to(pixels, (*shape[:2], 3)).copy()
+                if not remaining and number + 1 < sequence.count:
                     return
-        if wanted:
-            raise _fault(file, "its images end early")
+        if remaining:
+            raise _fault(file, "its images are truncated")
 
 
 class PlusSequence(RecordingFormat):
-    """A stream is a transform, `StylusToTracker` for StylusToTrackerTransform (which maps coordinates of the stylus to
-    the tracker's, mm), or `images`. Times are PLUS's timestamps, from the first image on where there are images."""
+    """A stream is a transform, `StylusToTracker` for StylusToTrackerTransform (which maps stylus coordinates to tracker
+    coordinates, mm), or `images`. Times are PLUS's timestamps, from the first image if there are images."""
 
     format = "PLUS sequence"
     holds = "poses by name (StylusToTracker) and images: .igs.mha, .mha, .mhd, .nrrd"
@@ -275,14 +275,14 @@ class PlusSequence(RecordingFormat):
             frames, notes = sequence.images
             title = f"{'grey' if sequence.channels == 1 else 'RGB'} images of {sequence.size[0]}x{sequence.size[1]}"
             why = f" ({notes[0].partition(': ')[2]})" if notes else ""
-            few = f"{len(frames)} of {sequence.count} images can be used{why}; record again"
+            few = f"only {len(frames)} of {sequence.count} images can be used{why}; record again"
             problem = few if len(frames) < LIMITS.min_images else None
             streams.append(
                 Stream(IMAGE_STREAM, Kind.IMAGES, title, len(frames), _rate(sequence.count, span), problem=problem)
             )
         for name in sequence.transforms:
             texts, (body, _, meaning) = sequence.fields[name + TRANSFORM], _ends(name)
-            # what is the same in every frame is a calibration (ImageToProbe), no motion
+            # a constant transform is a calibration (ImageToProbe), not motion
             fixed = len(texts) > 1 and len(set(texts.values())) == 1
             statuses = [status.lower() for status in sequence.statuses(name).values()]
             why = f"no frame can be used: {name}{TRANSFORM}{STATUS} is {printable(statuses[0].upper(), 20)}"
@@ -295,17 +295,16 @@ class PlusSequence(RecordingFormat):
     def read(self, path: Path, stream: str | None = None) -> Table:
         sequence = read_sequence(path)
         if not sequence.transforms:
-            problem = "holds no transforms (Seq_Frame0000_StylusToTrackerTransform)"
-            raise NeecoError(f"{path}: {problem}; name a log of poses")
-        wanted = None if stream is None else stream.removesuffix(TRANSFORM)
-        name = self.choose(path, wanted, Kind.POSES).name
+            problem = "contains no transforms (Seq_Frame0000_StylusToTrackerTransform)"
+            raise NeecoError(f"{path}: {problem}; give a log of poses")
+        name = self.choose(path, None if stream is None else stream.removesuffix(TRANSFORM), Kind.POSES).name
         statuses, texts = sequence.statuses(name), sequence.fields[name + TRANSFORM]
         _, stated_in, meaning = _ends(name)
         rows = np.full((len(texts), len(HEADER) + 1), "", object)
         for row, frame in zip(rows, sorted(texts), strict=True):
-            words = texts[frame].split()
-            if frame in sequence.times and len(words) == len(HEADER) - 1:
-                row[:-1] = [repr(sequence.times[frame]), *words]
+            cells = texts[frame].split()
+            if frame in sequence.times and len(cells) == len(HEADER) - 1:
+                row[:-1] = [repr(sequence.times[frame]), *cells]
             row[-1] = statuses[frame]
         header, lines = (*HEADER, name + TRANSFORM + STATUS), np.array(sorted(texts), np.int64)
         return Table(path, header, rows, lines, stream=name, record="frame", stated_in=stated_in, meaning=meaning)
@@ -323,10 +322,10 @@ def _rate(count: int, span: float) -> float | None:
 
 
 def _ends(name: str) -> tuple[str, str, NamedFrame]:
-    """Return the ends of a transform, Stylus and Tracker of StylusToTracker, and the meaning of the frame that it maps
-    to; without a "To", as 3D Slicer names transforms (LinearTransform_3), the whole name and nothing."""
+    """Return the two frames of a transform, Stylus and Tracker of StylusToTracker, and the meaning of the second one.
+    Without a "To", as in 3D Slicer (LinearTransform_3), return the whole name and ""."""
     match = _ENDS.fullmatch(name)
     if match is None:
-        why = f"{printable(name)} names no frame (StylusToTracker does)"
+        why = f"{printable(name)} does not name its frame (as StylusToTracker does)"
         return name, "", NamedFrame(None, why, (BASE, CAMERA))
     return match[1], match[2], meaning_of(match[2], dvrk=of_dvrk(match[1]))

@@ -1,7 +1,7 @@
 """ROS 1 and ROS 2 bags and MCAP files: poses, joints, transforms, images and lenses by topic.
 
-Times are those of the messages' headers, in s from the first image (without images: the first message) on; where a
-header has none, the time of receipt. Lengths come in m and angles in rad, as ROS has them.
+Times are the header stamps, in s from the first image (without images: the first message); the receipt time if a header
+has none. Lengths are in m and angles in rad, as in ROS.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from neeco.ingest.readers.logs import read_pose_log
 if TYPE_CHECKING:
     from neeco.ingest.readers._bagfile import Samples, Survey
 
-DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
+DVRK_CAMERA = "ECM"  # the endoscope's arm, and the frame of its tip
 CHAIN_HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 POSE_HEADER = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _DVRK = re.compile(r"(?:^|/)(PSM\d|ECM|MTM[LR]|SUJ)(?:/|$)", re.IGNORECASE)
@@ -43,12 +43,12 @@ _DVRK_JOINTS = re.compile(r"(^|/)PSM\d/((jaw/)?measured_js|state_joint_current|s
 DVRK_JOINTS = ("outer_yaw", "outer_pitch", "outer_insertion", "outer_roll", "outer_wrist_pitch", "outer_wrist_yaw")
 DVRK_WRIST = ("wrist_pitch", "wrist_yaw", "jaw")  # of an instrument; the joints before them move all of it
 DVRK_HINT = "kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit"
-_COMMANDS = re.compile(r"setpoint|goal|desired|command|target|servo|move_", re.IGNORECASE)  # nothing measured
+_COMMANDS = re.compile(r"setpoint|goal|desired|command|target|servo|move_", re.IGNORECASE)  # not measurements
 _PRISMATIC = re.compile(r"insertion|prismatic", re.IGNORECASE)  # joints in m
 
 
 class RosBag(RecordingFormat):
-    """Bags. A stream is a topic; of transforms, `tf:CHILD`, in the child's parent, or `tf:CHILD in FRAME`."""
+    """Bags. A stream is a topic, or a transform: `tf:CHILD`, in the child's parent frame, or `tf:CHILD in FRAME`."""
 
     format = "ROS bag"
     holds = "poses, transforms, joints, images and lenses by topic: ROS 1 .bag, ROS 2 folders, .mcap, .db3"
@@ -76,7 +76,7 @@ class RosBag(RecordingFormat):
         poses = survey.poses[chosen]
         if len(poses.frames) > 1:
             listed = ", ".join(sorted(poses.frames)[:4])
-            raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
+            raise NeecoError(f"{path}: {chosen}: its poses are in several frames ({listed}); use tf instead")
         table = survey.table(chosen, poses, POSE_HEADER, poses.table())
         return replace(table, stated_in=next(iter(poses.frames), None) or None, meaning=_meaning(survey, chosen))
 
@@ -100,13 +100,13 @@ class RosBag(RecordingFormat):
             topic = _info_topic(stream)
             camera = _camera(survey, topic, stream or "")
             if camera is None:
-                why = f"{topic}: is not calibrated" if topic in survey.lenses else f"holds no {topic or 'camera_info'}"
+                why = f"{topic}: is not calibrated" if topic in survey.lenses else f"has no {topic or 'camera_info'}"
                 raise NeecoError(f"{path}: {why}; give a calibration of both cameras as stereo.calibration")
             cameras.append(camera)
         return from_projections(*cameras)
 
     def origin_s(self, path: Path) -> float:
-        """Return the time from which all streams' times count, s of the recorder's clock."""
+        """Return the time origin of all streams, s on the recorder's clock."""
         return self._survey(path).origin * 1e-9
 
     def _survey(self, path: Path) -> Survey:
@@ -139,12 +139,12 @@ def _pose_stream(survey: Survey, name: str, meanings: Mapping[str, NamedFrame], 
     else:
         offered = not _COMMANDS.search(name)
     frame, bases = ", ".join(sorted(log.frames)) or "no named frame", ""
-    hints = meaning.hints or (f"poses are stated in {frame}",)
+    hints = meaning.hints or (f"poses are expressed in {frame}",)
     if name in arms and _body(name) == DVRK_CAMERA:
-        rest = (topic for topic in arms if topic != name and meanings[topic].frame not in CAMERA_FRAMES)
-        of_arms = {base for topic in rest for base in survey.poses[topic].frames}
-        if of_arms - log.frames:  # these would not register them
-            offered, bases = False, f", the arms' in {', '.join(sorted(of_arms))}"
+        instruments = (topic for topic in arms if topic != name and meanings[topic].frame not in CAMERA_FRAMES)
+        of_arms = {base for topic in instruments for base in survey.poses[topic].frames}
+        if of_arms - log.frames:  # the endoscope's poses would not register these arms
+            offered, bases = False, f", the arms in {', '.join(sorted(of_arms))}"
     elif name in arms:
         hints = (*hints, DVRK_HINT)
     kind, static = (Kind.OTHER, ", static") if log.static else (Kind.POSES, "")
@@ -160,7 +160,7 @@ def _joint_stream(survey: Survey, name: str) -> Stream:
 
 
 def _image_frames(survey: Survey) -> set[str]:
-    """Return the frames of the first camera's images; another camera, as a stereo scope's right one, has its own."""
+    """Return the frames of the first camera's images; other cameras, as a stereo scope's right one, have their own."""
     first = min(survey.images, key=camera_order, default=None)
     return set() if first is None else survey.images[first].frames - {""}
 
@@ -174,12 +174,12 @@ def _meaning(survey: Survey, name: str) -> NamedFrame:
 
 
 def _info_topic(stream: str | None) -> str | None:
-    """Return the topic of the camera_info of a stream of images, which is in their namespace."""
+    """Return the camera_info topic of a stream of images, which is in the same namespace."""
     return f"{stream.removesuffix('/compressed').rpartition('/')[0]}/camera_info" if stream else None
 
 
 def _camera(survey: Survey, topic: str | None, stream: str) -> RosCamera | None:
-    """Return the camera that a topic states, as it takes the images of a stream; None where it is not calibrated.
+    """Return the camera that a topic describes, for the images of a stream; None if it is not calibrated.
     Raises NeecoError."""
     if topic not in survey.lenses:
         return None
@@ -187,7 +187,7 @@ def _camera(survey: Survey, topic: str | None, stream: str) -> RosCamera | None:
     rectified = stream.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
     cut = region.height not in (0, info.height) or region.width not in (0, info.width)
     if max(info.binning_x, info.binning_y) > 1 or cut:
-        raise NeecoError(f"{where}: states binning or a part of the image; give the images' own `intrinsics`")
+        raise NeecoError(f"{where}: uses binning or a region of interest; set `intrinsics` for these images")
     if not numbers["P" if rectified else "K"][0]:
         return None
     document = {
@@ -203,7 +203,7 @@ def _camera(survey: Survey, topic: str | None, stream: str) -> RosCamera | None:
 
 
 def _chained(survey: Survey, stream: str) -> Table:
-    """Return poses of `tf:CHILD in FRAME`, at the times of the child's nearest transform that moves."""
+    """Return poses of `tf:CHILD in FRAME`, at the times of the first moving transform from the child."""
     child, word, frame = stream.removeprefix("tf:").partition(" in ")
     where = f"{survey.path}: {stream}"
     children = {name.removeprefix("tf:") for name in survey.poses if name.startswith("tf:")}
@@ -211,17 +211,17 @@ def _chained(survey: Survey, stream: str) -> Table:
     missing = [name for name in (child, frame) if name not in names] if word else [child]
     if missing:
         listed = printable(", ".join(sorted(names)), 300).strip("'")
-        remedy = f"name one of {listed}" if names else "the bag has no tf; name a topic"
+        remedy = f"choose one of: {listed}" if names else "the bag has no tf; use a topic"
         raise NeecoError(f"{where}: there is no transform of {printable(missing[0])}; {remedy}")
     ups, downs = _path(survey, where, child, frame)
     moving = [edge for edge in (*ups, *downs) if not survey.poses[f"tf:{edge}"].static]
     if not moving:
-        raise NeecoError(f"{where}: does not move: all transforms between are static; name another frame")
+        raise NeecoError(f"{where}: does not move: all transforms between are static; use another frame")
     seconds = np.unique(survey.seconds(survey.poses[f"tf:{moving[0]}"]))
     frame_from_child = np.linalg.inv(_composed(survey, downs, seconds)) @ _composed(survey, ups, seconds)
-    known_rows = np.isfinite(frame_from_child).all(axis=(1, 2))
+    covered = np.isfinite(frame_from_child).all(axis=(1, 2))
     quats = np.full((len(seconds), 4), np.nan)
-    quats[known_rows] = Rotation.from_matrix(frame_from_child[known_rows, :3, :3]).as_quat()
+    quats[covered] = Rotation.from_matrix(frame_from_child[covered, :3, :3]).as_quat()
     rows = np.column_stack([seconds, frame_from_child[:, :3, 3], quats])
     meaning = meaning_of(frame, _image_frames(survey), dvrk=of_dvrk(child))
     lines = np.arange(1, len(rows) + 1)
@@ -241,13 +241,14 @@ def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str]
             if len(parents) > 1 or chain[-1] in chain[:-1]:
                 several = f"has several parents ({', '.join(parents[:4])})"
                 fault = several if len(parents) > 1 else "is its own parent"
-                raise NeecoError(f"{where}: {chain[-1]} {fault}; name another, or record the transforms anew")
+                raise NeecoError(f"{where}: {chain[-1]} {fault}; use another frame, or record the transforms again")
             chain.append(parents[0])
         chains.append(chain)
     ups, downs = chains
     shared = next((name for name in ups if name in downs), None)
     if shared is None:
-        raise NeecoError(f"{where}: nothing joins {child} to {frame}; their roots are {ups[-1]} and {downs[-1]}")
+        roots = f"their roots are {ups[-1]} and {downs[-1]}"
+        raise NeecoError(f"{where}: no transforms connect {child} to {frame} ({roots}); use frames of one tree")
     return ups[: ups.index(shared)], downs[: downs.index(shared)]
 
 
@@ -259,11 +260,11 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
         if log.static:
             values = log.table()[-1]
             if not (np.isfinite(values).all() and abs(np.linalg.norm(values[3:]) - 1) < LOGS.norm_tolerance):
-                raise NeecoError(f"{survey.path}: tf:{edge}: is no rotation and translation; record it anew")
+                raise NeecoError(f"{survey.path}: tf:{edge}: is not a rigid transform; record it again")
             pose = rigid(Rotation.from_quat(values[3:]).as_matrix(), 1000 * values[:3])
             poses = np.tile(pose, (len(seconds), 1, 1))
         else:
-            # as it stands, whatever its parent's axes: those of the last frame alone matter
+            # unconverted, whatever the parent's axes: only the axes of the final frame matter
             log_of_edge = read_pose_log(PoseColumns(survey.path, stream=f"tf:{edge}", frame=BASE))
             poses, _ = poses_at(log_of_edge, seconds, 0.0)
         total = poses @ total
@@ -281,7 +282,7 @@ def _body(topic: str) -> str | None:
 
 
 def _joint_names(topic: str, log: Samples) -> list[str]:
-    """Return the joints' names; where a dVRK's messages have none, its own."""
+    """Return the joints' names; the dVRK's default names if its messages have none."""
     names, usual = list(log.columns), {6: DVRK_JOINTS, 1: ("jaw",)}
     unnamed = names == [f"joint_{number + 1}" for number in range(len(names))]
     return list(usual.get(len(names), names)) if unnamed and _DVRK_JOINTS.search(topic) else names

@@ -1,4 +1,4 @@
-"""The rows of a log's table that are in use: which were measured, their times and numbers, their order and gaps."""
+"""Selection of the valid rows of a log's table, with their times, numbers, order and gaps."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from neeco.ingest.readers import Table, column_index, numbers
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.columns import JointColumns, PoseColumns, RecognisedColumns
 
-DAY_S = 86400.0  # a clock that shows the time of day begins anew
-COUNTERS = (2.0**32, 2.0**16)  # values at which unsigned counters begin anew
+DAY_S = 86400.0  # period of a time-of-day clock, s
+COUNTERS = (2.0**32, 2.0**16)  # periods of unsigned counters
 MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"))  # words for no sample
 
 
@@ -38,7 +38,7 @@ SETTINGS = RowSettings()
 
 
 class Rows:
-    """The rows of a table in use; those left out, by reason, and what was repaired or found, for the notes."""
+    """The valid rows of a table; dropped rows by reason, and repairs and observations, for the notes."""
 
     def __init__(self, table: Table) -> None:
         self.table = table
@@ -47,14 +47,14 @@ class Rows:
         self.repairs: list[str] = []
 
     def drop(self, which: np.ndarray | list[int], reason: str) -> None:
-        """Leave rows out (bool [R], or their numbers), and note those that were in use."""
+        """Drop rows (bool [R], or their numbers), and record the reason of those that were valid so far."""
         lines = self.table.lines[which][self.keep[which]]
         if len(lines):
             self.reasons.setdefault(reason, []).extend(lines.tolist())
         self.keep[which] = False
 
     def drop_wrong(self, wrong: np.ndarray, reason: str) -> None:
-        """Leave out a few rows that are wrong (bool [R]). Raises NeecoError when they are more than a few."""
+        """Drop wrong rows (bool [R]). Raises NeecoError if they are more than `RowSettings.max_wrong`."""
         lines, count = self.table.lines[wrong & self.keep], int(self.keep.sum())
         if len(lines) > max(1, SETTINGS.max_wrong * count):
             share = f"{self.table.list_rows(lines)} ({len(lines)} of {counted(count, 'row')})"
@@ -62,7 +62,7 @@ class Rows:
         self.drop(wrong, reason.split(";")[0])
 
     def notes(self) -> tuple[str, ...]:
-        """Return the changes to the rows and what else was found, one sentence each."""
+        """Return the notes on dropped and repaired rows, one sentence each."""
         name = self.table.title
         dropped = (
             f"{name}: {counted(len(lines), 'row')} dropped: {reason} ({self.table.list_rows(lines)})"
@@ -72,7 +72,7 @@ class Rows:
 
 
 def keep_measured(rows: Rows, source: PoseColumns, recognised: str | None) -> None:
-    """Drop the rows whose state does not say that they were measured."""
+    """Drop the rows whose state does not mark them as measured."""
     table, name = rows.table, source.state or recognised
     if name is None or not len(table.rows):
         return
@@ -84,7 +84,7 @@ def keep_measured(rows: Rows, source: PoseColumns, recognised: str | None) -> No
     if not rows.keep.any():
         raise NeecoError(
             f"{table.where}: {name}: no row is {' or '.join(source.good)} ({table.list_rows(table.lines[:1])} has "
-            f"{str(states[0])[:20]!r}); list the values that mark measured rows in the recording: columns.good"
+            f"{str(states[0])[:20]!r}); set columns.good in the recording to the values of measured rows"
         )
 
 
@@ -94,23 +94,23 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, recognised: Recog
     if names is None and rate is not None:
         if headers := _headers(table, range(len(table.rows))):
             problem = f"line {headers[0]} repeats the header, and its rows have no times"
-            raise NeecoError(f"{table.where}: {problem}; keep those of one run in a file")
+            raise NeecoError(f"{table.where}: {problem}; use one file per run")
         return np.arange(len(table.rows)) / rate
     if names is None:
-        problem = "no column of times found; name it as columns.time (or add t_s), or say rate_hz"
-        raise NeecoError(f"{table.where}: header: {problem} where its rows come at a fixed rate")
+        problem = "no column of times found; name it as columns.time (or add t_s), or set rate_hz"
+        raise NeecoError(f"{table.where}: header: {problem} if its rows have a fixed rate")
     cells, meaning = read_cells(rows, names), named.recognise_time(names)
     if rate is not None and (len(names) == 2 or meaning.time_unit or named.split_unit(names[0], "time")[1]):
-        problem = f"{', '.join(names)} holds times and counts no frames"
+        problem = f"{', '.join(names)} holds times, not frame numbers"
         raise NeecoError(
-            f"{table.where}: rate_hz: {problem}; leave rate_hz out, or name the column that counts as columns.time"
+            f"{table.where}: rate_hz: {problem}; remove rate_hz, or name the column of frame numbers as columns.time"
         )
     if len(names) == 2:
         return cells[:, 0] + cells[:, 1] * 1e-9
     if rate is not None:
         return cells[:, 0] / rate
     if meaning.counts_frames:
-        problem = "counts frames, and nothing says how many a second; say rate_hz in the recording"
+        problem = "counts frames at an unknown rate; set rate_hz in the recording"
         raise NeecoError(
             f"{table.where}: {names[0]}: {problem} (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
         )
@@ -118,21 +118,21 @@ def read_times(rows: Rows, source: PoseColumns | JointColumns, recognised: Recog
 
 
 def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
-    """Return numbers [R, C], and drop rows without all of them. Raises NeecoError when most are unreadable, or when no
-    row is left."""
+    """Return numbers [R, C], and drop incomplete rows. Raises NeecoError if most are unreadable, or if no row
+    remains."""
     table, values = rows.table, numbers(rows.table, names)
-    lacking, unreadable = dict[int, str](), dict[int, str]()  # the first such cell of each row, in words
+    missing, unreadable = dict[int, str](), dict[int, str]()  # by row: message about its first such cell
     for row, slot in np.argwhere(np.isnan(values) & rows.keep[:, None]).tolist():
         cell = str(table.rows[row, column_index(table, names[slot])])
-        for faults in (lacking, unreadable) if not _is_readable(cell) else (lacking,):
+        for faults in (missing, unreadable) if not _is_readable(cell) else (missing,):
             faults.setdefault(row, f"{names[slot]} is {printable(cell, 24)}, not a number")
-    rows.drop(list(lacking), f"values are missing, first: {next(iter(lacking.values()), '')}")
+    rows.drop(list(missing), f"values are missing, first: {next(iter(missing.values()), '')}")
     too_many = len(unreadable) > max(3, SETTINGS.max_unreadable * (len(unreadable) + rows.keep.sum()))
-    if too_many or (lacking and not rows.keep.any()):
-        row, first = next(iter((unreadable if too_many else lacking).items()))
+    if too_many or (missing and not rows.keep.any()):
+        row, first = next(iter((unreadable if too_many else missing).items()))
         problem = f"{table.where}: {table.record} {table.lines[row]}: {first}"
         if too_many:
-            similar = f"{len(unreadable)} of {counted(len(table.rows), 'row')} like it"
+            similar = f"as {len(unreadable)} of {counted(len(table.rows), 'row')}"
             raise NeecoError(f"{problem} ({similar}); name other columns or repair the file")
         problem = f"{problem}, and no row has values of {', '.join(names)}"
         raise NeecoError(f"{problem}; name other columns or another file in the recording")
@@ -140,7 +140,7 @@ def read_cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
 
 
 def _is_readable(cell: str) -> bool:
-    """Return whether a cell holds a number, also one that stands for none, or a word for a missing sample."""
+    """Return whether a cell holds a number (also one that marks a missing value) or a word for a missing sample."""
     try:
         return cell.lower() in MISSING or ("_" not in cell and float(cell) is not None)
     except ValueError:
@@ -148,8 +148,8 @@ def _is_readable(cell: str) -> bool:
 
 
 def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
-    """Drop the rows of a tracker that repeats its last pose [R, 7] after losing its tool: identical poses for long, and
-    a jump at an end. A tool that comes to rest decelerates before."""
+    """Drop the rows of a tracker that repeats its last pose [R, 7] after losing its tool: identical poses for
+    `stuck_s`, with a jump at one end. A tool that comes to rest decelerates before."""
     used = np.flatnonzero(rows.keep)
     steps = np.linalg.norm(np.diff(poses[used, :3], axis=0), axis=1)
     if not (steps > 0).any():
@@ -161,7 +161,7 @@ def drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
         jump = max([*steps[max(first - 1, 0) : first], *steps[last : last + 1]], default=0.0)
         lasted = times[used[last]] - times[used[first]]
         if last - first >= SETTINGS.stuck_samples and lasted > SETTINGS.stuck_s and jump > usual:
-            rows.drop(used[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
+            rows.drop(used[first + 1 : last + 1], "the previous pose is repeated (the tracker lost its tool)")
 
 
 def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -174,15 +174,15 @@ def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tup
     doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
     if doubled.sum() > max(SETTINGS.min_samples, SETTINGS.max_same_time * len(order)):
         raise NeecoError(
-            f"{table.where}: {counted(int(doubled.sum()), 'row')} of {len(order)} have the time of another; its times "
-            "are too coarse, or of several tools: name a finer column as columns.time"
+            f"{table.where}: {counted(int(doubled.sum()), 'row')} of {len(order)} have duplicate times, which are too "
+            "coarse, or mix several tools; name a finer column as columns.time"
         )
-    rows.drop(np.sort(order[doubled]), "a second row at one time")
+    rows.drop(np.sort(order[doubled]), "duplicate time")
     order = order[~doubled]
     if len(order) < SETTINGS.min_samples:
         why = "; ".join(note.partition(": ")[2] for note in rows.notes()[:2])
         raise NeecoError(
-            f"{table.where}: {counted(len(order), 'row')} of {len(table.rows)} can be used{f' ({why})' if why else ''}"
+            f"{table.where}: only {counted(len(order), 'row')} of {len(table.rows)} usable{f' ({why})' if why else ''}"
             "; record again or name the right columns"
         )
     if len(late):
@@ -192,8 +192,8 @@ def in_order(rows: Rows, times: np.ndarray, rate_hz: float | None = None) -> tup
 
 
 def restarts(times: np.ndarray) -> tuple[float, list[int]]:
-    """Return the usual step of times [T], and the rows after which time restarts: a backward step far larger than it
-    that no single misplaced time explains."""
+    """Return the median step of times [T], and the rows after which time restarts: a much larger backward step that is
+    not due to a single misplaced time."""
     steps = np.diff(times)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
     far = np.flatnonzero(steps < -SETTINGS.restart_steps * usual).tolist()
@@ -202,15 +202,15 @@ def restarts(times: np.ndarray) -> tuple[float, list[int]]:
 
 
 def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float | None) -> np.ndarray:
-    """Return times [R] that continue after a counter, or the time of day, wraps around. Raises NeecoError for other
-    restarts: one backward step far larger than the usual step, between rows in order."""
-    table, taken = rows.table, times[usable]
-    usual, places = restarts(taken)
+    """Return times [R] unwrapped where a counter, or the time of day, wraps around. Raises NeecoError for other
+    restarts of time."""
+    table, usable_times = rows.table, times[usable]
+    usual, places = restarts(usable_times)
     units = [1.0, 1e-3, 1e-6, 1e-9, *([] if rate_hz is None else [1 / rate_hz])]
     periods = [DAY_S, *(count * unit for unit in units for count in COUNTERS)]
     times = times.copy()
     for back in places:
-        before, after = float(taken[back]), float(taken[back + 1])
+        before, after = float(usable_times[back]), float(usable_times[back + 1])
         tolerance, line = SETTINGS.gap_steps * usual, table.lines[usable[back + 1]]
         wraps = [
             period
@@ -222,26 +222,26 @@ def _continued(rows: Rows, times: np.ndarray, usable: np.ndarray, rate_hz: float
             headers = _headers(table, range(usable[back] + 1, usable[back + 1]))
             why = f"line {headers[0]} repeats the header" if headers else "another run, or a clock set back"
             raise NeecoError(
-                f"{table.where}: {table.record} {line}: time begins anew ({before:.6g} s, then {after:.6g} s): {why}; "
-                "keep the rows of one run in a file"
+                f"{table.where}: {table.record} {line}: time restarts ({before:.6g} s, then {after:.6g} s): {why}; "
+                "use one file per run"
             )
         times[usable[back + 1 :]] += wraps[0]
-        rows.repairs.append(f"its time begins anew after {before:.6g} s ({table.record} {line}); taken to go on")
+        rows.repairs.append(f"its time wraps around after {before:.6g} s ({table.record} {line}); unwrapped")
     return times
 
 
 def _headers(table: Table, rows: range) -> list[int]:
-    """Return the lines that repeat the header."""
+    """Return the numbers of lines that repeat the header."""
     return [int(table.lines[row]) for row in rows if tuple(table.rows[row]) == table.header]
 
 
 def find_gaps(rows: Rows, times: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """Return the gaps in time (steps longer than 4 usual ones and 0.15 s), and note them."""
+    """Return the gaps in time (steps longer than 4 median steps and 0.15 s), and note them."""
     steps = np.diff(times)
     longest = max(SETTINGS.gap_steps * float(np.median(steps)), SETTINGS.gap_s)
     gaps = tuple((float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest))
     if gaps:
         total = sum(end - start for start, end in gaps)
         first = ", ".join(f"{start:.2f}-{end:.2f} s" for start, end in gaps[:3])
-        rows.repairs.append(f"{counted(len(gaps), 'gap')}, {total:.2f} s in all ({first}); not bridged")
+        rows.repairs.append(f"{counted(len(gaps), 'gap')}, {total:.2f} s in all ({first}); not interpolated")
     return gaps

@@ -1,7 +1,7 @@
 """SurgPose trajectories: poses and joints of the dVRK's arms in YAML, stereo videos and their calibration.
 
-One row of the YAML files belongs to each frame of the videos at 30 frames a second; positions are m and angles rad, in
-each arm's own base frame, a few mm and degrees off the camera's.
+Each row of the YAML files corresponds to one frame of the videos at 30 Hz. Positions are in m and angles in rad, in
+each arm's own base frame, which differs by a few mm and degrees from the camera's.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from neeco.ingest.readers.video import open_video
 
 POSE_FILE, JOINT_FILE = "api_cp_data.yaml", "api_jp_data.yaml"
 FRAMES_PER_SECOND = 30.0
-JOINTS_BEHIND = "_joints"  # the stream's name, after the arm's
+JOINTS_BEHIND = "_joints"  # suffix of a joint stream, after the arm's name
 JOINT_NAMES = ("yaw_rad", "pitch_rad", "insertion_m", "roll_rad", "wrist_pitch_rad", "wrist_yaw_rad", "jaw_rad")
 WRIST = (("wrist_pitch", "wrist_pitch_rad"), ("wrist_yaw", "wrist_yaw_rad"), ("jaw", "jaw_rad"))
 POSE_HEADER = ("t_s", *(f"m{row}{column}{'_m' if column == 3 else ''}" for row in range(3) for column in range(4)))
 GREEN = "green"  # folder of videos that show the ultraviolet paint
-_ByArm = dict[str, tuple[np.ndarray, np.ndarray]]  # frames [T], and rows [T, C] of each, by arm
+_ByArm = dict[str, tuple[np.ndarray, np.ndarray]]  # by arm: frames [T] and rows [T, C]
 
 
 class SurgPose(RecordingFormat):
@@ -85,13 +85,13 @@ class SurgPose(RecordingFormat):
 
     def stereo(self, path: Path, left: str | None, right: str | None) -> tuple[Lens, Lens, np.ndarray] | None:
         if left and right and right != left.replace("left", "right"):
-            return None  # of another light, or a left camera, too
+            return None  # videos of different light, or two left cameras
         calibrations = visible_entries(path, "*.ini")
         return read_stereo(calibrations[0]) if len(calibrations) == 1 else None
 
 
 def _videos(path: Path) -> list[str]:
-    """Videos, the left one in usual light first."""
+    """Return the videos, the left one in visible light first."""
     videos = [file.relative_to(path).as_posix() for file in visible_entries(path, "**/*_video.mp4")]
     return sorted(videos, key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
 
@@ -117,7 +117,7 @@ def _by_arm(file: Path, parse: Callable[[Any], np.ndarray], expected: str) -> _B
         rows: dict[int, np.ndarray] = {}
         numbers = sorted(int(key) for key, arms in frames.items() if arm in arms)
         for key, arms in frames.items():
-            with suppress(KeyError, IndexError, TypeError, ValueError, OverflowError):  # missing, where it is no state
+            with suppress(KeyError, IndexError, TypeError, ValueError, OverflowError):  # an invalid state is missing
                 rows[int(key)] = parse(arms[arm])
         bad = [number for number in numbers if number not in rows]
         if len(bad) > ROWS.max_wrong * len(numbers) or len({len(row) for row in rows.values()}) != 1:
@@ -129,7 +129,7 @@ def _by_arm(file: Path, parse: Callable[[Any], np.ndarray], expected: str) -> _B
 
 
 def _pose(value: Any) -> np.ndarray:
-    """R and t as 12 numbers, row by row."""
+    """Return R and t as 12 numbers, row by row."""
     turn, shift = np.array(value["R"], np.float64).reshape(3, 3), np.array(value["t"], np.float64).reshape(3)
     return np.column_stack([turn, shift]).reshape(-1)
 

@@ -22,7 +22,7 @@ from neeco.capture.readers.parsed import natural_order
 from neeco.ingest.readers import VideoSource, numbers, one_line, read_table, reason_of
 from neeco.ingest.readers.columns import recognise_time, scale_of
 
-FURTHER_FORMATS = {".bmp": "BMP", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}  # opened under these names alone
+FURTHER_FORMATS = {".bmp": "BMP", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}  # opened only with these suffixes
 IMAGES = (".png", ".jpg", ".jpeg", *FURTHER_FORMATS)
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
 
@@ -50,28 +50,29 @@ def require_installed(name: str) -> None:
 
 
 def open_video(path: Path, fps: float | None = None, part: tuple[float, float] | None = None) -> VideoSource:
-    """A video file, or the part of it from one time s to another, without it. Its frames are decoded once to find
-    those that can be, with their own times (`fps`: overrides them), and buffered up to `VideoSettings.buffered_bytes`.
-    What is damaged is left out and noted; raises NeecoError when nothing can be read."""
+    """Open a video file, or a part of it (start and excluded end, s). All frames are decoded once to determine which
+    are readable, with their times (`fps` overrides them), and buffered up to `VideoSettings.buffered_bytes`. Damaged
+    frames are left out and noted. Raises NeecoError if nothing can be read."""
     path = Path(path)
     require_content(path)
     if not path.is_file():
-        raise NeecoError(f"{path}: {'is a folder; give it as images' if path.is_dir() else 'no such file'}")
+        problem = "is a folder; give it as `images`" if path.is_dir() else "no such file; correct the path"
+        raise NeecoError(f"{path}: {problem}")
     scan = _Scan(path, part=part).run()
     if scan.failure or scan.corrupt:
-        # decoding frames in parallel, which of the damaged ones are given up differs from run to run
+        # with frame threading, the set of damaged frames that are dropped varies between runs
         scan = _Scan(path, threads="SLICE", part=part).run()
     return scan.finish(fps)
 
 
 def open_images(folder: Path, fps: float | None = None, times: Path | None = None) -> VideoSource:
-    """A folder of images, ordered by name (2 before 10), at `fps` or at the times of a CSV file: one column of times,
-    and perhaps one of file names. Images that cannot be read, are of another size than nearly all, or are listed and
-    not there are left out and noted; at `fps`, a gap in their names' numbers is one in time. Raises NeecoError."""
+    """Open a folder of images, ordered by name (2 before 10), at `fps` or at the times of a CSV file with a column of
+    times and optionally one of file names. Unreadable or missing images, and images that differ in size, are left out
+    and noted. With `fps`, a gap in the numbers of file names is a gap in time. Raises NeecoError."""
     folder = Path(folder)
     if not folder.is_dir():
         raise NeecoError(f"{folder}: {'is a file; give a folder of images' if folder.exists() else 'no such folder'}")
-    folder = folder if folder.name else folder.resolve()  # "." says nothing in a message
+    folder = folder if folder.name else folder.resolve()  # "." is not informative in a message
     files = sorted(
         (file for file in visible_entries(folder) if file.suffix.lower() in IMAGES),
         key=lambda file: natural_order(file.name),
@@ -84,7 +85,7 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     elif fps is not None:
         stamps = _numbered(folder, files, notes) / fps
     else:
-        raise NeecoError(f"{folder}: when were the images taken? Give fps, or a CSV file of times, in the recording")
+        raise NeecoError(f"{folder}: unknown image times; set fps, or a CSV file of times, in the recording")
     sizes: list[tuple[int, int] | None] = []
     for file in files:
         try:
@@ -93,14 +94,14 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
             sizes.append(None)
     counts = Counter(size for size in sizes if size is not None)
     if counts.total() < SETTINGS.min_images:
-        raise NeecoError(f"{folder}: {counts.total()} of {len(files)} images can be read; replace the damaged files")
+        raise NeecoError(f"{folder}: only {counts.total()} of {len(files)} images readable; replace the damaged files")
     size, count = counts.most_common(1)[0]
     other = [file for file, each in zip(files, sizes, strict=True) if each not in (None, size)]
     if not _are_few(len(other), count):
         listed = " and ".join("x".join(map(str, each)) for each, _ in counts.most_common(2))
-        raise NeecoError(f"{other[0]}: the images of this folder are {listed}; give images of one size")
+        raise NeecoError(f"{other[0]}: images of this folder have sizes {listed}; give images of one size")
     bad = [file for file, each in zip(files, sizes, strict=True) if each is None]
-    notes += _left_out(folder, "cannot be read", bad) + _left_out(folder, "are of another size", other)
+    notes += _left_out(folder, "cannot be read", bad) + _left_out(folder, "differ in size", other)
     usable = [index for index, each in enumerate(sizes) if each == size]
     return ImageFiles(folder, size, tuple(notes), stamps[usable], files=tuple(files[i] for i in usable))
 
@@ -120,8 +121,8 @@ def _left_out(folder: Path, why: str, files: Sequence[Path]) -> list[str]:
 
 
 def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarray:
-    """Return each image's place in time, [N] from 0: by the last number in its name, where the names differ in it alone
-    and count on evenly, else by its place in the folder."""
+    """Return each image's index in time, [N] from 0: by the last number in its name, if the names differ only in that
+    number and it increases regularly, else by its position in the folder."""
     places = np.arange(len(files))
     parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", file.stem) for file in files]
     if any(part is None for part in parts) or len({(part[1], part[3]) for part in parts if part}) != 1:
@@ -135,14 +136,14 @@ def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarr
     missing = int(places[-1]) + 1 - len(files)
     if missing:
         first = files[int(np.flatnonzero(steps != step)[0])].name
-        gap = f"{missing} images are missing by their numbers (first after {first})"
-        notes.append(f"{folder.name}: {gap}; a gap in time")
+        gap = f"{missing} image numbers are missing (first after {first})"
+        notes.append(f"{folder.name}: {gap}; treated as a gap in time")
     return places
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageFiles(VideoSource):
-    """Images in files of their own."""
+    """Images in separate files."""
 
     files: tuple[Path, ...]
 
@@ -151,16 +152,17 @@ class ImageFiles(VideoSource):
             try:
                 pixels = np.array(_open(self.files[index]).convert("RGB"))
             except NeecoError as error:
-                raise NeecoError(f"{self.files[index]}: cannot be read any more; do not change the images") from error
+                problem = "can no longer be read; do not modify the images during a run"
+                raise NeecoError(f"{self.files[index]}: {problem}") from error
             if pixels.shape[1::-1] != self.size:
-                raise NeecoError(f"{self.files[index]}: is of another size than the first; give images of one size")
+                raise NeecoError(f"{self.files[index]}: differs in size from the first; give images of one size")
             yield index, pixels
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenFrames(VideoSource):
-    """Some frames of a video, at times of their own. frames: their numbers in it; half: of the pixels, of a video that
-    shows two cameras side by side (0: the left one, 1: the right one, None: it does not)."""
+    """Selected frames of a video, with other times. frames: their numbers in it; half: half of the image, for a video
+    of two cameras side by side (0: left, 1: right, None: the whole image)."""
 
     video: VideoSource
     frames: tuple[int, ...]
@@ -175,7 +177,7 @@ class ChosenFrames(VideoSource):
 
 @dataclass(frozen=True, kw_only=True)
 class _Video(VideoSource):
-    stamps: tuple[int, ...]  # of each frame, in the stream's time base; or its number where the stream has no stamps
+    stamps: tuple[int, ...]  # of each frame, in the stream's time base; its number if the stream has no stamps
     numbered: bool
     threads: str
     part: tuple[float, float] | None = None
@@ -183,16 +185,17 @@ class _Video(VideoSource):
     buffered: tuple[Any, ...] = ()  # all frames, decoded; empty where they are too large
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        wanted = {self.stamps[int(index)]: int(index) for index in indices}
+        remaining = {self.stamps[int(index)]: int(index) for index in indices}
         frames = self.buffered or _Scan(self.path, threads=self.threads, part=self.part).decoded()
         for number, frame in enumerate(frames):
-            if not wanted:
+            if not remaining:
                 return
-            index = wanted.pop(number if self.numbered else frame.pts, None)
+            index = remaining.pop(number if self.numbered else frame.pts, None)
             if index is not None:
                 yield index, _rgb(frame)
-        if wanted:
-            raise NeecoError(f"{self.path}: frame {min(wanted.values())} can no longer be read; do not change the file")
+        if remaining:
+            problem = f"frame {min(remaining.values())} can no longer be read; do not modify the file during a run"
+            raise NeecoError(f"{self.path}: {problem}")
 
 
 @dataclass
@@ -220,7 +223,7 @@ class _Scan:
     buffered_bytes: int = 0
 
     def decoded(self) -> Iterator[Any]:
-        """Frames as far as they can be decoded; damaged ones are counted and left out."""
+        """Yield the decodable frames; damaged ones are counted and left out."""
         require_installed("av")
         import av
         from av.stream import Disposition
@@ -230,8 +233,8 @@ class _Scan:
             container = av.open(str(self.path))
         with container:
             if not container.streams.video:
-                raise NeecoError(f"{self.path}: holds no video stream; give the recording's video")
-            # what players show as a file's cover is a video stream, too
+                raise NeecoError(f"{self.path}: contains no video stream; give the recording's video")
+            # cover images are video streams, too
             films = [film for film in container.streams.video if not film.disposition & Disposition.attached_pic]
             stream, *unused = films or container.streams.video
             self.others = tuple(f"{film.width}x{film.height}" for film in unused)
@@ -247,7 +250,7 @@ class _Scan:
                 early = 0.5 / self.rate if self.rate else 0.0  # s: times in other files are rounded
                 stamps = (round((time - early) / self.time_base) for time in self.part)
                 first, last = ((stream.start_time or 0) + stamp for stamp in stamps)
-                with suppress(av.error.FFmpegError):  # of a damaged index: then from the film's beginning on
+                with suppress(av.error.FFmpegError):  # with a damaged index, decoding starts at the beginning
                     container.seek(first, stream=stream)  # to the key frame before it
             packets = container.demux(stream)
             while True:
@@ -273,12 +276,12 @@ class _Scan:
                         yield frame
 
     def run(self) -> _Scan:
-        """Decode all frames, and keep them for later readings where they are not too large. Raises NeecoError when the
-        file cannot be opened or its frames differ in size."""
+        """Decode all frames, and buffer them if they fit into `buffered_bytes`. Raises NeecoError if the file cannot
+        be opened or its frames differ in size."""
         for frame in self.decoded():
             size = (frame.width, frame.height)
             if self.size not in (None, size):
-                raise NeecoError(f"{self.path}: changes from {self.size} to {size} pixels midway; cut it there")
+                raise NeecoError(f"{self.path}: frame size changes from {self.size} to {size} px; split it there")
             self.size = size
             self.stamps.append(frame.pts)
             self.interlaced |= bool(frame.interlaced_frame)
@@ -301,21 +304,21 @@ class _Scan:
                 # AVI and ASF store no times of display: these are of decoding, and frames come in order of display
                 ranked, numbered = sorted(stamps), True
                 order = [place for place, stamp in enumerate(ranked) if place == 0 or stamp > ranked[place - 1]]
-                notes.append("its frames' times fall; frames are taken in the order they are shown")
+                notes.append("its frame times decrease; frames are read in display order")
             if fps is not None:
                 rate = 1 / float(np.median(np.diff(times)))
                 times = np.arange(len(order)) / fps
                 if abs(rate / fps - 1) >= SETTINGS.same_rate:
                     own_rate = rate
-                    notes.append(f"states {own_rate:.4g} frames a second itself, the recording {fps:g}")
+                    notes.append(f"states {own_rate:.4g} frames per second, the recording {fps:g}")
             if len(order) < len(stamps):
-                notes.append(f"{len(stamps) - len(order)} frames share a time with another; left out")
+                notes.append(f"{len(stamps) - len(order)} frames left out: duplicate time")
         else:
             stated, order, numbered = fps or self.rate, list(range(len(self.stamps))), True
             if not stated or stated > SETTINGS.max_rate:
                 raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
             if fps is None:
-                notes.append(f"its frames have no times; taken as {stated:g} a second")
+                notes.append(f"its frames have no times; {stated:g} Hz is assumed")
             times = np.array(order) / stated
         return _Video(
             self.path, self.size, tuple(f"{self.path.name}: {note}" for note in notes), times, stamps=tuple(order),
@@ -332,10 +335,10 @@ class _Scan:
             # unless frames reach the end that the file states: those missing are decoded and not shown (edit list)
             step = float(np.median(np.diff(sorted(stamps)))) if len(stamps) > 1 else 0.0
             if self.end is None or not self.time_base or not stamps or max(stamps) + 1.5 * step < self.end:
-                notes.append(f"ends early: {read} of {self.promised} frames are there")
+                notes.append(f"is truncated: only {read} of {self.promised} frames exist")
         if self.others:
             which = f"the first is read (others: {', '.join(self.others)})"
-            remedy = "copy another into a file of its own: ffmpeg -map 0:v:1 -c copy"
+            remedy = "to read another, copy it to a separate file: ffmpeg -map 0:v:1 -c copy"
             notes.append(f"holds {1 + len(self.others)} video streams; {which}; {remedy}")
         if self.pixel_aspect != 1:
             shape = f"are not square ({self.pixel_aspect:.3g} times as wide as high); its frames are used as stored"
@@ -348,7 +351,7 @@ class _Scan:
 
 
 def _rgb(frame: Any) -> np.ndarray:
-    """uint8 [H, W, 3]. The converter's quick default is over one level too dark, so it is asked for exact rounding."""
+    """Return uint8 [H, W, 3]. The converter's fast default is more than one level too dark, hence exact rounding."""
     from av.video.reformatter import Interpolation
 
     exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.BITEXACT
@@ -356,12 +359,12 @@ def _rgb(frame: Any) -> np.ndarray:
 
 
 def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[str]) -> tuple[list[Path], np.ndarray]:
-    """The files a table of times names (all of them, in order, when it names none) and their times [N] s."""
+    """Return the files named in a table of times (all files, in order, if it names none) and their times [N] s."""
     table = read_table(table_path)
     recognised = recognise_time(table.header)
     column = recognised.time[0] if recognised.time else table.header[0] if len(table.header) == 1 else None
     if column is None:
-        raise NeecoError(f"{table_path}: header: no column of times found; call one t_s")
+        raise NeecoError(f"{table_path}: header: no column of times found; name one t_s")
     scale = scale_of(table_path, (column,), "time", None, recognised.time_unit, "")
     times, lines = numbers(table, (column,))[:, 0] * scale, table.lines
     by_name = {file.name: file for file in files} | {file.stem: file for file in files}
@@ -371,14 +374,14 @@ def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[
         in_folder = np.array([cell in by_name for cell in names])
         absent = np.flatnonzero(~in_folder)
         if not _are_few(len(absent), len(names)):
-            problem = f"{names[absent[0]]!r} is not in {folder.name} ({len(absent)} of {len(names)} like it)"
+            problem = f"{names[absent[0]]!r} is not in {folder.name}, as {len(absent)} of {len(names)}"
             raise NeecoError(f"{table_path}: line {lines[absent[0]]}: {problem}; correct the names")
-        notes += _left_out(folder, "are listed and not there", [folder / names[row] for row in absent])
+        notes += _left_out(folder, "are listed but missing", [folder / names[row] for row in absent])
         files, times, lines = [by_name[name] for name in names if name in by_name], times[in_folder], lines[in_folder]
     if len(times) != len(files):
         raise NeecoError(f"{table_path}: has {len(times)} times for {len(files)} images; add a column of names")
     wrong = ~(np.diff(times, prepend=-np.inf) > 0)  # NaN compares false
     if wrong.any():
-        problem = f"line {lines[wrong][0]}: {column}: expected a time after the one before"
-        raise NeecoError(f"{table_path}: {problem}; keep the rows of one run, in order")
+        problem = f"line {lines[wrong][0]}: {column}: times must increase"
+        raise NeecoError(f"{table_path}: {problem}; keep only the rows of one run, in order")
     return files, times
