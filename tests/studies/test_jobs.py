@@ -287,8 +287,6 @@ def test_tasks_here_see_a_gpu_each_or_share_them_where_they_are_small(shared, vi
     ],
 )
 def test_gpus_are_asked_for_where_jobs_compute_on_them(device, address, asked, make_job, environment, monkeypatch):
-    device, address, asked, make_job, environment, monkeypatch
-) -> None:
     given: list[bool] = []
 
     def tasks(function, shared, jobs, how):
