@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,9 +138,21 @@ def in_bfloat16(network: NPS, inputs: tuple[torch.Tensor, torch.Tensor], half: b
 
 
 @pytest.fixture
-def any_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+def processor(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Sets what PyTorch says of the processor."""
+
+    def say(*features: str, **words: str) -> None:
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: dict.fromkeys(features, True) | words, raising=False)
+        processor_has.cache_clear()
+
+    yield say
+    processor_has.cache_clear()
+
+
+@pytest.fixture
+def any_processor(processor: Callable[..., None]) -> None:
     """Computes in bfloat16 even where the processor has no instructions for it, slowly."""
-    monkeypatch.setattr("neeco.raster.devices.processor_has", lambda *features: True)
+    processor("bf16")
 
 
 @pytest.fixture
@@ -180,8 +193,8 @@ def test_states_that_bfloat16_cannot_tell_apart_stay_apart(small: tuple) -> None
     assert torch.allclose(near, exact, rtol=0, atol=0.1 * float(exact.abs().max()))
 
 
-def test_a_processor_without_bfloat16_stays_with_float32_and_says_so(small, monkeypatch):
-    monkeypatch.setattr("neeco.raster.devices.processor_has", lambda *features: False)
+def test_a_processor_without_bfloat16_stays_with_float32_and_says_so(small, processor):
+    processor()
     with pytest.warns(UserWarning, match="no bfloat16"):
         half = in_bfloat16(*small, half=True)
     assert all(torch.equal(a, b) for a, b in zip(half, in_bfloat16(*small, half=False), strict=True))
@@ -197,14 +210,9 @@ def test_a_processor_without_bfloat16_stays_with_float32_and_says_so(small, monk
         (None, [], False),  # an older PyTorch, or another architecture
     ],
 )
-def test_bfloat16_is_fast_with_tiles_and_on_amd(monkeypatch, name, features, fast):
-    said = dict.fromkeys(features, True) | ({} if name is None else {"cpu_name": name})
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: said, raising=False)
-    processor_has.cache_clear()
-    try:
-        assert fast_bfloat16() is fast
-    finally:
-        processor_has.cache_clear()
+def test_bfloat16_is_fast_with_tiles_and_on_amd(processor, name, features, fast):
+    processor(*features, **({} if name is None else {"cpu_name": name}))
+    assert fast_bfloat16() is fast
 
 
 @pytest.mark.parametrize("method", ["nps", "deformable-3dgs"])

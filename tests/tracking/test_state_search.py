@@ -37,7 +37,7 @@ from neeco.states.fitter import Fitter, StateFit
 from neeco.states.parameters import StateParameters
 from neeco.states.refinement import Refinement, Verdict
 from neeco.states.search import SEARCH, StateSearch
-from neeco.training.config import method_defaults
+from neeco.training.config import method_defaults, training_config
 from neeco.training.session import GaussianSession, new_session
 
 TRUE = [world.moving(k) for k in range(-4, 8)]
@@ -435,6 +435,8 @@ def test_a_shape_that_carving_no_longer_finds_goes_on_as_learned(tmp_path):
     """States of few frames may be too far off for carving, while the learned shape explains their images."""
     session = driver_session(tmp_path)
     session.views = replace(session.views, images=tuple(torch.full_like(i, 128) for i in session.views.images))
+    short = ["deformation.carving.tissue_steps=5", "deformation.carving.long_tissue_steps=5"]
+    session.config = training_config("kinematic", {}, short)
     scene = session.scene
     reports: list[str] = []
     session.report = reports.append

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
@@ -125,46 +126,44 @@ def test_what_cannot_be_is_told_in_one_line(arguments: list[str], told: str, mad
     assert error.count("\n") == 1
 
 
-def test_it_prints_its_address_and_ends_quietly_on_interrupt(made_run: Path) -> None:
+def view(run: Path, seen: Callable[[str], object], *words: str, **environment: str) -> str:
+    """What `neeco view` says as a warning before and after its address is `seen`, when it is asked to end."""
     program = "import sys; from neeco.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", program, "view", str(made_run), "--no-browser", "--device", "cpu"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        assert line.startswith("http://127.0.0.1:")
-        assert status(line.split()[0]) == 200
+    command = [sys.executable, "-c", program, "view", str(run), "--device", "cpu", *words]
+    variables, pipes = os.environ | environment, {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, env=variables, text=True, **pipes) as process:  # type: ignore[call-overload]
+        seen(process.stdout.readline().split()[0])
         process.terminate()
         rest, errors = process.communicate(timeout=30)
-    assert process.returncode == 0
-    assert (rest.strip(), errors) == ("", "")
+    assert (process.returncode, rest.strip()) == (0, "")
+    return str(errors)
 
 
-def test_the_browser_is_opened_without_the_token_in_its_arguments(made_run, monkeypatch, capsys):
+def test_it_prints_its_address_and_ends_quietly_on_interrupt(made_run: Path) -> None:
+    def seen(address: str) -> None:
+        assert address.startswith("http://127.0.0.1:")
+        assert status(address) == 200
+
+    assert view(made_run, seen, "--no-browser") == ""
+
+
+def test_a_browser_gets_no_token_in_its_arguments_and_plain_http_is_warned_of(made_run: Path, tmp_path: Path) -> None:
     """By way of a file that nobody else can read and that goes again."""
-    opened: list[Path] = []
+    browser, folder = tmp_path / "browser", tmp_path / "folder"
+    browser.write_text(f'#!/bin/sh\ncp -pr "$(dirname "${{1#file://}}")" {folder}\nprintf %s "$1" > {tmp_path}/asked\n')
+    browser.chmod(0o755)
 
-    def open_page(address: str) -> None:
-        page = Path(url2pathname(urlsplit(address).path))
-        opened.append(page)
-        token = urlsplit(capsys.readouterr().out.split()[0]).path.strip("/")
-        assert token not in address
-        assert token in page.read_text()
-        assert page.parent.stat().st_mode & 0o077 == 0
-        raise KeyboardInterrupt
+    def seen(address: str) -> None:
+        deadline = time.monotonic() + 30
+        while not (tmp_path / "asked").exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        token = urlsplit(address).path.strip("/")
+        assert token in (folder / "view.html").read_text()
+        assert token not in (tmp_path / "asked").read_text()
 
-    monkeypatch.setattr("webbrowser.open", open_page)
-    assert main(["view", str(made_run), "--device", "cpu"]) == 0
-    assert not opened[0].parent.exists()
-
-
-def test_a_host_that_others_reach_is_warned_of_as_plain_http(made_run, monkeypatch, capsys):
-    def stop(_: float) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("neeco.cli.view.time.sleep", stop)
-    for host, warned in (("127.0.0.1", False), ("0.0.0.0", True)):
-        assert main(["view", str(made_run), "--no-browser", "--device", "cpu", "--host", host]) == 0
-        assert ("plain HTTP" in capsys.readouterr().err) is warned
+    assert "plain HTTP" in view(made_run, seen, "--host", "0.0.0.0", BROWSER=f"{browser} %s")
+    assert folder.stat().st_mode & 0o077 == 0
+    assert not Path(url2pathname(urlsplit((tmp_path / "asked").read_text()).path)).parent.exists()
 
 
 class Browser:
