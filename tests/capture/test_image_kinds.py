@@ -75,6 +75,6 @@ def test_a_folder_of_a_recording_may_hold_further_kinds_under_their_own_names(tm
     assert len(source.times) == 4
     assert source.notes == (f"{tmp_path.name}: 1 images cannot be read and are left out (4.png)",)
     (tmp_path / "2.webp").write_bytes(b"STANDIN" + bytes(100))
-    with pytest.raises(NeecoError, match="cannot be read any more"):
+    with pytest.raises(NeecoError, match="can no longer be read"):
         list(source.read([2]))
     assert calls == []

@@ -130,19 +130,19 @@ def test_a_missing_video_hides_no_topic_and_a_missing_bag_no_video(session):
     name = "endoscope_20260117_153206"
     (session / f"{name}.mp4").rename(session / "kept")
     streams = {stream.name: stream for stream in format_of(session).streams(session)}
-    assert f"videos: '{name}.mp4' is not there" in streams[name].problem
+    assert f"videos: '{name}.mp4' is missing" in streams[name].problem
     assert streams["/PSM1/measured_cp"].problem is None
     for stream in (None, f"{name}.left"):
-        with pytest.raises(NeecoError, match=r"index.json: videos: 'endoscope_20260117_153206.mp4' is not there"):
+        with pytest.raises(NeecoError, match=r"index.json: videos: 'endoscope_20260117_153206.mp4' is missing"):
             format_of(session).open_images(session, stream)
-    with pytest.raises(NeecoError, match=r"holds no images that can be read: .*mp4' is not there"):
+    with pytest.raises(NeecoError, match=r"holds no images that can be read: .*mp4' is missing"):
         write_template(session)
     (session / "kept").rename(session / f"{name}.mp4")
     change(session / "index.json", rosbags="gone")
     problems = []
     assert f"stream: {name}.left" in write_template(session, problems.append)
-    assert "rosbags: names no bag that is there; put the session's bag" in problems[0]
-    with pytest.raises(NeecoError, match=r"index.json: rosbags: names no bag that is there"):
+    assert "rosbags: the session's bag does not exist; put it" in problems[0]
+    with pytest.raises(NeecoError, match=r"index.json: rosbags: the session's bag does not exist"):
         format_of(session).read(session, "/PSM1/measured_cp")
 
 
@@ -164,4 +164,4 @@ def test_frames_earlier_than_any_before_them_are_left_out(world):
     change(session / SIDECAR, frames=[{"cpu_ts": START + round(number * 40e6)} for number in numbers])
     video = format_of(session).open_images(session, "endoscope_20260117_153206.left")
     assert (np.diff(video.times) > 0).all()
-    assert any("10 frames are no later than" in note for note in video.notes)
+    assert any("10 frames left out: their times do not increase" in note for note in video.notes)

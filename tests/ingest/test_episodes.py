@@ -250,7 +250,7 @@ class TestEpisodesOfADataSet:
 
     def test_an_episode_that_is_not_there_is_named(self, written: Path) -> None:
         change(written, episodes=[0, 7])
-        with pytest.raises(NeecoError, match="holds no episode 7; there are episodes 0 to 2"):
+        with pytest.raises(NeecoError, match="has no episode 7; choose one of episodes 0 to 2"):
             read_episodes(separate([read_recording(written)]))
 
     def test_files_that_hold_one_recording_have_no_episodes(self, tmp_path: Path) -> None:

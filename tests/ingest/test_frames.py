@@ -139,15 +139,17 @@ def test_columns_that_count_frames_or_name_images_are_no_frame_of_poses(tmp_path
 def test_poses_of_several_frames_in_one_table_are_refused_and_left_out_of_a_template(tmp_path):
     path = table(tmp_path / "a.csv", "", SEEN, "PSM1_base")
     path.write_text(path.read_text().replace("PSM1_base", "ECM", 1))
-    with pytest.raises(NeecoError, match=r"frame_id: poses are stated in several frames \(ECM, PSM1_base\)"):
+    with pytest.raises(NeecoError, match=r"frame_id: poses are in several frames \(ECM, PSM1_base\)"):
         read_pose_log(PoseColumns(path))
     (tmp_path / "video.mp4").touch()
-    assert "#   a.csv: frame_id: poses are stated in several frames" in write_template(tmp_path)
+    assert "#   a.csv: frame_id: poses are in several frames" in write_template(tmp_path)
 
 
 def test_camera_means_opencvs_axes_and_is_refused_where_the_file_names_others(tmp_path):
     path = table(tmp_path / "psm1_in_ecm.csv", "", ECM)
-    with pytest.raises(NeecoError, match=r"frame: camera means OpenCV's axes .* write frame: ecm\), or frame: opencv"):
+    with pytest.raises(
+        NeecoError, match=r"frame: camera means OpenCV's axes .* set frame: ecm\), or set frame: opencv"
+    ):
         read_pose_log(PoseColumns(path, frame="camera"))
     np.testing.assert_allclose(read_pose_log(PoseColumns(path, frame="opencv")).positions[0], ECM)
     assert read_pose_log(PoseColumns(path, frame=BASE)).frame == BASE
@@ -161,7 +163,7 @@ def test_a_template_says_what_it_assumes_and_asks_the_rest(tmp_path):
     path = tmp_path / "recording.yaml"
     path.write_text(text)
     assert [item.name for item in read_recording(path).instruments] == ["needle", "psm1"]
-    assert "# poses are stated in ECM, the frame of the camera in the dVRK's axes (x left, y up, z forward)" in text
+    assert "# poses are expressed in ECM, the frame of the camera in the dVRK's axes (x left, y up, z forward)" in text
     assert "# frame: ros_body   # or camera, base: camera_link may be the camera's frame" in text
 
 

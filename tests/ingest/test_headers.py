@@ -66,9 +66,9 @@ def test_names_over_two_lines_tell_columns_of_one_name_apart(world):
 
 def test_rows_without_a_header_say_where_they_begin(world):
     rows = lines_of(world)
-    with pytest.raises(NeecoError, match=r"line 1 is no header of columns \(found '0,"):
+    with pytest.raises(NeecoError, match=r"line 1 is not a header line \(found '0,"):
         read_table(world.text("\n".join(rows)))
-    with pytest.raises(NeecoError, match=r"line 1 is no header of columns .*the rows of numbers begin at line 4"):
+    with pytest.raises(NeecoError, match=r"line 1 is not a header line .*the rows of numbers begin at line 4"):
         read_table(world.text("\n".join(["Recorded,2020", "# at night", "", *rows])))
 
 
@@ -85,9 +85,9 @@ def test_a_column_named_for_one_meaning_is_not_recognised_for_another(world, twi
         log = read_pose_log(PoseColumns(twice_xyz, **source))
         np.testing.assert_allclose(log.positions, world.positions(world.times), atol=1e-6)
         assert np.abs((log.quats * world.quats(world.times)).sum(1)).min() > 1 - 1e-9
-    with pytest.raises(NeecoError, match=r"X, Y, Z may be the position's or the quaternion's; name both"):
+    with pytest.raises(NeecoError, match=r"X, Y, Z may belong to the position or the quaternion; name both"):
         read_pose_log(PoseColumns(twice_xyz, units=MM))
-    with pytest.raises(NeecoError, match=r"log\.csv: columns: X is named for two things"):
+    with pytest.raises(NeecoError, match=r"log\.csv: columns: X is named for two quantities"):
         read_pose_log(PoseColumns(twice_xyz, **quaternion, position=("X", "Y#2", "Z#2")))
 
 
@@ -97,14 +97,14 @@ def test_a_joints_reading_is_not_its_time(world):
     np.testing.assert_allclose(read_reading_log(source).times, world.times, atol=1e-8)
     source = JointColumns(path, "jaw", time=("time_s",), units=Units(angle="rad"))
     np.testing.assert_allclose(read_reading_log(source).values, world.jaw(world.times), atol=1e-8)
-    with pytest.raises(NeecoError, match="stamp is named for two things"):
+    with pytest.raises(NeecoError, match="stamp is named for two quantities"):
         read_reading_log(JointColumns(path, "jaw", time=("stamp",), value="stamp"))
 
 
 def test_rows_without_times_come_at_the_stated_rate(world):
     path = world.write("x_mm,y_mm,z_mm,qw,qx,qy,qz", world.rows()[:, 1:])
     np.testing.assert_allclose(read_pose_log(PoseColumns(path, rate_hz=40)).times, world.times, atol=1e-9)
-    with pytest.raises(NeecoError, match=r"no column of times found; .* or say rate_hz"):
+    with pytest.raises(NeecoError, match=r"no column of times found; .* or set rate_hz"):
         read_pose_log(PoseColumns(path))
     jaw = world.write("angle_rad", world.jaw(world.times)[:, None], "jaw.csv")
     np.testing.assert_allclose(read_reading_log(JointColumns(jaw, "jaw", rate_hz=40)).times, world.times, atol=1e-9)
@@ -114,5 +114,5 @@ def test_rows_without_times_come_at_the_stated_rate(world):
 
 def test_a_rate_does_not_turn_times_into_counts(world):
     path = world.write("t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz", world.rows())
-    with pytest.raises(NeecoError, match="rate_hz: t_s holds times and counts no frames"):
+    with pytest.raises(NeecoError, match="rate_hz: t_s holds times, not frame numbers"):
         read_pose_log(PoseColumns(path, rate_hz=40))

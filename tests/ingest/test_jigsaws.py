@@ -80,17 +80,17 @@ def test_a_template_takes_the_slaves_on_the_videos_clock(trial, world):
     ("frames", "rate", "message"),
     [
         (40, 30, None),
-        (20, 15, "has 39 images for 40 states at 30 a second; both are taken to begin together"),
-        (38, 30, "has 38 images for 40 states at 30 a second; both are taken to begin together"),
-        (12, 30, "has 12 images for 40 states at 30 a second; they do not belong together: give the video of this log"),
-        (40, 15, "has 79 images for 40 states at 30 a second; .*: as it has 40, say `fps: 30` of it"),
+        (20, 15, "has 39 images for 40 states at 30 Hz; both are assumed to start at the same time"),
+        (38, 30, "has 38 images for 40 states at 30 Hz; both are assumed to start at the same time"),
+        (12, 30, "has 12 images for 40 states at 30 Hz; the numbers do not match: give the video of this log"),
+        (40, 15, "has 79 images for 40 states at 30 Hz; .*: its 40 images match the states: set `fps: 30`"),
     ],
 )
 def test_there_is_a_row_for_every_image_of_the_video(frames, rate, message, trial, world):
     world.video("Suturing_B001_capture1.mp4", frames, lambda i: round(i * 1000 / rate))
     world.text(write_template(trial.parent), "recording.yaml")
     recording = read_recording(world.folder / "recording.yaml")
-    if message is None or "begin together" in message:
+    if message is None or "start at the same time" in message:
         notes = read_episodes([recording]).notes.sentences
         expected = [f"Suturing_B001_capture1.mp4: {message}"] if message else []
         assert [note for note in notes if "images for" in note] == expected
@@ -108,9 +108,9 @@ def test_a_log_on_the_videos_clock_that_is_longer_than_the_video_is_noted(world)
 
 
 def test_an_arm_must_be_named(trial):
-    with pytest.raises(NeecoError, match=r"holds 4 streams of poses; .*master left, master right, slave left, slave"):
+    with pytest.raises(NeecoError, match=r"has 4 streams of poses; .*master left, master right, slave left, slave"):
         read_pose_log(PoseColumns(trial))
-    with pytest.raises(NeecoError, match="holds no 'PSM1'; name one of master left"):
+    with pytest.raises(NeecoError, match="'PSM1' does not exist; choose one of: master left"):
         read_pose_log(PoseColumns(trial, stream="PSM1"))
 
 
@@ -119,7 +119,7 @@ def test_lines_of_other_numbers_are_named(trial, line):
     lines = trial.read_text().splitlines()
     lines[16] = line
     trial.write_text("\n".join(lines))
-    with pytest.raises(NeecoError, match=r"Suturing_B001\.txt: line 17: has not 76 numbers") as caught:
+    with pytest.raises(NeecoError, match=r"Suturing_B001\.txt: line 17: expected 76 numbers") as caught:
         read_pose_log(PoseColumns(trial, stream="slave left"))
     assert "\n" not in str(caught.value)
 

@@ -98,8 +98,11 @@ def test_an_episode_has_its_own_images_at_the_times_of_its_states(plain, number)
 def test_images_that_stand_in_the_table_are_refused(tmp_path):
     path = data_set(tmp_path, version="v2.1", embedded=True)
     said = refusal(path, f"episode 0/{CAMERA}", images=True)
-    assert f"episode 0/{CAMERA}: stands in the table, image by image, which is not read; write the data set" in said
-    with pytest.raises(NeecoError, match=r"holds no images that can be read: .*stands in the table"):
+    assert (
+        f"episode 0/{CAMERA}: is stored as single images in the table, which is not supported; write the data set"
+        in said
+    )
+    with pytest.raises(NeecoError, match=r"holds no images that can be read: .*is stored as single images"):
         write_template(path)
     assert len(read(path, f"episode 0/{STATE}").rows) == LENGTHS[0]
 
@@ -169,9 +172,9 @@ def test_poses_are_what_the_recording_says_they_are(nameless):
         ),
         (
             {"frame": None},
-            r"frame: nothing says .* frame: camera \(.*x right, y down, z forward\), or frame: base",
+            r"frame of its poses is not stated; .* frame: camera \(.*x right, y down, z forward\), or frame: base",
         ),
-        ({"units": Units()}, r"in which length unit\?"),
+        ({"units": Units()}, "unknown length unit"),
     ],
 )
 def test_order_frame_and_unit_are_not_guessed(nameless, changes, message):
@@ -210,7 +213,7 @@ def test_a_template_names_every_arm_with_its_jaw(plain):
     place.write_text(text.replace('# episodes: ["0-', 'episodes: ["0-'))
     assert [item.episode for item in separate([read_recording(place)])] == [f"episode_{n}" for n in range(3)]
     assert "# frame: camera   # or base" in text
-    with pytest.raises(NeecoError, match="frame: nothing says"):
+    with pytest.raises(NeecoError, match="frame: the frame of its poses is not stated"):
         read_pose_log(first)
     place.write_text(text.replace("# frame: camera", "frame: camera"))
     chosen = read_recording(place).instruments[1].poses
@@ -263,17 +266,17 @@ def test_logs_of_another_episode_than_the_images(plain):
 
 def test_which_episode_must_be_said_where_there_are_several(plain):
     for action in (format_of(plain).read, format_of(plain).open_images):
-        with pytest.raises(NeecoError, match=r"there are episodes 0 to 2; name one, as in episode 0/"):
+        with pytest.raises(NeecoError, match=r"the data set has episodes 0 to 2; choose one, for example episode 0/"):
             action(plain)
 
 
 def test_what_is_not_there(plain):
-    assert "holds no episode 7; there are episodes 0 to 2" in refusal(plain, f"episode 7/{STATE}")
-    assert f"holds no 'episode 1/wrong'; name one of episode 1/{STATE}, episode 1/action" in refusal(
+    assert "has no episode 7; choose one of episodes 0 to 2" in refusal(plain, f"episode 7/{STATE}")
+    assert f"'episode 1/wrong' does not exist; choose one of: episode 1/{STATE}, episode 1/action" in refusal(
         plain, "episode 1/wrong"
     )
     assert "is float32, not images" in refusal(plain, f"episode 1/{STATE}", images=True)
-    assert "holds no 'nonsense'" in refusal(plain, "nonsense")
+    assert "'nonsense' does not exist" in refusal(plain, "nonsense")
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
@@ -316,7 +319,7 @@ def test_an_image_belongs_to_the_state_with_its_timestamp(tmp_path, version, sho
     assert [left_edge(pixels) for _, pixels in video.read(range(len(shown)))] == shown.tolist()
     np.testing.assert_array_equal(video.times, read(path, f"episode 0/{STATE}").rows[:, 0])
     np.testing.assert_allclose(video.times, (shown - shown[0]) / FPS, atol=1e-6)
-    assert not [note for note in video.notes if "not all images have" not in note]
+    assert not [note for note in video.notes if "at their timestamp are left out" not in note]
 
 
 def test_timestamps_a_little_off_name_the_nearest_image_and_those_of_a_clock_none(tmp_path):
@@ -329,7 +332,7 @@ def test_timestamps_a_little_off_name_the_nearest_image_and_those_of_a_clock_non
         with_column(path, "data/*/*.parquet", "timestamp", stamps)
         video = format_of(path).open_images(path, f"episode 0/{CAMERA}")
         assert [left_edge(pixels) for _, pixels in video.read([0, 7, 29])] == [0, 7, 29]
-        assert len([note for note in video.notes if "state i is taken to be of image i" in note]) == noted
+        assert len([note for note in video.notes if "state i is assigned to image i" in note]) == noted
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
@@ -363,17 +366,17 @@ def test_a_jaw_whose_column_stands_with_the_pose_is_offered(tmp_path, names, joi
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("data_path", "../../etc/passwd", "no path inside the data set"),
-        ("data_path", "data/{episode_index.__class__}.parquet", "no path inside the data set"),
+        ("data_path", "../../etc/passwd", "not a path inside the data set"),
+        ("data_path", "data/{episode_index.__class__}.parquet", "not a path inside the data set"),
         ("data_path", 7, "data_path: expected text, found 7"),
-        ("video_path", "..\\{video_key}", "no path inside the data set"),
-        ("codebase_version", "v1.6", "'v1.6' is not read"),
+        ("video_path", "..\\{video_key}", "not a path inside the data set"),
+        ("codebase_version", "v1.6", "'v1.6' is not supported"),
         ("fps", 0, "fps: 0 is out of range"),
         ("fps", "x", "fps: expected a number, found 'x'"),
         ("chunks_size", 0, "chunks_size: 0 is out of range"),
         ("features", [], "features: expected an object of features"),
-        ("features", {"a": {"dtype": "float32"}}, "features.a: has no dtype and shape"),
-        ("video_path", None, "video_path: .* no path inside the data set"),
+        ("features", {"a": {"dtype": "float32"}}, "features.a: expected a dtype and a shape"),
+        ("video_path", None, "video_path: .* not a path inside the data set"),
     ],
 )
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
@@ -414,23 +417,23 @@ def test_damaged_files(tmp_path, version):
         file.write_bytes(content)
         assert "cannot be read as Parquet" in refusal(path)
     file.unlink()
-    assert "no such file; download the episode's files, too" in refusal(path)
+    assert "no such file; download all files of the episode" in refusal(path)
 
 
 def test_parquet_of_other_columns(tmp_path):
     path = data_set(tmp_path, version="v2.1")
     file, rows = path / "data/chunk-000/episode_000001.parquet", LENGTHS[1]
     table = pyarrow.parquet.read_table(file)
-    no_numbers = f"{STATE}: holds .*, no numbers, as many in each row"
+    no_numbers = f"{STATE}: holds .*, expected numbers, as many in each row"
     for other, message in [
         (table.drop_columns([STATE]), f"has no column '{STATE}'; its columns are action, timestamp"),
         *((table.set_column(0, STATE, pyarrow.array([cell] * rows)), no_numbers)
           for cell in ("x", "1.5", b"1.5", Decimal("1.5"), ["1.5"] * len(DVRK))),
         (table.set_column(0, STATE, pyarrow.array([[1.0] * (1 + row % 2) for row in range(rows)])), no_numbers),
-        (table.set_column(0, STATE, pyarrow.array([[1.0]] * rows)), f"{STATE}: has 1 numbers a row, not 16"),
+        (table.set_column(0, STATE, pyarrow.array([[1.0]] * rows)), f"{STATE}: has 1 numbers per row, expected 16"),
         (table.set_column(2, "timestamp", pyarrow.array([[]] * rows, pyarrow.list_(pyarrow.float64()))),
-         "timestamp: has 0 numbers a row, not 1"),
-        (table.slice(0, 11), "has 11 rows of episode 1, meta says 30"),
+         "timestamp: has 0 numbers per row, expected 1"),
+        (table.slice(0, 11), "has 11 rows of episode 1, meta states 30"),
     ]:  # fmt: skip
         pyarrow.parquet.write_table(other, file)
         assert re.search(message, refusal(path))
@@ -442,7 +445,7 @@ def test_lists_where_the_length_of_an_episode_stands_are_refused(tmp_path: Path)
         table = pyarrow.parquet.read_table(file)
         lists = pyarrow.array([[]] * len(table), pyarrow.list_(pyarrow.float64()))
         pyarrow.parquet.write_table(table.set_column(table.schema.get_field_index("length"), "length", lists), file)
-    assert "length: has 0 numbers a row, not 1" in refusal(path)
+    assert "length: has 0 numbers per row, expected 1" in refusal(path)
 
 
 def test_numbers_come_of_every_arrow_type_that_holds_them(tmp_path: Path) -> None:
@@ -468,7 +471,7 @@ def test_lines_of_episodes_that_are_none(tmp_path):
         '{"episode_index": 1, "length": Infinity}',
     ):
         (path / "meta/episodes.jsonl").write_text('{"episode_index": 0, "length": 20}\n' + line + "\n")
-        assert "episodes.jsonl: line 2: is no episode" in refusal(path)
+        assert "episodes.jsonl: line 2: expected an episode" in refusal(path)
 
 
 def test_timestamps_that_stand_still_are_replaced_with_a_note(tmp_path):
@@ -476,7 +479,7 @@ def test_timestamps_that_stand_still_are_replaced_with_a_note(tmp_path):
     with_column(path, "data/*/*.parquet", "timestamp", np.full(LENGTHS[1], 1.7e9, np.float32))
     table = read(path, f"episode 0/{STATE}")
     np.testing.assert_allclose(table.rows[:, 0], np.arange(LENGTHS[1]) / FPS)
-    assert "timestamps do not increase; taken as 25 a second" in table.notes[0]
+    assert "timestamps do not increase; 25 Hz is assumed" in table.notes[0]
 
 
 def test_row_groups_that_unpack_to_more_than_memory_should_hold_are_refused(tmp_path, monkeypatch):
@@ -486,4 +489,4 @@ def test_row_groups_that_unpack_to_more_than_memory_should_hold_are_refused(tmp_
     monkeypatch.setattr(lerobot_files, "LIMITS", LeRobotLimits(group_bytes=8_000))
     assert len(read(path, f"episode 33/{STATE}").rows) == 20
     monkeypatch.setattr(lerobot_files, "LIMITS", LeRobotLimits(group_bytes=100))
-    assert "unpacks to over" in refusal(path, f"episode 33/{STATE}")
+    assert "a row group exceeds" in refusal(path, f"episode 33/{STATE}")

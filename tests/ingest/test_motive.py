@@ -80,7 +80,7 @@ def test_a_rigid_body_is_named_and_its_units_are_the_exports(world, options):
 
 def test_of_several_bodies_one_is_named_and_the_only_one_need_not_be(world):
     with pytest.raises(
-        NeecoError, match=r"holds 2 streams of poses; name one as `stream` in the recording: .*scissors"
+        NeecoError, match=r"has 2 streams of poses; set `stream` in the recording to one of: .*scissors"
     ):
         read_pose_log(PoseColumns(export(world)))
     assert len(read_pose_log(PoseColumns(export(world, bodies=("scissors",)))).times) == 198
@@ -102,11 +102,11 @@ def test_a_template_lists_every_body(world):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("Rotation Type,Quaternion", "Rotation Type,XYZ", "Rotation Type: 'xyz' is not read"),
-        ("Rigid Body,", "Bone,", "holds no rigid bodies"),
-        (",Rotation,", ",Spin,", "rotation: a rigid body has no columns of it"),
-        ("Length Units,Meters", "Length Units,Feet", r"in which length unit\?"),
-        ("Frame,Time (Seconds)", "Number,Seconds", "holds no rigid bodies"),
+        ("Rotation Type,Quaternion", "Rotation Type,XYZ", "Rotation Type: 'xyz' is not supported"),
+        ("Rigid Body,", "Bone,", "contains no rigid bodies"),
+        (",Rotation,", ",Spin,", "rotation: missing for a rigid body"),
+        ("Length Units,Meters", "Length Units,Feet", "unknown length unit"),
+        ("Frame,Time (Seconds)", "Number,Seconds", "contains no rigid bodies"),
     ],
 )
 def test_exports_of_something_else_end_in_one_line(world, old, new, message):

@@ -55,10 +55,10 @@ def test_a_tool_that_drops_out_takes_no_other_with_it(world, polaris):
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ({}, r"holds 3 streams of poses; name one as `stream` in the recording: 8700340, needle driver, endoscope"),
-        ({"stream": "0x07"}, r"stream: holds no '0x07'; name one of 8700340, needle driver, endoscope"),
+        ({}, r"has 3 streams of poses; set `stream` in the recording to one of: 8700340, needle driver, endoscope"),
+        ({"stream": "0x07"}, r"stream: '0x07' does not exist; choose one of: 8700340, needle driver, endoscope"),
         # the second Tx is the first tool's first marker
-        ({"position": ("Tx#2", "Ty#2", "Tz#2")}, "holds 3 streams of poses; name one"),
+        ({"position": ("Tx#2", "Ty#2", "Tz#2")}, "has 3 streams of poses; set `stream`"),
     ],
 )
 def test_of_several_tools_one_is_named(polaris, source, message):

@@ -270,7 +270,7 @@ def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder)
         ("[qw, qx, qy, qz]", "[a, b, c, d]", "the names do not say the order"),
         ("quaternion: [qw, qx, qy, qz]", "euler: [qx, qy, qz]", r"euler_convention: missing"),
         ("quaternion:", "rotation_vector: [a, b, c], quaternion:", "keep one of them"),
-        ("millimetres", "inches", r"units\.length: 'inches' is no unit of length; use mm, cm, m"),
+        ("millimetres", "inches", r"units\.length: 'inches' is not a unit of length; use one of: mm, cm, m"),
         ("[0, 1.5]", "[1.5, 0]", r"joints\.jaw\.limits: 1\.5 is not below 0"),
         ("jaw: -1}", "jaww: -1}", r"sync\.jaww: no log has the clock 'jaww'; did you mean jaw\?"),
         ("jaw: -1}", "jaw: soon}", r"sync\.jaw: 'soon' is not an offset in seconds"),

@@ -35,7 +35,7 @@ def test_a_counter_that_wraps_goes_on_and_is_noted(world, header, unit_s, period
     log = read_reading_log(JointColumns(world.write(header, np.column_stack([wrapped, np.sin(true)])), "jaw"))
     np.testing.assert_allclose(log.times, true, atol=1e-3)
     np.testing.assert_allclose(log.values, np.sin(true), atol=1e-6)
-    assert any("begins anew" in note and "(line 52)" in note for note in log.notes)
+    assert any("wraps around" in note and "(line 52)" in note for note in log.notes)
     assert log.gaps == ()
 
 
@@ -63,7 +63,7 @@ def test_frame_numbers_that_wrap_go_on(world):
 def test_a_second_run_in_a_file_is_refused_with_its_line(world, begins):
     first, second = 5 + np.arange(100) / 50, begins + np.arange(80) / 50
     path = world.write(HEADER, poses(np.concatenate([first, second])))
-    with pytest.raises(NeecoError, match=r"line 102: time begins anew .*another run.*keep the rows of one run"):
+    with pytest.raises(NeecoError, match=r"line 102: time restarts .*another run.*use one file per run"):
         read_pose_log(PoseColumns(path))
 
 
@@ -72,14 +72,14 @@ def test_a_second_run_in_a_file_is_refused_with_its_line(world, begins):
 def test_a_second_run_is_refused_however_uneven_the_rows_around_its_beginning_are(world, times, begins):
     stamps = [*np.arange(0, 4, 0.02), *times, *begins, *(0.6 + np.arange(100) / 50)]
     path = world.write("t_s,jaw_rad", np.column_stack([stamps, np.sin(stamps)]))
-    with pytest.raises(NeecoError, match=r"line 204: time begins anew"):
+    with pytest.raises(NeecoError, match=r"line 204: time restarts"):
         read_reading_log(JointColumns(path, "jaw"))
 
 
 def test_a_repeated_header_is_named_whether_or_not_rows_have_times(world):
     values = np.sin(np.arange(100))
     for header, columns, message in [
-        ("t_s,jaw_rad", [np.arange(100) / 50, values], "line 103: time begins anew .*: line 102 repeats the header"),
+        ("t_s,jaw_rad", [np.arange(100) / 50, values], "line 103: time restarts .*: line 102 repeats the header"),
         ("jaw_rad", [values], "line 102 repeats the header"),
     ]:
         source = JointColumns(world.write(header, np.column_stack(columns)), "jaw", rate_hz=None)
@@ -93,7 +93,7 @@ def test_a_repeated_header_is_named_whether_or_not_rows_have_times(world):
 def test_a_run_that_ends_near_a_counters_period_is_no_wrap(world):
     times = np.concatenate([np.arange(0, 4.29, 0.02), np.arange(0.5, 3, 0.02)])  # 2^32 ns are 4.295 s
     path = world.write("t_s,jaw_rad", np.column_stack([times, np.sin(times)]))
-    with pytest.raises(NeecoError, match="begins anew"):
+    with pytest.raises(NeecoError, match="time restarts"):
         read_reading_log(JointColumns(path, "jaw"))
 
 

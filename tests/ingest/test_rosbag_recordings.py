@@ -106,7 +106,7 @@ def test_a_dvrks_bag_becomes_a_recording_by_one_command(tmp_path, kind, names, c
     assert [item.name for item in recording.instruments] == ["PSM1", "PSM2"]
     assert all(set(item.joints) == {"wrist_pitch", "wrist_yaw", "jaw"} for item in recording.instruments)
     assert text.count("# kinematics: {dvrk_tool: TOOL.json}") == 2
-    assert text.count("# poses are stated in ECM, the frame of the camera") == 2
+    assert text.count("# poses are expressed in ECM, the frame of the camera") == 2
     assert recording.laparoscope is not None
     assert recording.laparoscope.stream == f"/dvrk/ECM/{names[0]}"
     assert recording.clocks == (VIDEO_CLOCK,)
@@ -133,7 +133,7 @@ def test_a_laparoscope_in_another_base_than_the_arms_is_not_taken_for_registrati
     text = write_template(bag.path)
     document = yaml.safe_load(text)
     assert "laparoscope" not in document
-    assert "in ECM_base, the arms' in PSM_base" in text
+    assert "in ECM_base, the arms in PSM_base" in text
     scope: dict[str, object] = {"file": "recording.bag", "stream": "/dvrk/ECM/measured_cp"}
     for frame, refused in ((None, True), ("base", False)):
         path = tmp_path / "recording.yaml"
@@ -190,7 +190,7 @@ def test_a_truncated_bag_is_refused_with_what_repairs_it(tmp_path, bags, kind, s
     file = _messages(path)
     file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
     message = refusal(lambda: read_arm(path))
-    assert message.startswith(f"{path}: is cut short or damaged, or no bag (")
+    assert message.startswith(f"{path}: is truncated, damaged or not a bag (")
     assert {"recording.bag": "rosbag reindex"}.get(kind, "ros2 bag reindex") in message
     if kind != "recording.bag":
         assert message.partition("(")[0] != refusal(lambda: read_arm(file)).partition("(")[0]
@@ -211,16 +211,18 @@ def test_a_bag_that_was_not_closed_is_refused(tmp_path: Path, bags: dict[str, Pa
 def test_what_is_no_bag_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    assert refusal(lambda: read_arm(path)).startswith(f"{path}: is cut short or damaged, or no bag")
+    assert refusal(lambda: read_arm(path)).startswith(f"{path}: is truncated, damaged or not a bag")
 
 
 def test_topics_that_are_not_there_or_not_of_the_kind_are_named(bags: dict[str, Path]) -> None:
     path = bags["recording.bag"]
-    poses = "name one of /dvrk/PSM1/measured_cp, tf:table, /dvrk/PSM1/jaw/measured_js"
-    assert f"stream: holds no '/PSM1/measured_cp'; {poses}" in refusal(lambda: read_table(path, "/PSM1/measured_cp"))
+    poses = "choose one of: /dvrk/PSM1/measured_cp, tf:table, /dvrk/PSM1/jaw/measured_js"
+    assert f"stream: '/PSM1/measured_cp' does not exist; {poses}" in refusal(
+        lambda: read_table(path, "/PSM1/measured_cp")
+    )
     message = f"'{RIGHT}' is sensor_msgs/Image (bgr8, 8x8), not poses or readings; {poses}"
     assert message in refusal(lambda: read_table(path, RIGHT))
-    assert f"holds 2 streams of images; name one as `stream` in the recording: /left/compressed, {RIGHT}" in refusal(
+    assert f"has 2 streams of images; set `stream` in the recording to one of: /left/compressed, {RIGHT}" in refusal(
         lambda: known(path).open_images(path)
     )
     assert "'tf:table' is tf2_msgs/TFMessage in world, not images" in refusal(
@@ -234,8 +236,12 @@ def test_encodings_that_are_not_read_are_named(tmp_path: Path, encoding: str) ->
         for time in range(3):
             bag.image(LEFT, float(time), np.zeros((8, 8, 2), np.uint8), encoding)
     message = refusal(lambda: known(bag.path).open_images(bag.path, LEFT))
-    assert f"{bag.path}: {LEFT}: 0 of 3 images can be used: 3 are not: one is in encoding '{encoding}'" in message
-    why = f"no images that can be read: {LEFT}: none of 3 messages can be used: one is in encoding '{encoding}'"
+    assert (
+        f"{bag.path}: {LEFT}: only 0 of 3 images usable (3 left out: one has the unsupported encoding '{encoding}'"
+        in message
+    )
+    fault = f"one has the unsupported encoding '{encoding}'"
+    why = f"no images that can be read: {LEFT}: none of 3 messages can be used: {fault}"
     assert why in refusal(lambda: write_template(bag.path))
 
 
@@ -244,8 +250,8 @@ def test_images_of_two_sizes_and_lenses_of_a_part_are_refused(tmp_path: Path) ->
         for number in range(4):
             bag.image(LEFT, number / 25, np.zeros((8, 8 + 8 * (number > 1), 3), np.uint8), "rgb8")
         bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, FOCAL, binning=2)
-    assert "changes from 8x8 to 16x8 pixels midway" in refusal(lambda: known(bag.path).open_images(bag.path))
-    assert "camera_info: states binning" in refusal(lambda: known(bag.path).lens(bag.path, LEFT))
+    assert "image size changes from 8x8 to 16x8 px" in refusal(lambda: known(bag.path).open_images(bag.path))
+    assert "camera_info: uses binning" in refusal(lambda: known(bag.path).lens(bag.path, LEFT))
 
 
 def test_a_type_that_is_defined_otherwise_is_not_read(tmp_path: Path, bags: dict[str, Path]) -> None:
@@ -254,7 +260,7 @@ def test_a_type_that_is_defined_otherwise_is_not_read(tmp_path: Path, bags: dict
     known = b"d3812c3cbc69362b77dc0b19b345f8f5"  # md5 of geometry_msgs/PoseStamped
     assert known in content
     path.write_bytes(content.replace(known, b"0" * 32))
-    assert "which defines geometry_msgs/PoseStamped otherwise than ROS, not poses" in refusal(lambda: read_arm(path))
+    assert "which defines geometry_msgs/PoseStamped differently from ROS, not poses" in refusal(lambda: read_arm(path))
 
 
 def test_without_rosbags_what_to_install_is_said(bags: dict[str, Path], uninstalled) -> None:
@@ -270,14 +276,14 @@ def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Pat
     metadata = path / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("compression_mode: ''", "compression_mode: FILE"))
     assert "FILE" in metadata.read_text()
-    assert "its files are packed as a whole; unpack one with `zstd -d`" in refusal(lambda: read_arm(path))
+    assert "its files are compressed as a whole; decompress one with `zstd -d`" in refusal(lambda: read_arm(path))
 
 
 def test_metadata_larger_than_any_recorder_writes_is_refused(tmp_path, bags, monkeypatch):
     path = _copy(bags["recording-db3"], tmp_path)
     monkeypatch.setattr(_bagfile, "LIMITS", _bagfile.BagLimits(metadata_bytes=100))
     said = refusal(lambda: known(path).streams(path))
-    assert "metadata.yaml: is too large; write it anew with `ros2 bag reindex`" in said
+    assert "metadata.yaml: is too large; rewrite it with `ros2 bag reindex`" in said
 
 
 def test_chunks_that_unpack_without_measure_are_refused(tmp_path, monkeypatch):

@@ -92,7 +92,9 @@ def test_a_template_of_the_folder_is_complete(world, trajectory):
 def test_a_video_of_another_length_is_refused(world, trajectory):
     world.video("000003/regular/left_video.mp4", 12, lambda i: round(i * 1000 / 30))
     recording = read_recording(world.text(write_template(trajectory), "recording.yaml"))
-    with pytest.raises(NeecoError, match=r"left_video.mp4: has 12 images for 30 states at 30 a second; they do not"):
+    with pytest.raises(
+        NeecoError, match=r"left_video.mp4: has 12 images for 30 states at 30 Hz; the numbers do not match"
+    ):
         read_episodes([recording])
 
 

@@ -39,7 +39,7 @@ def test_a_log_of_which_most_rows_are_missing_is_read_and_one_of_which_most_are_
     rows = Rows(read_table(path))
     assert read_cells(rows, ("a", "b"))[rows.keep].tolist() == [[k, k] for k in range(8)]
     path.write_text("a,b\n" + "".join(f"{k},{('1_0', '1.2.3', 'x')[k % 3] if k > 7 else k}\n" for k in range(40)))
-    with pytest.raises(NeecoError, match=r"line 10: b is '.+', not a number \(32 of 40 rows like it\); name other col"):
+    with pytest.raises(NeecoError, match=r"line 10: b is '.+', not a number \(as 32 of 40 rows\); name other col"):
         read_cells(Rows(read_table(path)), ("a", "b"))
 
 

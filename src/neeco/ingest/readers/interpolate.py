@@ -3,8 +3,7 @@
 At each time a quadratic is fitted to the samples around it, weighted by nearness (tricube) and by their residuals
 (bisquare). Rotations are fitted as sign-continuous quaternions, then normalised. The window width minimises the
 leave-one-out prediction error. If a cubic through the four nearest samples predicts better than any window, motion
-between samples exceeds their noise, as in logs with a low sampling rate. Then nothing is
-smoothed.
+between samples exceeds their noise, as in logs with a low sampling rate. Then nothing is smoothed.
 SciPy's smoothing splines with robust weights are as accurate on positions, but up to 28 % worse on rotations.
 """
 

@@ -159,8 +159,7 @@ class DataSet:
 
 
 def read_data_set(path: Path) -> DataSet:
-    """Read meta/info.json and the list of episodes, cached until they change. Raises NeecoError naming field and
-    remedy."""
+    """Read meta/info.json and the list of episodes, cached until they change. Raises NeecoError."""
     folder = path / EPISODES_3
     files = [path / INFO, path / EPISODES_2, *(folder.glob("chunk-*/*.parquet") if folder.is_dir() else ())]
     return _described(path, file_state(*sorted(file for file in files if file.exists())))
@@ -258,8 +257,7 @@ def read_columns(path: Path, widths: Mapping[str, int], episode: int | None = No
             data = file.metadata.row_group(group.id).to_dict()["columns"]
             read = [chunk for chunk in data if f"{chunk['path_in_schema']}.".startswith(leaves)]
             if sum(chunk["total_uncompressed_size"] for chunk in read) > LIMITS.group_bytes:
-                limit = f"{LIMITS.group_bytes >> 20} MiB"
-                raise NeecoError(f"{path}: decompresses to more than {limit}; write smaller row groups")
+                raise NeecoError(f"{path}: a row group exceeds {LIMITS.group_bytes >> 20} MiB; write smaller ones")
         table = part.to_table(columns=list(widths), filter=of_episode, use_threads=False)
     columns = {}
     for name, width in widths.items():

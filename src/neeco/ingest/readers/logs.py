@@ -60,8 +60,7 @@ class SampleLog:
 @dataclass(frozen=True, eq=False)
 class PoseLog(SampleLog):
     """Poses tracker_from_sensor: positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; frame: CAMERA (OpenCV's
-    axes) or BASE; stated_in: the file's name of the frame, None if it names none or the recording states the
-    frame."""
+    axes) or BASE; stated_in: the file's name of the frame, None if it names none or the recording does."""
 
     positions: np.ndarray
     quats: np.ndarray

@@ -1,8 +1,7 @@
 """Exports of OptiTrack's Motive as CSV: rigid bodies by name, units in the preamble.
 
 A preamble of pairs (`Length Units,Meters`) precedes header lines with type, name and ID (since Motive 3 also parent) of
-each column's body, its quantity (Rotation, Position) and its axis. Cells are empty where a body was not
-tracked.
+each column's body, its quantity (Rotation, Position) and its axis. Cells of an untracked body are empty.
 """
 
 from __future__ import annotations
@@ -56,8 +55,7 @@ class MotiveExport(RecordingFormat):
 
 
 def _columns(path: Path) -> tuple[int, dict[str, dict[tuple[str, str], int]]]:
-    """Return the first row of numbers, and the columns of each rigid body by quantity and axis. Raises
-    NeecoError."""
+    """Return the first row of numbers, and each rigid body's columns by quantity and axis. Raises NeecoError."""
     text = read_cells(path)
     lower = np.char.lower(text.cells[:20].astype(str))
     types = np.flatnonzero((lower == BODY_TYPE).any(axis=1))
