@@ -102,6 +102,7 @@ class ArticulatedSettings:
     # changes of a fit, tried after it: factors on the size before a camera that stands still, as then hardly more than
     # the tip tells how far the instrument is
     sizes: tuple[float, ...] = (0.7, 1.4, 0.87, 1.15)
+    start_sizes: tuple[float, ...] = (0.6, 1.6, 2.5)  # the same, of the best coarse fits
     end_steps_mm: tuple[float, ...] = (-6.0, 6.0)  # shifts of the tube's end along it
     clock_steps_s: tuple[float, ...] = (-0.04, 0.04)  # changes of a clock that is not known
     max_changes: int = 6  # maximum number of times that each of these is made, as long as it improves the fit
@@ -174,9 +175,8 @@ def _explaining(problem: ArticulatedProblem, starts: list[ArticulatedFit]) -> li
     if not fits or fits[0].residual_px > LINKED.max_residual_px or overlap(problem, fits[0]) < LINKED.least_overlap:
         return []
     swings = fits[0].swings[:, :2].std(0)
-    if problem.prior.sd_mm is None and problem.still and (swings > LINKED.max_swing_rad).any():
-        return []
-    return [] if _exchangeable(problem, fits[0]) else fits
+    mirrored = problem.prior.sd_mm is None and problem.still and (swings > LINKED.max_swing_rad).any()
+    return [] if mirrored or _exchangeable(problem, fits[0]) else fits
 
 
 def _elsewhere(problem: ArticulatedProblem, model: ArticulatedModel, reached: float, seed: int) -> str:
@@ -250,6 +250,9 @@ def _fits(problem: ArticulatedProblem, starts: list[ArticulatedFit]) -> list[Art
     few = problem.take(np.array(evenly_spaced(len(problem.blocks), LINKED.start_frames)))
     rough = bool(problem.readings)  # what is stated of links comes close
     coarse = [fit_articulated(few, start.in_frames(few), LINKED_FIT.widths_px[:2], 10, rough=rough) for start in starts]
+    for fit in _distinct(problem, coarse)[: LINKED.n_refined] if problem.still and not rough else ():
+        sized = [_resized(few, factor, fit) for factor in LINKED.start_sizes]
+        coarse += [fit_articulated(few, start, LINKED_FIT.widths_px[:2], 10) for start in sized]
     chosen = [fit.in_frames(problem) for fit in _distinct(problem, coarse)[: LINKED.n_refined]]
     fits = [fit_articulated(problem, fit, LINKED_FIT.widths_px[1:]) for fit in chosen]
     if fits and not rough:
@@ -391,8 +394,7 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
 
 
 def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], tree: KinematicTree | None) -> BaseRegistration:
-    with_errors, prior = with_pose_errors(problem, fits[0]), problem.prior
-    full = covariance(problem, with_errors)
+    prior, full = problem.prior, covariance(problem, with_errors := with_pose_errors(problem, fits[0]))
     best = fits[0] if tree is None else with_errors  # errors of poses beside swings make up for too much
     scatter = LINKED.swinging_scatter if tree is None else LINKED.scatter
     spread = scatter**2 * full[:6, :6]

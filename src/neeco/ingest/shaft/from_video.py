@@ -154,7 +154,7 @@ def find_shaft(
     if share < SHAFT.usual_share:
         assert axes.covariance is not None
         axes = replace(axes, covariance=SHAFT.short_factor**2 * axes.covariance)
-        notes.append("errors count twice where so little of the shaft shows; hold the scope back")
+        notes.append("its standard deviations are doubled, as little of the shaft is visible; hold the scope back")
     by_color = bool(ends.any()) and heads is not None
     length = working_length or (
         float(np.nanquantile(heads, SHAFT.closed_quantile)) if heads is not None else _default_head(video)
