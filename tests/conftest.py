@@ -48,6 +48,23 @@ def environment() -> Iterator[MutableMapping[str, str]]:
 
 
 @pytest.fixture
+def registered() -> Iterator[Callable[[type], type]]:
+    """Register a method that a test defines, as an installed package's would be, until the test ends."""
+    from neeco.scene.method_registry import add_method, methods
+
+    yield add_method
+    methods.cache_clear()
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of installed packages of this process, empty."""
+    (tmp_path / "site").mkdir()
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    return tmp_path / "site"
+
+
+@pytest.fixture
 def uninstalled(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Make a package as if it were not installed."""
     return lambda name: monkeypatch.setitem(sys.modules, name, None)

@@ -16,7 +16,7 @@ PLUGIN = Path(__file__).parents[1] / "examples" / "plugin"
 
 def install_plugin(site: Path) -> None:
     """Install the plug-in into `site`, a folder on this process's path."""
-    shutil.copytree(_installed(), site)
+    shutil.copytree(_installed(), site, dirs_exist_ok=True)
     importlib.invalidate_caches()
 
 

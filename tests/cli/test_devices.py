@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import shlex
 import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
 
 from neeco.base.errors import NeecoError
+from neeco.capture.model import State
 from neeco.capture.writer import write_capture
 from neeco.cli import main
 from neeco.cli._progress import resumable
-from neeco.scene.gaussian_scene import GaussianScene
-from neeco.scene.training_session import StepResult
-from neeco.scene.training_views import TrainingViews
+from neeco.methods.static import Static
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.deformation import UNPERTURBED, Perturbation, Posed
 from neeco.studies.configurations import Configuration, Study, SweepRequest
 from neeco.studies.sweep import plan_sweep
 from neeco.training.config import training_config
-from neeco.training.session import GaussianSession
 from neeco.training.train import train
 
 OF_A_RUN = {
@@ -38,6 +39,42 @@ OF_A_CAPTURE = {
     "downstream": ["--output", "out"],
     "ablate": ["--output", "ablated", "--tables", "kinematic", "--iterations", "5"],
 }
+
+
+class Failing(Static):
+    """A method on a device that fails in the hook `fails_in`, called so many times."""
+
+    method = "failing"
+    fails_in, calls, error = "", 0, RuntimeError
+
+    def begin(self, training: object) -> None:
+        self.fail("begin")
+
+    def between_steps(self, training: object) -> None:
+        self.fail("between_steps")
+
+    def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
+        self.fail("pose")
+        return super().pose(canonical, state, perturbation)
+
+    def fail(self, hook: str) -> None:
+        if hook == Failing.fails_in:
+            Failing.calls -= 1
+            if Failing.calls < 0:
+                raise Failing.error
+
+
+@pytest.fixture
+def fails(registered) -> Iterator[Callable[..., None]]:
+    """Sets the hook, the number of calls before and the error of a device that fails."""
+    registered(Failing)
+
+    def fail(hook: str, calls: int = 0, error: Exception | None = None) -> None:
+        text = "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0"
+        Failing.fails_in, Failing.calls, Failing.error = hook, calls, error or torch.cuda.OutOfMemoryError(text)
+
+    yield fail
+    fail("")
 
 
 @pytest.fixture(scope="module")
@@ -94,58 +131,42 @@ def test_the_jobs_of_a_comparison_are_given_the_word(trained, tmp_path: Path) ->
 class TestADeviceThatFails:
     """In the middle of a verb: one line, exit 1, and what was done is kept."""
 
-    @pytest.fixture
-    def steps(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-        """After how many steps of training the memory is full."""
-        left = {"steps": 3}
-        step = GaussianSession.step
-
-        def fails(session: GaussianSession) -> StepResult:
-            left["steps"] -= 1
-            if left["steps"] < 0:
-                raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0")
-            return step(session)
-
-        monkeypatch.setattr(GaussianSession, "step", fails)
-        return left
-
-    def test_training_says_how_to_go_on_and_does(self, made, steps, tmp_path: Path, capsys) -> None:
-        words = ["train", made["train"], "--output", "new", "--method", "3dgs", "--iterations", "5", "--device", "cpu"]
-        assert main(words) == 1
+    def test_training_says_how_to_go_on_and_does(self, made, fails, tmp_path: Path, capsys) -> None:
+        fails("between_steps", calls=3)
+        words = ["train", made["train"], "--output", "my run", "--method", "failing", "--iterations", "5"]
+        assert main([*words, "--device", "cpu"]) == 1
         line = capsys.readouterr().err.strip().splitlines()[-1]
         assert line.startswith("neeco: error: --device: the GPU's memory is full (2.50 GiB more were asked for): ")
-        told, _, command = line.partition("; go on with: neeco ")
+        told, _, command = line.partition("; continue with: neeco ")
         assert told
-        assert not Path("new/scene.safetensors").exists()
-        steps["steps"] = 100
+        assert not Path("my run/scene.safetensors").exists()
+        fails("")
         assert main([*shlex.split(command), "--device", "cpu"]) == 0
-        assert Path("new/scene.safetensors").exists()
+        assert Path("my run/scene.safetensors").exists()
+        assert "(next: neeco evaluate 'my run')" in capsys.readouterr().out
 
-    def test_before_the_first_step_nothing_is_left(self, made, monkeypatch, capsys) -> None:
-        def full(views: TrainingViews, device: torch.device) -> TrainingViews:
-            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
-
-        monkeypatch.setattr(TrainingViews, "to", full)
-        assert main(["train", made["train"], "--output", "new", "--device", "cpu"]) == 1
+    def test_before_the_first_step_nothing_is_left(self, made, fails, capsys) -> None:
+        fails("begin", error=torch.cuda.OutOfMemoryError("CUDA out of memory."))
+        assert main(["train", made["train"], "--output", "new", "--method", "failing", "--device", "cpu"]) == 1
         line = capsys.readouterr().err.strip().splitlines()[-1]
         assert line.startswith("neeco: error: --device: the GPU's memory is full: ")
         assert "--resume" not in line
         assert not Path("new").exists()
 
-    def test_a_job_of_a_comparison_fails_in_a_line_without_a_traceback(self, made, steps, capsys) -> None:
-        assert main(command("compare", made, "cpu")) == 1
+    def test_a_job_of_a_comparison_fails_in_a_line_without_a_traceback(self, made, fails, capsys) -> None:
+        fails("between_steps", calls=3)
+        assert main([*command("compare", made, "cpu"), "--methods", "failing"]) == 1
         output = capsys.readouterr()
         told = " ".join((output.out + output.err).split())
         assert "the GPU's memory is full (2.50 GiB more were asked for)" in told
         assert not list(Path("out").rglob("*.error.txt"))
 
     @pytest.mark.parametrize("verb", ["evaluate", "render"])
-    def test_drawing_verbs_end_in_a_line(self, verb: str, made, monkeypatch, capsys) -> None:
-        def lost(scene: GaussianScene, *args: object, **named: object) -> None:
-            raise RuntimeError("CUDA error: unspecified launch failure\nCUDA kernel errors might be reported")
-
-        monkeypatch.setattr(GaussianScene, "at", lost)
-        assert main(command(verb, made, "cpu")) == 1
+    def test_drawing_verbs_end_in_a_line(self, verb: str, made, fails, capsys) -> None:
+        train(Path(made["train"]), Path("failing"), training_config("failing", {"iterations": 5}))
+        lost = RuntimeError("CUDA error: unspecified launch failure\nCUDA kernel errors might be reported")
+        fails("pose", error=lost)
+        assert main(command(verb, made | {verb: "failing"}, "cpu")) == 1
         line = capsys.readouterr().err.strip().splitlines()[-1]
         assert line.startswith("neeco: error: --device: the GPU gave up (CUDA error: unspecified launch failure): ")
 

@@ -2,10 +2,12 @@
 
 import json
 import shutil
+from collections import defaultdict
 from dataclasses import replace
 
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
 
 from neeco.base.errors import NeecoError
 from neeco.capture.images import write_labels
@@ -14,6 +16,7 @@ from neeco.cli import main
 from neeco.evaluation import evaluate, image_metrics
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.training.config import training_config
+from neeco.training.run import open_run
 from neeco.training.train import train
 
 
@@ -151,25 +154,29 @@ def trained(world, tmp_path_factory):
     return train(folder / "capture", folder / "run", training_config("3dgs", {"iterations": 5}))
 
 
-def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(trained, monkeypatch):
-    seen = {}
+class Threads(TorchFunctionMode):
+    """Notes how many threads torch has when its functions are called, by their names."""
 
-    def noting(where, function):
-        def call(*arguments, **options):
-            seen[where] = torch.get_num_threads()
-            return function(*arguments, **options)
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen = defaultdict(set)
 
-        return call
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        if function is not torch.get_num_threads:
+            self.seen[getattr(function, "__name__", "")].add(torch.get_num_threads())
+        return function(*args, **kwargs or {})
 
+
+def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(trained):
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
         network = image_metrics.Lpips((image_metrics.Convolution(1, 1, 0, None, True),), one_by_one_filter())
-        monkeypatch.setattr(image_metrics, "find_lpips", lambda folder: {"alexnet": network})
-        monkeypatch.setattr(evaluate, "draw", noting("draw", evaluate.draw))
-        monkeypatch.setattr(image_metrics, "relu", noting("lpips", image_metrics.relu))
-        assert main(["evaluate", str(trained), "--splits", "test"]) == 0
-        assert (seen, torch.get_num_threads()) == ({"draw": 1, "lpips": 3}, 3)
+        with Threads() as threads, open_run(trained) as run:
+            evaluate_run(run, run.capture(), ("test",), networks={"alexnet": network})
+        assert threads.seen["exp"] == {1}  # of the Gaussians' sizes
+        assert threads.seen["relu"] == {3}  # of the network
+        assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
 

@@ -21,12 +21,11 @@ from neeco.ingest.recording.file import read_recording
 pytest.importorskip("av")
 
 
-@pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder of installed packages of this process."""
-    monkeypatch.syspath_prepend(tmp_path / "site")
+@pytest.fixture(autouse=True)
+def formats() -> Iterator[None]:
+    """Formats are looked for anew."""
     recording_formats.cache_clear()
-    yield tmp_path / "site"
+    yield
     recording_formats.cache_clear()
     sys.modules.pop("neeco_poselines", None)
 

@@ -232,14 +232,15 @@ def test_joints_go_by_their_names(tmp_path: Path) -> None:
     assert table.rows[1, column] == 0.2
 
 
-def test_the_limit_of_joints_leaves_poses_whole_and_a_joint_named_twice_counts_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(_bagfile, "LIMITS", _bagfile.BagLimits(joints=2))
+def test_the_limit_of_joints_leaves_poses_whole_and_a_joint_named_twice_counts_once(tmp_path):
     with BagWriter(tmp_path, "recording.bag") as bag:
         write_arm(bag)
+        for time in TICKS:
+            bag.joints("/many", float(time), **{f"j{number}": time for number in range(401)})
     assert np.shape(read_table(bag.path, ARM).rows) == (40, 8)
-    joints = read_table(bag.path, "/PSM1/measured_js")
-    assert joints.header == ("t_s", "outer_insertion_m", "outer_wrist_pitch_rad")
-    np.testing.assert_allclose(joints.rows[:, 2], TICKS, atol=1e-15)
+    joints = read_table(bag.path, "/many")
+    assert joints.header == ("t_s", *(f"j{number}_rad" for number in range(400)))
+    np.testing.assert_allclose(joints.rows[:, -1], TICKS, atol=1e-15)
     header = SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=0), frame_id="")
     message = SimpleNamespace(name=["a", "b", "a"], position=np.array([1.0, 2.0, 3.0]), header=header)
     samples = _bagfile.Samples(_bagfile.JOINTS)

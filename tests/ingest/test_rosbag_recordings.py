@@ -279,9 +279,10 @@ def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Pat
     assert "its files are compressed as a whole; decompress one with `zstd -d`" in refusal(lambda: read_arm(path))
 
 
-def test_metadata_larger_than_any_recorder_writes_is_refused(tmp_path, bags, monkeypatch):
+def test_metadata_larger_than_any_recorder_writes_is_refused(tmp_path, bags):
     path = _copy(bags["recording-db3"], tmp_path)
-    monkeypatch.setattr(_bagfile, "LIMITS", _bagfile.BagLimits(metadata_bytes=100))
+    with (path / "metadata.yaml").open("ab") as metadata:
+        metadata.write(b"#" * (16 << 20))
     said = refusal(lambda: known(path).streams(path))
     assert "metadata.yaml: is too large; rewrite it with `ros2 bag reindex`" in said
 

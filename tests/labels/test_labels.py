@@ -3,6 +3,7 @@ from copy import copy
 import numpy as np
 import pytest
 import torch
+from rod_world import Rod
 
 from neeco.base.errors import NeecoError
 from neeco.geometry.camera import Camera
@@ -18,6 +19,7 @@ from neeco.labels.labellers import (
 )
 from neeco.labels.settings import LABELS
 from neeco.raster import Rendering, rasterize
+from neeco.scene.deformation import Deltas
 from neeco.synthesis.generator import UNOBSERVED_SIDE, UNOBSERVED_TISSUE, Acceptance
 
 
@@ -178,12 +180,14 @@ def test_otsu_falls_between_two_clusters_orders_of_magnitude_apart():
     assert otsu_of_magnitudes(torch.ones(10)) is None
 
 
-def test_a_scene_that_does_not_move_cannot_be_labelled_by_threshold(scene, monkeypatch):
-    from neeco.scene.deformation import Deltas
+class Still(Rod):
+    def deltas(self, canonical, state) -> Deltas:
+        return Deltas(*(torch.zeros(len(canonical), columns) for columns in (3, 4, 3)))
 
-    count = len(scene.canonical)
-    still = Deltas(torch.zeros(count, 3), torch.zeros(count, 4), torch.zeros(count, 3))
-    monkeypatch.setattr(scene.deformation, "deltas", lambda canonical, state: still)
+
+def test_a_scene_that_does_not_move_cannot_be_labelled_by_threshold(scene):
+    scene = copy(scene)
+    scene.deformation = Still(30)
     with pytest.raises(NeecoError, match="moves nothing"):
         find_thresholds(scene)
 

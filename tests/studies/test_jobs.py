@@ -229,11 +229,11 @@ def test_a_folder_of_another_job_is_refused_before_any_work(
         run_jobs([replace(finished_job, capture=tmp_path / "other")])
 
 
-def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, monkeypatch) -> None:
+def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, site, environment) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         closed = server.getsockname()[1]
-    monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{closed}")
+    (site / "ray.py").touch()
+    environment["RAY_ADDRESS"] = f"127.0.0.1:{closed}"
     with pytest.raises(NeecoError, match=f"RAY_ADDRESS: no Ray cluster answers at 127.0.0.1:{closed}"):
         run_jobs([make_job()], workers=2)
 

@@ -18,7 +18,7 @@ from neeco.base.files import LOCK, TEMPORARY
 from neeco.capture.writer import state_to_json
 from neeco.labels.settings import LABELS
 from neeco.synthesis.dataset import synthesize
-from neeco.synthesis.generator import Acceptance, SampleGenerator, draw_encoded
+from neeco.synthesis.generator import SampleGenerator, draw_encoded
 from neeco.synthesis.rendered_views import render, split_views, state_views
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers import WrittenImages
@@ -282,19 +282,13 @@ def test_a_folder_that_is_not_empty_is_left_alone(run, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-def test_states_that_are_refused_are_drawn_anew_and_counted(run, tmp_path, monkeypatch):
-    refusals = iter(["leaves the image", "enters the tissue", None, None])
-    monkeypatch.setattr(Acceptance, "refusal", lambda self, drawing: next(refusals))
-    summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2))
-    assert summary.refused == {"leaves the image": 1, "enters the tissue": 1}
-    assert json.loads((tmp_path / "dataset/dataset.json").read_text())["refused"] == summary.refused
-
-
-def test_given_states_that_are_refused_are_skipped_and_named(run, tmp_path, state):
-    given = states_file(tmp_path / "states.jsonl", [state(), state(x=200.0), state(x=3.0)])
-    summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=3, states=given, max_attempts=2))
-    assert summary.skipped == [1]
+def test_given_states_that_are_refused_are_skipped_and_counted_by_reason(run, tmp_path, state):
+    given = states_file(tmp_path / "states.jsonl", [state(), state(x=200.0), state(x=3.0), state(z=130.0)])
+    summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=4, states=given, max_attempts=2))
+    assert summary.skipped == [1, 3]
     assert sorted(path.name for path in (tmp_path / "dataset/images").iterdir()) == ["000000.png", "000002.png"]
+    assert summary.refused == {"leaves the image": 2, "enters the tissue": 2}
+    assert json.loads((tmp_path / "dataset/dataset.json").read_text())["refused"] == summary.refused
 
 
 @pytest.mark.parametrize(

@@ -99,13 +99,15 @@ def test_still_tissue_does_not_breathe() -> None:
     assert find_breathing(*wall(moving=False)) is None
 
 
-def test_an_interrupted_run_goes_on_breathing(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def begin(self: Static, training: object) -> None:
-        tissue = 10 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
-        self.start_breathing(Breathing.of(tissue, 0.2, torch.full((2 * BREATHING.n_harmonics, 3), 0.5), 0.1))
+def test_an_interrupted_run_goes_on_breathing(capture: Path, tmp_path: Path, registered) -> None:
+    @registered
+    class Breathes(Static):
+        method = "breathes"
 
-    monkeypatch.setattr(Static, "begin", begin)
-    config = training_config(
-        "3dgs", {"iterations": 30}, ["density_start=10", "log_interval=5", "checkpoint_interval=10"]
-    )
+        def begin(self, training: object) -> None:
+            tissue = 10 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
+            self.start_breathing(Breathing.of(tissue, 0.2, torch.full((2 * BREATHING.n_harmonics, 3), 0.5), 0.1))
+
+    short = ["density_start=10", "log_interval=5", "checkpoint_interval=10"]
+    config = training_config("breathes", {"iterations": 30}, short)
     train_interrupted(capture, tmp_path, config, 15)

@@ -19,7 +19,7 @@ from capture_files import write_capture
 
 from neeco.base.errors import NeecoError
 from neeco.cli import main
-from neeco.training import train as module
+from neeco.methods.static import Static
 from neeco.training.config import training_config
 from neeco.training.run import checkpoint_path, load_run, read_checkpoint
 from neeco.training.session import GaussianSession
@@ -51,7 +51,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_stopped_run_keeps_its_last_step_and_ends_in_the_same_bytes(number, stop, whole, capture, tmp_path):
     handlers = signal.getsignal(signal.SIGINT), signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with pytest.raises(KeyboardInterrupt, match=f"at iteration {stop}; go on with: neeco train .* --resume"):
+        with pytest.raises(KeyboardInterrupt, match=f"at iteration {stop}; continue with: neeco train .* --resume"):
             train(capture, tmp_path / "cut", CONFIG, progress=signalling(stop, number))
         assert signal.getsignal(signal.SIGINT) is handlers[0]
         assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
@@ -83,7 +83,7 @@ def test_rows_after_going_on_average_over_the_steps_before_the_stop_too(capture:
 
 
 def test_a_second_ctrl_c_stops_at_once(capture: Path, tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt, match="at iteration 12; go on with"):
+    with pytest.raises(KeyboardInterrupt, match="at iteration 12; continue with"):
         train(capture, tmp_path / "run", CONFIG, progress=signalling(12, signal.SIGINT, signal.SIGINT))
     assert not checkpoint_path(tmp_path / "run").exists()
 
@@ -93,7 +93,7 @@ def test_ctrl_c_while_finishing_loses_no_step(whole: Path, capture: Path, tmp_pa
         if row.note.startswith("finishing"):
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match="while finishing; go on with"):
+    with pytest.raises(KeyboardInterrupt, match="while finishing; continue with"):
         train(capture, tmp_path / "cut", CONFIG, progress=interrupt)
     steps: list[int] = []
     train(capture, tmp_path / "cut", CONFIG, resume=True, progress=lambda row: steps.append(row.iteration))
@@ -101,13 +101,18 @@ def test_ctrl_c_while_finishing_loses_no_step(whole: Path, capture: Path, tmp_pa
     assert (tmp_path / "cut" / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
 
 
-def test_ctrl_c_before_the_first_step_leaves_nothing(capture, tmp_path, monkeypatch, capsys):
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
+def test_ctrl_c_before_the_first_step_leaves_nothing(capture, tmp_path, registered, capsys):
+    @registered
+    class Stopped(Static):
+        method = "stopped"
 
-    monkeypatch.setattr(module, "begin_session", interrupted)
-    assert main(["train", str(capture), "--output", str(tmp_path / "runs" / "mine"), "--method", "3dgs"]) == 130
-    assert capsys.readouterr().err.strip() == ("neeco: interrupted: before the first step; run the same command again")
+        def begin(self, training: object) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(30)
+
+    assert main(["train", str(capture), "--output", str(tmp_path / "runs" / "mine"), "--method", "stopped"]) == 130
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told == "neeco: interrupted: before the first step; run the same command again"
     assert not (tmp_path / "runs").exists()
 
 
@@ -123,7 +128,7 @@ def test_the_command_line_tells_how_to_go_on_and_going_on_works(capture: Path, t
     assert started.returncode == 130, told
     assert "Traceback" not in told
     last = told.strip().splitlines()[-1]
-    found = re.fullmatch(r"neeco: interrupted: at iteration (\d+); go on with: neeco (.*)", last)
+    found = re.fullmatch(r"neeco: interrupted: at iteration (\d+); continue with: neeco (.*)", last)
     assert found, told
     assert int(found[1]) % CONFIG.checkpoint_interval != 0  # so the checkpoint was written for this stop
     assert shlex.split(found[2]) == ["train", str(capture), "--output", str(tmp_path / "my run"), "--resume"]

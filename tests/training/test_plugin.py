@@ -27,15 +27,13 @@ from neeco.training.run import load_run
 from neeco.viewer.views import picture, views_of
 
 
-@pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder of installed packages of this process."""
-    site = tmp_path / "site"
-    monkeypatch.syspath_prepend(site)
+@pytest.fixture(autouse=True)
+def looked_for_anew() -> Iterator[None]:
+    """What is installed."""
     found = (methods, writers, find_models)
     for cached in found:
         cached.cache_clear()
-    yield site
+    yield
     for cached in found:
         cached.cache_clear()
     for name in ("neeco_rigid", "neeco_boxlist", "neeco_pixelwise"):

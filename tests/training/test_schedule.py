@@ -10,6 +10,7 @@ from capture_files import write_capture
 
 from neeco.base.errors import NeecoError
 from neeco.methods.kinematic.deformation import Kinematic
+from neeco.methods.static import Static
 from neeco.training.config import method_defaults, training_config
 from neeco.training.schedule import DensityPhase, Schedule, ScheduleConfig, order_by_pose
 from neeco.training.train import train
@@ -124,15 +125,20 @@ def test_poses_on_a_line_are_walked_from_end_to_end() -> None:
 
 
 @pytest.mark.parametrize("batch_size", [1, 3])
-def test_an_event_comes_once_by_share_or_by_iteration_in_the_order_of_the_schedule(batch_size, tmp_path, monkeypatch):
+def test_an_event_comes_once_by_share_or_by_iteration_in_the_order_of_the_schedule(batch_size, tmp_path, registered):
     """However many iterations a step has."""
     acted: list[str] = []
-    monkeypatch.setattr(Kinematic, "act", lambda self, training, action: acted.append(action))
+
+    @registered
+    class Acts(Static):
+        method, actions = "acts", Kinematic.actions
+
+        def act(self, training, action: str) -> None:
+            acted.append(action)
+
     events = "[{at: 0.5, action: place_wrists}, {at: 0.1, action: fit_states}, {at: 0.1, action: find_shadow}"
     events += ", {at: 7, action: observe_silhouettes}, {at: 13, action: refine_wrists}]"
-    small = {"tissue_steps": 5, "long_tissue_steps": 5, "seeds": 300}
-    settings = [f"schedule.events={events}", *(f"deformation.carving.{name}={value}" for name, value in small.items())]
-    config = training_config("kinematic", {"iterations": 12, "batch_size": batch_size}, settings)
+    config = training_config("acts", {"iterations": 12, "batch_size": batch_size}, [f"schedule.events={events}"])
     train(write_capture(tmp_path / "capture"), tmp_path / "run", config)
     assert sorted(acted) == ["find_shadow", "fit_states", "observe_silhouettes", "place_wrists"]
     assert acted.index("fit_states") < acted.index("find_shadow") < acted.index("place_wrists")

@@ -62,32 +62,35 @@ def test_with_instruments_what_moves_is_labelled_at_the_end(tmp_path: Path) -> N
     assert float(spread[labels[:, 0] == 1].min()) >= float(spread[labels[:, 0] == 0].max()) * 0.99
 
 
-def test_planes_are_regularised_from_the_moment_they_wake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planes_are_regularised_from_the_moment_they_wake(tmp_path: Path, registered) -> None:
     asked: list[bool] = []
-    real = HexPlane.regularisation
 
-    def regularisation(self, canonical, rendering, iteration):
-        asked.append(self.warming_up)
-        return real(self, canonical, rendering, iteration)
+    @registered
+    class Asked(HexPlane):
+        method = "asked"
 
-    monkeypatch.setattr(HexPlane, "regularisation", regularisation)
-    config = training_config("4dgs", {"iterations": 34}, SMALL["4dgs"])
+        def regularisation(self, canonical, rendering, iteration):
+            asked.append(self.warming_up)
+            return super().regularisation(canonical, rendering, iteration)
+
+    config = training_config("asked", {"iterations": 34}, SMALL["4dgs"])
     train(write_capture(tmp_path / "capture"), tmp_path / "run", config)
     assert asked == [False] * 29  # resting while done / 34 < 3 / 17: through the fifth step
 
 
-def test_training_disturbs_the_time_until_half_of_the_run_and_drawing_never_does(tmp_path, monkeypatch):
+def test_training_disturbs_the_time_until_half_of_the_run_and_drawing_never_does(tmp_path, registered):
     asked: list[tuple[bool, float]] = []
-    real = TimeMLP.pose
 
-    def pose(self, canonical, state, perturbation=UNPERTURBED):
-        asked.append(
-            (torch.is_grad_enabled() and canonical.means.requires_grad, getattr(perturbation, "time_noise", 0.0))
-        )
-        return real(self, canonical, state, perturbation)
+    @registered
+    class Asked(TimeMLP):
+        method = "asked"
 
-    monkeypatch.setattr(TimeMLP, "pose", pose)
-    config = training_config("deformable-3dgs", {"iterations": 10}, SMALL["deformable-3dgs"])
+        def pose(self, canonical, state, perturbation=UNPERTURBED):
+            training = torch.is_grad_enabled() and canonical.means.requires_grad
+            asked.append((training, getattr(perturbation, "time_noise", 0.0)))
+            return super().pose(canonical, state, perturbation)
+
+    config = training_config("asked", {"iterations": 10}, SMALL["deformable-3dgs"])
     scene = load_run(train(write_capture(tmp_path / "capture"), tmp_path / "run", config)).scene
     trained = [noise for training, noise in asked if training]
     assert trained == pytest.approx([0.08, 0.06, 0.04, 0.02, 0, 0, 0, 0, 0, 0], abs=1e-9)
