@@ -117,7 +117,7 @@ EDITS = [
     (_uncertainty(rotation_deg=[1, -1, 2]), "frames[3].instruments[0].uncertainty.rotation_deg[1]", "out of range"),
     (_uncertainty(joints_deg={"x": 1}), "frames[3].instruments[0].uncertainty.joints_deg.x", "no such joint"),
     (_uncertainty(joints_deg=[]), "frames[3].instruments[0].uncertainty.joints_deg", "expected an object"),
-    (_shared(np.diag([1.0] * 5 + [-1.0]).tolist()), "instruments[0].base_uncertainty.covariance", "no covariance"),
+    (_shared(np.diag([1.0] * 5 + [-1.0]).tolist()), "instruments[0].base_uncertainty.covariance", "not a covariance"),
     (_shared([[1.0] * 5] * 6), "instruments[0].base_uncertainty.covariance[0]", "6 numbers"),
     (_from_video({"shaft_diameter_mm": 0}), "instruments[0].from_video.shaft_diameter_mm", "out of range"),
     (_from_video({"shaft_diameter_mm": 5}), "instruments[0].from_video.working_length_mm", "expected a number"),
@@ -166,12 +166,12 @@ def _scale(pose, factor):
 )
 def test_cameras_without_points_in_view_are_an_error(folder, mistake):
     folder.edit_cameras(mistake)
-    assert_found(folder, "frames[*].transform_matrix", "no camera has any point in its image")
+    assert_found(folder, "frames[*].transform_matrix", "no camera observes any point")
 
 
 def test_positions_in_metres_are_an_error(folder):
     folder.edit_poses(lambda pose: _scale(pose, 1e-3))
-    assert_found(folder, "frames[*].instruments[*].pose", "metres?")
+    assert_found(folder, "frames[*].instruments[*].pose", "probably metres")
 
 
 def test_a_whole_capture_in_metres_is_noticed(folder):
@@ -236,7 +236,7 @@ def test_a_roll_that_nobody_knows_is_a_warning(folder):
 
 def test_a_tracker_dropout_is_a_warning(folder):
     folder.edit(lambda d: [d["frames"][6]["instruments"][0]["pose"][row].__setitem__(3, 200.0) for row in range(3)])
-    assert_found(folder, "frames[6].instruments[0].pose", "where it usually is", "warning")
+    assert_found(folder, "frames[6].instruments[0].pose", "its median position", "warning")
 
 
 def test_unregistered_instruments_are_a_warning_and_not_located(folder):
@@ -414,7 +414,7 @@ def _tree(**changes):
 @pytest.mark.parametrize(
     ("changes", "field", "words", "severity"),
     [
-        ({"value": {"elbow": 1}}, "instruments", "'elbow' is no joint of it (recorded: jaw_angle)", "error"),
+        ({"value": {"elbow": 1}}, "instruments", "'elbow' is not a joint of it (recorded: jaw_angle)", "error"),
         ({"offset": 50.0, "limits": [-1, 1]}, "instruments", "8 frames, outside its limits", "warning"),
         ({"parent": "wrist"}, "instruments[0].kinematics.links", "the links form a cycle", "error"),
         ({"type": "hinge"}, "instruments[0].kinematics.links[1].type", "is 'hinge'", "error"),
@@ -472,8 +472,12 @@ def test_a_joint_that_nobody_recorded_stands_halfway_and_is_not_written(folder, 
     [
         (_unrecorded({"recorded": False}), "instruments[0].joints.jaw_angle.limits", "is missing"),
         (_unrecorded({"recorded": 0, "limits": [0, 1]}), "instruments[0].joints.jaw_angle.recorded", "true or false"),
-        (_unrecorded(pose_of="wrist"), "instruments", "the pose of 'wrist' depends on 'jaw_angle'"),
-        (_unrecorded(keep=True), "frames[0].instruments[0].joints.jaw_angle", "in the header as not recorded"),
+        (
+            _unrecorded(pose_of="wrist"),
+            "instruments",
+            "the pose of 'wrist' depends on the unrecorded joint 'jaw_angle'",
+        ),
+        (_unrecorded(keep=True), "frames[0].instruments[0].joints.jaw_angle", "but the header declares it unrecorded"),
     ],
 )
 def test_a_joint_that_nobody_recorded_is_checked(folder, edit, field, words):

@@ -200,7 +200,7 @@ def shuffle(document: Document) -> None:
 
 def test_poses_in_the_axes_of_a_robots_endoscope_are_named(sample):
     (line,) = told(sample, in_ecm_axes)
-    assert line.startswith("frames[*].instruments[*].pose: poses of 'maryland' were turned into the world with the")
+    assert line.startswith("frames[*].instruments[*].pose: poses of 'maryland' were converted to the world with the")
 
 
 def test_states_that_nothing_explains_contradict_the_images_and_no_cause_is_named(sample):

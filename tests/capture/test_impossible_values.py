@@ -79,8 +79,8 @@ def test_states_of_a_file_for_each_split_are_read(folder):
 def test_states_under_another_name_are_not_dropped_in_silence(folder, key):
     folder.edit(lambda document: document.pop("instruments"))
     folder.edit(lambda document: [frame.update({key: frame.pop("instruments")}) for frame in document["frames"]])
-    (line,) = [line for line in told(folder) if "not read" in line]
-    assert f"frames[0].{key}: is not read: instrument states belong into `instruments`" in line
+    (line,) = [line for line in told(folder) if "is ignored" in line]
+    assert f"frames[0].{key}: is ignored: instrument states must be in `instruments`" in line
 
 
 def mask_frames(folder, shown: np.ndarray) -> None:
@@ -112,12 +112,12 @@ RENAMED = {
     "upper": (
         lambda path: path.with_suffix(".PNG"),
         lambda text: text,
-        "'images/000000.PNG' is there, in another Unicode form or case",
+        "'images/000000.PNG' exists, in another Unicode form or case",
     ),
-    "backslash": (lambda path: path, lambda text: text.replace("/", "\\"), "'images/000000.png' is there"),
-    "no extension": (lambda path: path, lambda text: text[:-4], "'images/000000.png' is there"),
-    "other extension": (lambda path: path, lambda text: text[:-3] + "jpeg", "'images/000000.png' is there"),
-    "other folder": (lambda path: path, lambda text: text.replace("images", "rgb"), "'images/000000.png' is there"),
+    "backslash": (lambda path: path, lambda text: text.replace("/", "\\"), "'images/000000.png' exists"),
+    "no extension": (lambda path: path, lambda text: text[:-4], "'images/000000.png' exists"),
+    "other extension": (lambda path: path, lambda text: text[:-3] + "jpeg", "'images/000000.png' exists"),
+    "other folder": (lambda path: path, lambda text: text.replace("images", "rgb"), "'images/000000.png' exists"),
     "decomposed": (
         lambda path: path.with_name(unicodedata.normalize("NFD", f"ü{path.name}")),
         lambda text: text.replace("/", "/ü"),

@@ -129,7 +129,7 @@ def test_a_tool_without_jaws_has_one_end_effector(tmp_path: Path) -> None:
         (('"modified"', '"standard"'), "DH.convention: is 'standard', not 'modified'"),
         (('"wrist_yaw"', '"elbow"'), "DH.joints: there is no joint wrist_yaw"),
         (('"A": 0.0091', '"A": "x"'), r"DH.joints\[2\].A: expected a number, found 'x'"),
-        (("{", "["), "not readable as a tool file of the dVRK"),
+        (("{", "["), "cannot be read as a tool file of the dVRK"),
     ],
 )
 def test_a_tool_file_of_another_kind_is_refused(tmp_path: Path, change: tuple[str, str], message: str) -> None:
@@ -144,7 +144,9 @@ def test_a_tool_file_of_another_kind_is_refused(tmp_path: Path, change: tuple[st
 def test_a_reading_that_a_tool_does_not_have_is_named(tmp_path: Path) -> None:
     file = tmp_path / "tool.json"
     file.write_text(TOOL)
-    with pytest.raises(NeecoError, match="'elbow' is no joint of this tool; it has wrist_pitch, wrist_yaw, jaw"):
+    with pytest.raises(
+        NeecoError, match="'elbow' is not a joint of this tool; choose one of: wrist_pitch, wrist_yaw, jaw"
+    ):
         read_dvrk_tool(file, {"elbow": "q3"})
 
 
@@ -167,9 +169,9 @@ def changed(index: int, **fields: object) -> dict:
         (changed(2, type="fixed"), "'wrist': readings drive a fixed joint"),
         (changed(1, type="prismatic", axis=[1, 0, 0]), "'shaft': the root has no parent to move against"),
         (changed(2, type="screw"), r"links\[2\].type: is 'screw'; write fixed, revolute, prismatic"),
-        (changed(2, axis=[0, 0, 0]), r"links\[2\].axis: is no direction"),
+        (changed(2, axis=[0, 0, 0]), r"links\[2\].axis: is not a direction"),
         (changed(2, axis=None), r"links\[2\].axis: is missing"),
-        (changed(2, origin=[0, 0, 1e6]), r"links\[2\].origin: lies 1e\+06 mm away"),
+        (changed(2, origin=[0, 0, 1e6]), r"links\[2\].origin: is 1e\+06 mm away"),
         (changed(2, origin=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 2, 0]]), r"links\[2\].origin: "),
         (changed(2, value={"pitch": float("nan")}), r"links\[2\].value.pitch: is nan"),
         (changed(2, limits=[1, 0]), r"links\[2\].limits: 1 is not below 0"),

@@ -255,8 +255,8 @@ def write_colmap(folder, root: Path, binary: bool, model: str = "PINHOLE", disto
     ("model", "parameters", "message"),
     [
         ("FISHEYE", (), "FISHEYE: the images are distorted .*; undistort them: neeco ingest"),
-        ("EUCM", (0.5, 1.1), "camera model is EUCM .*; run `colmap image_undistorter` first"),
-        ("DIVISION", (-0.1,), "camera model is DIVISION .*; run `colmap image_undistorter` first"),
+        ("EUCM", (0.5, 1.1), "camera model is EUCM .*; convert it to PINHOLE with `colmap image_undistorter`"),
+        ("DIVISION", (-0.1,), "camera model is DIVISION .*; convert it to PINHOLE with `colmap image_undistorter`"),
     ],
 )
 def test_camera_models_of_newer_colmap_are_named(folder, tmp_path, binary, model, parameters, message):
@@ -268,7 +268,7 @@ def test_camera_models_of_newer_colmap_are_named(folder, tmp_path, binary, model
 
 def test_an_unknown_camera_model_of_colmap_is_newer_and_not_damage(folder, tmp_path):
     write_colmap(folder, tmp_path, True, "OF_TOMORROW")
-    with pytest.raises(NeecoError, match=r"camera model 99 is not known; run `colmap image_undistorter`"):
+    with pytest.raises(NeecoError, match=r"camera model 99 is unknown; run `colmap image_undistorter`"):
         read_capture(tmp_path)
 
 

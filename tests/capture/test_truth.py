@@ -58,8 +58,8 @@ def test_files_that_evaluation_would_pass_over_are_named(root: Path) -> None:
     Image.open(file).convert("L").save(file.with_suffix(".jpg"))
     os.rename(file, file.with_name("unknown.png"))
     jpeg, unknown = sorted(told_of(root))
-    assert jpeg.endswith("no frame has this mask; masks are PNG files with the names of the images")
-    assert "unknown.png: no frame has this mask" in unknown
+    assert jpeg.endswith("belongs to no frame; masks must be PNG files with the names of the images")
+    assert "unknown.png: belongs to no frame" in unknown
 
 
 def test_further_files_about_a_frame_that_has_its_mask_are_not_told_of(root: Path) -> None:

@@ -83,15 +83,15 @@ def test_of_links_without_anything_visual_all_are_bodies(file: Path) -> None:
     [
         (
             ('type="prismatic"', 'type="floating"'),
-            "joint 'insertion' is floating; fixed, revolute, .*prismatic are supported",
+            "joint 'insertion' is floating; use one of: fixed, revolute, .*prismatic",
         ),
-        (('"0 2 0"', '"0 0 0"'), "joint 'pitch': its axis is no direction"),
+        (('"0 2 0"', '"0 0 0"'), "joint 'pitch': its axis is not a direction"),
         (('mimic joint="open"', 'mimic joint="shut"'), "joint 'open_too' mimics 'shut'"),
-        (('child link="wrist"', 'child link="hand"'), "joint 'pitch' joins 'hand', which is no link"),
-        (('"tip"', '"jaw_b"'), "'jaw_b' is reached twice"),
-        (('lower="-1.2"', 'lower="2"'), "joint 'pitch': its limits 2 to 1.2 are no range"),
-        (("</robot>", ""), "not readable as a URDF file"),
-        (('<link name="base"/>', '<link name="base"/><link name="cart"/>'), "found base, cart; name `root`"),
+        (('child link="wrist"', 'child link="hand"'), "joint 'pitch' connects 'hand', which is not a link"),
+        (('"tip"', '"jaw_b"'), "'jaw_b' has several paths to the root"),
+        (('lower="-1.2"', 'lower="2"'), "joint 'pitch': its limits 2 to 1.2 are not a range"),
+        (("</robot>", ""), "cannot be read as a URDF file"),
+        (('<link name="base"/>', '<link name="base"/><link name="cart"/>'), "found base, cart; set `root`"),
     ],
 )
 def test_a_urdf_that_is_no_tree_is_one_line(file: Path, change: tuple[str, str], message: str) -> None:
@@ -104,10 +104,10 @@ def test_a_urdf_that_is_no_tree_is_one_line(file: Path, change: tuple[str, str],
 
 def test_names_that_are_none_of_its_are_told(file: Path) -> None:
     with pytest.raises(
-        NeecoError, match="readings: 'jaw' is no joint that moves; it has insertion, open, open_too, pitch"
+        NeecoError, match="readings: 'jaw' is not a moving joint; choose of: insertion, open, open_too, pitch"
     ):
         read_urdf(file, readings={"jaw": "a"})
-    with pytest.raises(NeecoError, match="root: there is no link 'arm'; name one of base, shaft"):
+    with pytest.raises(NeecoError, match="root: there is no link 'arm'; choose one of: base, shaft"):
         read_urdf(file, root="arm")
 
 

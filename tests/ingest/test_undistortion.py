@@ -153,7 +153,7 @@ def test_frames_without_an_image_are_left_out_with_their_count(tmp_path):
     assert len(read_capture(tmp_path / "new").frames) == COUNT - 1
     for file in (source / "images").iterdir():
         file.rename(file.with_suffix(".PNG"))
-    with pytest.raises(NeecoError, match=r"no such file: '000.png'.*'000.PNG' is there"):  # nothing to leave out
+    with pytest.raises(NeecoError, match=r"no such file: '000.png'.*'000.PNG' exists"):  # nothing to leave out
         convert_folder(source, tmp_path / "other")
 
 
@@ -169,7 +169,7 @@ def test_frames_without_an_image_are_left_out_with_their_count(tmp_path):
         ({"distortion_params": [0.1, 0, 0, 0], "k1": 0.2}, "k1: is 0.2, but distortion_params.0. differs"),
         ({"k1": float("nan")}, "k1: is nan, not a finite number"),
         ({"k1": -5.0}, "folds the image over"),
-        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "a fisheye lens has coefficients k1 to k4 alone"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "a fisheye lens has only coefficients k1 to k4"),
     ],
 )
 def test_a_distortion_that_cannot_be_undone_is_refused(tmp_path, camera, words):

@@ -25,7 +25,7 @@ __all__ = ["CaptureSummary", "Checked", "check_capture", "inspect_capture", "rea
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureSummary:
-    """Counts and ranges of what could be read."""
+    """Counts and ranges of the parsed data."""
 
     splits: dict[str, int]  # name -> number of frames
     points: int  # number of measured points
@@ -80,7 +80,7 @@ def inspect_capture(
     report = ProblemReport()
     parsed = parse_capture(path, report, transforms)
     if not parsed.frames and not errors_only(report.problems):
-        report.error(transforms, "frames", "holds no usable frame", "list images and their cameras there")
+        report.error(transforms, "frames", "contains no usable frame", "list images and their cameras there")
     capture = None if errors_only(report.problems) else capture_of(parsed)
     if parsed.frames:
         pictures = read_pictures(parsed)

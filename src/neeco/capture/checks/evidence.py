@@ -2,7 +2,7 @@
 
 Colours: a sparse point has the colour of the pixel that it projects to. Lighting and exposure vary between images, so
 differences between a point's brightness and its neighbours' are correlated with those in the image: by 0.3 to 0.7 if
-images and cameras belong together, by less than 0.1 if not.
+images and cameras correspond, by less than 0.1 if not.
 
 Motion: each frame is predicted from frames of nearby cameras, warped by the sparse points' depth; where the prediction
 fails, something moves. If the poses are correct, a point fixed to the instrument lies on moving pixels in all frames.
@@ -238,7 +238,7 @@ class MotionEvidence:
         # [F, h, w] confidence in [0, 1] that a pixel moves
         moving = np.stack([cv2.blur(((pixels - low) / (high - low)).clip(0, 1), (3, 3)) for pixels in differences])
         self._choose_rays(moving)
-        # whatever moves everywhere or always is no evidence; nor are outside pixels, in a border of one pixel
+        # uniform and permanent motion, and pixels outside the image (a border of one pixel), are not evidence
         evidence = np.pad((moving - moving.mean(0)).astype(np.float32), ((0, 0), (1, 1), (1, 1)))
         self._evidence, self._first = evidence.ravel(), np.arange(len(valid), dtype=np.int32) * evidence[0].size
 
@@ -284,12 +284,12 @@ class MotionEvidence:
     def _neighbours(self, index: int) -> list[int]:
         """Return frames with cameras near that of `index`, spread over the time that they span."""
         poses, pose = self.cameras.poses, self.cameras.poses[index]
-        aside = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.median(self.depths[index])
+        shift = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.median(self.depths[index])
         cosine = (np.einsum("ij,fij->f", pose[:3, :3], poses[:, :3, :3]) - 1) / 2
-        apart = aside + np.arccos(cosine.clip(-1, 1))
-        apart[index] = np.inf
+        distance = shift + np.arccos(cosine.clip(-1, 1))
+        distance[index] = np.inf
         count = min(len(poses) - 1, max(3 * SETTINGS.predicting, len(poses) // 2))
-        near = np.sort(np.argsort(apart, kind="stable")[:count])
+        near = np.sort(np.argsort(distance, kind="stable")[:count])
         return near[evenly_spaced(len(near), SETTINGS.predicting)].tolist()
 
     def _choose_rays(self, moving: np.ndarray) -> None:
@@ -319,14 +319,14 @@ class MotionEvidence:
         return rays
 
     def without(self, others: list[np.ndarray], poses: np.ndarray) -> MotionEvidence | None:
-        """Return the rays without those that poses of other instruments, each [F, 4, 4], explain better than `poses`
-        do: the motion of one arm may resemble the mirrored one of another. None if too few remain."""
+        """Return the rays that poses of other instruments, each [F, 4, 4], do not explain better than `poses`: the
+        motion of one arm may resemble the mirrored motion of another. None if too few remain."""
         if not others:
             return self
-        everywhere = np.ones(len(poses), dtype=bool)
-        explained, *theirs = (self.explained(self.evidence(one), everywhere) for one in (poses, *others))
-        rest = np.max(theirs, axis=0) <= np.maximum(explained, SETTINGS.min_ray_evidence)
-        return self._subset(rest) if self.enough(self.ray_views[rest]) else None
+        all_frames = np.ones(len(poses), dtype=bool)
+        explained, *by_others = (self.explained(self.evidence(one), all_frames) for one in (poses, *others))
+        remaining = np.max(by_others, axis=0) <= np.maximum(explained, SETTINGS.min_ray_evidence)
+        return self._subset(remaining) if self.enough(self.ray_views[remaining]) else None
 
     def _subset(self, rays: np.ndarray | slice, depths: slice = slice(None)) -> MotionEvidence:
         few = copy.copy(self)

@@ -33,7 +33,7 @@ def check_frames(parsed: Parsed) -> None:
         message = f"few frames: {counts['train']} to train on, fewer than {few} give a poor scene"
         frames.warning(message, "record more if you can")
     if not counts["test"]:
-        frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")
+        frames.warning("split 'test' is empty", "without it the scene cannot be evaluated")
     if parsed.still:
         poses = [frame.camera.world_from_camera.double() for frame in parsed.with_cameras().frames]
         if (
@@ -46,7 +46,7 @@ def check_frames(parsed: Parsed) -> None:
         frames.warning("not every frame has a time; their order is used instead", "add `time` in seconds")
     elif len(times) == 1 and not all(_is_same(parsed.frames[0], frame) for frame in parsed.frames):
         message = f"every frame has the time {times.pop():g}, though states differ"
-        frames.warning(message, "write seconds, or leave `time` out")
+        frames.warning(message, "write seconds, or remove `time`")
     first: dict[Path, Node] = {}
     for frame, place in zip(parsed.frames, parsed.places, strict=True):
         earlier = first.setdefault(frame.image_path, place)
@@ -57,7 +57,7 @@ def check_frames(parsed: Parsed) -> None:
 
 def check_pictures(parsed: Parsed, pictures: Sequence[Picture]) -> None:
     """Report images and masks that are damaged, of the wrong size, empty, inverted, or with the same pixels."""
-    # the reader may have reported an image whose size it wanted to know
+    # the reader may have reported an image whose size it needed
     reported = [place.child("file_path").reported for place in parsed.places]
     first: dict[bytes, int] = {}
     for index, (picture, place) in enumerate(zip(pictures, parsed.places, strict=True)):
@@ -66,7 +66,7 @@ def check_pictures(parsed: Parsed, pictures: Sequence[Picture]) -> None:
         if picture.mask_error:
             place.child("mask_path").error(*picture.mask_error.split("; ", 1))
         if picture.uniform:
-            place.child("file_path").warning("every pixel of the image has one colour", "was the camera covered?")
+            place.child("file_path").warning("all pixels have the same colour", "check whether the camera was covered")
         elif picture.digest is not None and (earlier := first.setdefault(picture.digest, index)) != index:
             one, two = parsed.frames[earlier], parsed.frames[index]
             message = f"duplicate frame: same pixels as {parsed.places[earlier].field} ({one.image_path.name!r})"
@@ -79,7 +79,7 @@ def check_pictures(parsed: Parsed, pictures: Sequence[Picture]) -> None:
                 place.child("file_path").error(message, "drop one of them (a stalled video does this)")
     without = [place for frame, place in zip(parsed.frames, parsed.places, strict=True) if frame.mask_path is None]
     if without and len(without) < len(parsed.frames):
-        message = f"has no mask while other frames do ({len(without)} of {len(parsed.frames)} without)"
+        message = f"has no mask, but other frames do ({len(without)} of {len(parsed.frames)} without)"
         without[0].child("mask_path").warning(message, "its whole image counts in the loss")
     if (fault := masks_fault([picture.hidden for picture in pictures if picture.hidden is not None])) is not None:
         parsed.header("frames[*].mask_path").warning(*fault)
@@ -105,7 +105,7 @@ def check_states(parsed: Parsed) -> None:
         without = [place for frame, place in frames if instrument.name not in frame.state.instruments]
         name = printable(instrument.name)
         if len(without) == len(parsed.frames):
-            message = f"instrument {name} is declared but no frame has it"
+            message = f"instrument {name} is declared, but not in any frame"
             parsed.header("instruments").error(message, "remove it or give its poses")
         else:
             message = f"instrument {name} is missing here ({len(without)} of {len(parsed.frames)} frames lack it)"
@@ -118,7 +118,7 @@ def check_states(parsed: Parsed) -> None:
         stated = [state.uncertainty for _, state in parsed.states_of(instrument.name) if state.uncertainty is not None]
         unknown = sum(uncertainty.rotation_deg[2] > SETTINGS.max_known_roll_deg for uncertainty in stated)
         if 2 * unknown > len(stated):  # from video, it cannot be learned
-            message = f"the roll of {name} is not known in {unknown} of {len(stated)} frames"
+            message = f"the roll of {name} is unknown in {unknown} of {len(stated)} frames"
             parsed.header("frames").warning(message, "log it, or pose frames by hand: neeco view CAPTURE --annotate")
     _check_changes(parsed)
 
@@ -132,7 +132,7 @@ def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
         place = state_place.child("joints").child(joint)
         if joint in instrument.unrecorded:
             if joint in state.joints:
-                place.error("is stated here, and in the header as not recorded", "keep one of the two")
+                place.error("is stated here, but the header declares it unrecorded", "remove one of the two")
                 return
             continue
         if joint not in state.joints:
@@ -152,14 +152,14 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
     place, name = parsed.header("instruments"), printable(instrument.name)
     if missing := [reading for reading in tree.readings if reading not in instrument.joints]:
         recorded = ", ".join(instrument.joints) or "none"
-        message = f"kinematics of {name}: {printable(missing[0])} is no joint of it (recorded: {recorded})"
+        message = f"kinematics of {name}: {printable(missing[0])} is not a joint of it (recorded: {recorded})"
         place.error(message, "name the recorded readings under `value`")
         return
     if unknown := [joint for joint in instrument.unrecorded if joint not in tree.readings]:
-        place.error(f"{name}: no link uses joint {printable(unknown[0])}", "name it in its kinematics")
+        place.error(f"{name}: no link uses joint {printable(unknown[0])}", "add it to the kinematics")
     if tree.pose_of is not None and (needed := tree.readings_of(tree.pose_of) & set(instrument.unrecorded)):
-        message = f"the pose of {printable(tree.pose_of)} depends on {printable(min(needed))}, which nobody recorded"
-        place.error(f"kinematics of {name}: {message}", "record the pose of a link before that joint")
+        message = f"the pose of {printable(tree.pose_of)} depends on the unrecorded joint {printable(min(needed))}"
+        place.error(f"kinematics of {name}: {message}", "record the pose of a link proximal to that joint")
     logged = sorted(set(tree.readings) - set(instrument.unrecorded))
     states = [state for _, state in parsed.states_of(instrument.name) if set(logged) <= set(state.joints)]
     for link in tree.links:
@@ -197,10 +197,10 @@ def _check_changes(parsed: Parsed) -> None:
                 message = f"joint {printable(joint)} of {name} is always {values[joint][0]:g}"
                 frames.warning(message, "its other values cannot be learned")
         elif any(moves.values()):
-            frames.warning(f"the pose of {name} never changes", "is its tracker connected?")
+            frames.warning(f"the pose of {name} never changes", "check the connection of its tracker")
         else:
             still.append(name)
     for name in still:
         message = f"the state of {name} never changes: pose and joints are the same in every frame"
-        remedy = "is its tracker connected? remove it from the capture if it is fixed"
+        remedy = "check the connection of its tracker, or remove the instrument if it is fixed"
         (frames.warning if moving else frames.error)(message, remedy)

@@ -1,4 +1,4 @@
-"""One pass over a capture's images and masks: faults of each file, and the reduced images that are compared."""
+"""One pass over a capture's images and masks: faults of each file, and reduced images for the comparisons."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class Picture:
 
 
 def in_threads(function: Callable[..., Result], *arguments: Iterable[Any]) -> list[Result]:
-    """Return `list(map(function, *arguments))`, computed in threads: Pillow, OpenCV and NumPy let others run."""
+    """Return `list(map(function, *arguments))`, computed in threads: Pillow, OpenCV and NumPy release the GIL."""
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
         return list(pool.map(function, *arguments))
 
 
 def compared_rows(parsed: Parsed) -> np.ndarray:
-    """[F] frames whose images are compared with points and states."""
+    """Return the frames [F] whose images are compared with points and states."""
     return np.array(evenly_spaced(len(parsed.frames), SETTINGS.max_images))
 
 
@@ -55,7 +55,7 @@ def read_pictures(parsed: Parsed) -> list[Picture]:
 
 
 def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """An image area-averaged to (width, height)."""
+    """Return an image area-averaged to (width, height)."""
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
@@ -73,7 +73,7 @@ def _read(parsed: Parsed, compared: set[int], points: np.ndarray, row: int) -> P
         counted = frame.load_mask()
         mask = None if counted is None else counted.numpy()
         if mask is not None and not mask.any():
-            picture.mask_error = "ignores every pixel; black is ignored: invert it, or write 255 instead of 1"
+            picture.mask_error = "ignores every pixel; invert it (black is ignored), or write 255 instead of 1"
         elif mask is not None and pixels is not None:
             camera = None if row in parsed.without_camera else frame.camera
             picture.hidden = measure_hidden(pixels, mask, camera, points)
@@ -84,6 +84,6 @@ def _read(parsed: Parsed, compared: set[int], points: np.ndarray, row: int) -> P
 
 
 def reduced_size(frame: Frame) -> tuple[int, int]:
-    """(width, height) px to which a frame's image is reduced."""
+    """Return (width, height) px to which a frame's image is reduced."""
     factor = min(1.0, SETTINGS.compared_width / frame.camera.width)
     return round(frame.camera.width * factor), max(1, round(frame.camera.height * factor))

@@ -1,4 +1,4 @@
-"""Checks that cameras, points and instruments fit together: distances, units, and visibility.
+"""Consistency checks of cameras, points and instruments: distances, units, and visibility.
 
 For points or instruments out of view, the images determine the mistake.
 """
@@ -27,8 +27,8 @@ def check_placement(parsed: Parsed, verdicts: ImageVerdicts) -> None:
     if not placed.frames:
         return
     if not parsed.registered and parsed.instruments:
-        message = "instrument poses are 'unregistered': in a tracker's or robot's own frame, not the cameras' world"
-        remedy = f"where an instrument is in the images cannot be checked; {HOW_TO_REGISTER}"
+        message = "instrument poses are 'unregistered': in a tracker's or robot's frame, not the cameras' world"
+        remedy = f"positions of instruments in the images cannot be checked; {HOW_TO_REGISTER}"
         parsed.header("instrument_frame").warning(message, remedy)
     if points is not None:
         _check_cameras(placed, points, verdicts)
@@ -38,28 +38,28 @@ def check_placement(parsed: Parsed, verdicts: ImageVerdicts) -> None:
 
 
 def _usable_points(parsed: Parsed) -> np.ndarray | None:
-    """The measured points [P, 3] float64. Reports that there are none, few, or all in one spot; None when unusable."""
+    """Return the measured points [P, 3] float64; None, and reported, if there are none or all coincide. Reports few."""
     place = parsed.points_place
     assert place is not None  # there are frames
     if parsed.points is None or not parsed.points.measured:
         if not place.reported:
-            place.warning("no sparse points", "training starts from random ones, with a poorer result")
+            place.warning("no sparse points", "training starts from random points, with a poorer result")
         return None
     points = parsed.points.positions.astype(np.float64)
     if len(points) == 0:
-        place.error("holds no points", "add SfM points or drop ply_file_path")
+        place.error("contains no points", "add SfM points or remove ply_file_path")
         return None
     if len(points) < SETTINGS.few_points:
         message = f"few sparse points: {len(points)}, fewer than {SETTINGS.few_points}"
-        place.warning(message, "give SfM's whole cloud if you can")
+        place.warning(message, "use the complete SfM point cloud if possible")
     if _radius(points) < 1e-9:
-        place.error("all points are in one spot", "repair the point cloud")
+        place.error("all points coincide", "repair the point cloud")
         return None
     return points
 
 
 def _radius(points: np.ndarray) -> float:
-    """Radius, mm, about their centre that 90% of the points [P, 3] are within."""
+    """Return the 90 % quantile of distances, mm, of points [P, 3] to their median."""
     return float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
 
 
@@ -72,21 +72,21 @@ def _check_cameras(parsed: Parsed, points: np.ndarray, verdicts: ImageVerdicts) 
     visible = cameras.sees(sampled(points)[None]).mean(axis=1)  # [F] share of the points in each image
     too_near = bool(parsed.instruments) and distance < SETTINGS.min_distance_mm
     if too_near or distance > SETTINGS.far_distance * radius:
-        message = f"cameras are {distance:.4g} mm from the points, which span {2 * radius:.4g} mm: metres?"
+        message = f"cameras are {distance:.4g} mm from the points, which span {2 * radius:.4g} mm: probably metres"
         matrices.error(message, ALL_IN_MM)
     elif visible.mean() < SETTINGS.min_visible and (verdict := verdicts.cameras).wrong_poses:
         matrices.error(f"points are outside the images: {verdict.message}", verdict.remedy)
     elif not visible.any():
         remedy = "camera-to-world with OpenGL axes, in the points' frame and unit (mm), is expected"
-        matrices.error("no camera has any point in its image", remedy)
+        matrices.error("no camera observes any point", remedy)
     else:
         for place, away, share in zip(parsed.places, distances, visible, strict=True):
             if away > SETTINGS.max_distance * max(radius, distance):
                 message = f"camera is far from the points: {away:.4g} mm, others {distance:.4g} mm"
                 place.child("transform_matrix").error(message, "repair the pose or drop the frame")
             elif share == 0:
-                remedy = "a wrong pose, or a part of the scene that SfM missed"
-                place.child("transform_matrix").warning("the camera has no point in its image", remedy)
+                remedy = "check its pose, unless SfM missed this part of the scene"
+                place.child("transform_matrix").warning("the camera observes no point", remedy)
 
 
 def _check_instrument(
@@ -101,7 +101,7 @@ def _check_instrument(
     origins = poses[:, :3, 3]
     farthest = float(np.linalg.norm(origins, axis=1).max())
     if np.ptp(origins, axis=0).max() > 0 and farthest < SETTINGS.min_distance_mm:
-        message = f"positions of {name} stay within {farthest:.2g} mm of the frame's origin: metres?"
+        message = f"positions of {name} stay within {farthest:.2g} mm of the frame's origin: probably metres"
         all_poses.error(message, "give them in mm")
     if not parsed.registered or farthest < SETTINGS.min_distance_mm:
         return
@@ -127,19 +127,19 @@ def _check_instrument(
         distances = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
         usual = max(float(np.median(distances)), SETTINGS.min_distance_mm)
         for index in np.flatnonzero((distances > SETTINGS.max_distance * usual) & ~visible):
-            message = f"instrument {name} is {distances[index]:.4g} mm from where it usually is, and out of view"
-            remedy = "a tracker drop-out or unit slip? repair the pose or drop the frame"
+            message = f"instrument {name} is {distances[index]:.4g} mm from its median position, and out of view"
+            remedy = "probably a tracker drop-out or a wrong unit: repair the pose or drop the frame"
             places[index].child("pose").warning(message, remedy)
     elif verdict is not None and verdict.status == "undecided":
         behind = visible.any() or _body_visible(cameras, poses) > SETTINGS.min_body_visible
-        remedy = "right only if its sensor sits far behind the tip"
+        remedy = "correct only if its sensor is far behind the tip"
         remedy += "" if behind else "; world_from_instrument in mm, in the cameras' world, is expected"
         (all_poses.warning if behind else all_poses.error)(f"the origin of {name} is outside {outside}", remedy)
 
 
 def _body_visible(cameras: CameraArrays, poses: np.ndarray) -> float:
-    """Share of the images that show the point fixed to the instrument, within a sensor's reach, that is nearest to all
-    optical axes."""
+    """Return the share of images that show the instrument-fixed point nearest to all optical axes; 0 if it is beyond a
+    sensor's reach."""
     across = across_projectors(cameras.poses[:, :3, 2])
     rows = (across @ poses[:, :3, :3]).reshape(-1, 3)
     target = (across @ (cameras.centers - poses[:, :3, 3])[:, :, None]).reshape(-1)

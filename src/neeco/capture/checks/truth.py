@@ -10,8 +10,8 @@ from neeco.base.files import read_json, require_inside, visible_entries
 from neeco.capture.images import read_labels, read_mask
 from neeco.capture.readers.parsed import Parsed
 
-PARTS_FILE = "parts.json"  # names of the ids of masks in a folder
-USUAL_NAMES: Mapping[int, str] = {1: "shaft", 2: "wrist", 3: "jaw_left", 4: "jaw_right"}  # in folders without one
+PARTS_FILE = "parts.json"  # part names of mask ids in a folder
+USUAL_NAMES: Mapping[int, str] = {1: "shaft", 2: "wrist", 3: "jaw_left", 4: "jaw_right"}  # without a PARTS_FILE
 REFERENCE_FOLDER, SHADOW_FOLDER = "reference_masks", "truth/shadow"
 MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)  # of a capture, in order of preference
 
@@ -30,7 +30,7 @@ def stated_names(path: Path) -> dict[int, str] | None:
 
 
 def check_truth(parsed: Parsed) -> None:
-    """Warn of truth masks that evaluation would refuse or ignore. They do not prevent training."""
+    """Warn of truth masks that evaluation would reject or ignore. They do not prevent training."""
     root, report = parsed.root, parsed.places[0].report
     cameras = {frame.name: frame.camera for frame in parsed.with_cameras().frames}
     names = {frame.name for frame in parsed.frames}
@@ -47,7 +47,7 @@ def check_truth(parsed: Parsed) -> None:
                     require_inside(file, root)
                     (read_labels if folder == MASK_FOLDERS[0] else read_mask)(file, size)
                 elif (file.stem not in names or file.suffix != ".png") and not file.stem.startswith(further):
-                    problem = "no frame has this mask; masks are PNG files with the names of the images"
+                    problem = "belongs to no frame; masks must be PNG files with the names of the images"
             except NeecoError as error:
                 problem = str(error).replace(f"{file}: ", "")
             if problem:

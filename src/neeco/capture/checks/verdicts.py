@@ -28,7 +28,7 @@ UNITS_MM = {"centimetres": 10.0, "inches": 25.4, "metres": 1000.0}
 PIXELS: dict[str, Pixels] = {
     "mirrored left to right": lambda u, v, width, height: (width - u, v),
     "upside down (flipped)": lambda u, v, width, height: (u, height - v),
-    "turned by 180 degrees against their cameras": lambda u, v, width, height: (width - u, height - v),
+    "rotated by 180 degrees relative to their cameras": lambda u, v, width, height: (width - u, height - v),
 }
 
 
@@ -63,7 +63,7 @@ class ImageVerdicts:
 
     @cached_property
     def cameras(self) -> Verdict:
-        """Return the verdict whether images and cameras belong together, by the sparse points' colours."""
+        """Return the verdict whether images and cameras correspond, by the sparse points' colours."""
         has_errors = bool(errors_only(self.parsed.places[0].report.problems))
         colors = None if has_errors else ColorEvidence.of(self.parsed, self.pictures)
         if colors is None:
@@ -73,18 +73,18 @@ class ImageVerdicts:
         candidates += camera_candidates(colors.cameras.poses) if fine < SETTINGS.good_colors else []
         if (mistake := likeliest(candidates, colors)) is not None:
             return Verdict.of(mistake, "frames[*].transform_matrix", "frames")
-        unlike = fine < SETTINGS.contradicted_colors and colors.contrast > SETTINGS.min_contrast
-        if unlike and colors.agreement(coarse=True).mean() < SETTINGS.contradicted_coarsely:
+        uncorrelated = fine < SETTINGS.contradicted_colors and colors.contrast > SETTINGS.min_contrast
+        if uncorrelated and colors.agreement(coarse=True).mean() < SETTINGS.contradicted_coarsely:
             message = (
                 "the images contradict the cameras: sparse points do not have the colours of the pixels they project "
                 f"to (correlation {fine:.2f})"
             )
-            remedy = "images, cameras, intrinsics and points must be of one recording, in one order, and nothing turned"
+            remedy = "images, cameras, intrinsics and points must be of one recording, in one order, without rotation"
             return Verdict("contradicted", "frames", message, remedy)
         direct, swapped = (colors.color_difference(order) for order in ((0, 1, 2), (2, 1, 0)))
         if swapped < SETTINGS.max_swapped * direct:
             message = f"(they differ by {direct:.0f} of 255, swapped by {swapped:.0f})"
-            message = f"red and blue of the images are swapped against the sparse points' {message}"
+            message = f"red and blue of the images are swapped relative to the sparse points {message}"
             return Verdict("contradicted", "frames", message, "write both as RGB (OpenCV reads and writes BGR)")
         return Verdict("supported")
 
@@ -122,7 +122,7 @@ class ImageVerdicts:
         if evidence > factor * by_chance or mostly_others or motion.travel(roots[rows]) < SETTINGS.min_travel:
             return Verdict("undecided")
         message = (
-            f"the images contradict the poses of {name}: what moves in them does not lie where the poses say (evidence "
+            f"the images contradict the poses of {name}: the observed motion is not at these poses (evidence "
             f"{evidence:.2f}, {by_chance:.2f} by chance)"
         )
         remedy = "shifts, other axes, frames and units were tried; states, cameras and images must be of one recording"
@@ -130,7 +130,7 @@ class ImageVerdicts:
 
     @cached_property
     def _poses(self) -> dict[str, tuple[np.ndarray, np.ndarray] | None]:
-        """Return recorded poses [N, 4, 4] of each instrument, and root_from_recorded [N, 4, 4], as the root is best
+        """Return recorded poses [N, 4, 4] of each instrument, and the transforms [N, 4, 4] to its root, which is most
         visible; None if a frame has no state."""
         poses: dict[str, tuple[np.ndarray, np.ndarray] | None] = {}
         for item in self.parsed.instruments:
@@ -174,10 +174,10 @@ def likeliest(candidates: Sequence[Candidate], evidence: ColorEvidence | MotionE
     another kind; None without one, or if several are equally likely."""
     compared = []
     for kind in dict.fromkeys(candidate.kind for candidate in candidates):
-        alike = [candidate for candidate in candidates if candidate.kind == kind]
-        quick = np.array([evidence.quick(candidate) for candidate in alike])
+        of_kind = [candidate for candidate in candidates if candidate.kind == kind]
+        quick = np.array([evidence.quick(candidate) for candidate in of_kind])
         best_few = np.argsort(-quick, kind="stable")[: SETTINGS.max_candidates]
-        compared += [(alike[index], *evidence.compare(alike[index])) for index in best_few]
+        compared += [(of_kind[index], *evidence.compare(of_kind[index])) for index in best_few]
     clear = [
         (agreement, candidate)
         for candidate, factor, certainty, agreement in compared
@@ -191,8 +191,8 @@ def likeliest(candidates: Sequence[Candidate], evidence: ColorEvidence | MotionE
         for candidate, factor, _, agreement in compared
         if factor > SETTINGS.pose.factor and agreement > SETTINGS.rival * most
     ]
-    alike = [one for one in rivals if one is best or (one.kind == best.kind and one.kind != "pose")]
-    return best if len(alike) == len(rivals) or best not in alike else None
+    equivalent = [one for one in rivals if one is best or (one.kind == best.kind and one.kind != "pose")]
+    return best if len(equivalent) == len(rivals) or best not in equivalent else None
 
 
 def _pose_candidates(poses: np.ndarray, name: str, factors: Sequence[float] = ()) -> Iterator[Candidate]:
@@ -212,7 +212,7 @@ def _pose_candidates(poses: np.ndarray, name: str, factors: Sequence[float] = ()
         turn[:3, :3] = np.diag(signs) @ np.eye(3)[list(order)]
         axes = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
         if axes != "x, y, z":
-            message = f"world axes of {name} are others than the scene's: (x, y, z) should be ({axes})"
+            message = f"world axes of {name} differ from the scene's: (x, y, z) should be ({axes})"
             remedy = "replace them, in positions and rotations"
             yield Candidate("pose", message, remedy, SETTINGS.pose, poses=turn @ poses)
     scales = {f"in {unit}": length for unit, length in UNITS_MM.items()}
@@ -231,8 +231,8 @@ def instrument_candidates(poses: np.ndarray, world_from_camera: np.ndarray, name
     yield Candidate("pose", message, remedy, SETTINGS.pose, poses=np.linalg.inv(poses))
     in_camera = np.linalg.inv(world_from_camera) @ poses
     for axes in (OPENCV, OPENGL, DVRK_ECM):
-        remedy = f"turn them into the world (`frame: {axes.name}` in recording.yaml)"
-        for words, original in (("are in the camera's frame", poses), ("were turned into the world", in_camera)):
+        remedy = f"convert them to the world frame (`frame: {axes.name}` in recording.yaml)"
+        for words, original in (("are in the camera's frame", poses), ("were converted to the world", in_camera)):
             moved = world_from_camera @ axes.poses_to_opencv(original)
             message = f"poses of {name} {words} with the axes of {axes.producer} ({axes.words})"
             if axes is not OPENCV or original is poses:
@@ -245,8 +245,8 @@ def resampled(
     """Return the states of frames `rows` [F], of poses [N, 4, 4], shifted by a number of frames, or of a clock with
     another rate. A new recording starts where time decreases."""
     recording = np.concatenate([[0], np.cumsum(np.diff(times) < 0)])
-    wanted = np.rint(rate * rows).astype(int) + steps
-    source = wanted.clip(0, len(poses) - 1)
+    shifted = np.rint(rate * rows).astype(int) + steps
+    source = shifted.clip(0, len(poses) - 1)
     words = f"on a clock that runs {rate:.3g} times as fast"
     if rate == 1:
         words = f"{abs(steps)} frame{'s' * (abs(steps) > 1)} {'earlier' if steps > 0 else 'later'}"
@@ -254,10 +254,10 @@ def resampled(
     return Candidate(
         "shift" if rate == 1 else "rate",
         f"states of {name} fit the images better {words}",
-        "correct their times (a clock's offset or rate, frames dropped or counted from another one?)",
+        "correct their times (clock offset or rate, dropped frames, or another first frame)",
         SETTINGS.shift if small else SETTINGS.pose,
         poses=poses[source],
-        available=(source == wanted) & (recording[source] == recording[rows]),
+        available=(source == shifted) & (recording[source] == recording[rows]),
         steps=steps,
     )
 
@@ -265,9 +265,9 @@ def resampled(
 def camera_candidates(poses: np.ndarray) -> Iterator[Candidate]:
     """Return candidate mistakes in camera poses [F, 4, 4] (OpenCV axes) and images."""
     for condition, pixels in PIXELS.items():
-        remedy = "turn their pixels, not only an EXIF tag"
+        remedy = "transform their pixels, not only an EXIF tag"
         yield Candidate("image", f"the images are {condition}", remedy, SETTINGS.camera, pixels=pixels)
-    written = swap_camera_axes(poses)  # as transform_matrix has them
+    written = swap_camera_axes(poses)  # as in transform_matrix
     message, inverse = "camera matrices are world-to-camera", np.linalg.inv(written)
     for words, moved in (
         ("camera axes are OpenCV's", written),

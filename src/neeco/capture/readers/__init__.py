@@ -1,4 +1,4 @@
-"""Readers of capture folders and of what they hold: cameras, lenses, instrument states and kinematic trees."""
+"""Readers of capture folders and their content: cameras, lenses, instrument states and kinematic trees."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
     Args:
         path: the capture's folder, or a transforms file in it
         transforms: which file of the folder to read
-        background: what shows through transparent pixels: 0 black, 1 white
+        background: grey value behind transparent pixels: 0 black, 1 white
 
     Image pixels are not read here. Raises NeecoError with the first problem found; `check_capture` finds all of them.
 
@@ -63,8 +63,8 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
 
 
 def capture_of(parsed: Parsed) -> Capture:
-    """Build the capture from what was read without errors. Poses of articulated instruments are converted to their
-    roots'. Raises NeecoError for an image whose name is not in UTF-8."""
+    """Build the capture from data parsed without errors. Poses of articulated instruments are converted to their root
+    links. Raises NeecoError for an image whose name is not in UTF-8."""
     frames, instruments = tuple(parsed.frames), parsed.instruments
     for frame in frames:
         require_utf8(frame.image_path)
@@ -93,8 +93,8 @@ def capture_of(parsed: Parsed) -> Capture:
 
 
 def _completed(state: State, instruments: Sequence[Instrument], parsed: Parsed) -> State:
-    """Return the state with every unrecorded joint half way between its limits, and poses of other links of an
-    instrument converted to its root's, by its stated kinematics."""
+    """Return the state with every unrecorded joint half way between its limits, and poses of other links converted to
+    the root link by the instrument's kinematics."""
     completed = dict(state.instruments)
     for item in (item for item in instruments if item.name in completed):
         recorded, tree = completed[item.name], item.kinematics
@@ -135,7 +135,7 @@ def parse_capture(
 def _parse(path: Path, report: ProblemReport, transforms: str, background: float, as_source: bool) -> Parsed:
     require_utf8(path)
     if os.path.isfile(path) and path.suffix.lower() != ".json":
-        report.error(str(path), "", "is no capture", "give the folder of one, or a transforms file (JSON) in it")
+        report.error(str(path), "", "is not a capture", "give its folder, or a transforms file (JSON) in it")
         return Parsed(path.parent)
     if os.path.isfile(path):
         path, transforms = path.parent, path.name

@@ -36,7 +36,7 @@ _MODELS = {
     17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
 MAX_MODEL_ID = 100  # future COLMAP versions may add models; a larger id indicates damage
-_COEFFICIENTS = {  # in a model's parameters, behind the focal lengths and the principal point
+_COEFFICIENTS = {  # in a model's parameters, after the focal lengths and the principal point
     "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
     "OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
@@ -59,7 +59,7 @@ class _Image(NamedTuple):
 
 
 def find_models(root: Path) -> list[Path]:
-    """Return the folders of a capture that hold a COLMAP model, the one with most images first."""
+    """Return the folders of a capture that contain a COLMAP model, the one with most images first."""
     parts = [root / "sparse", root / "colmap" / "sparse"]
     numbered = [entry for part in parts if part.is_dir() for entry in part.iterdir()]
     folders = [*sorted(numbered, key=lambda folder: natural_order(folder.name)), *parts, root]
@@ -72,7 +72,7 @@ def _suffix(model: Path) -> str:
 
 
 def _image_count(model: Path) -> int:
-    """Number of images of a model, 0 of a damaged one."""
+    """Return the number of images of a model, 0 if it is damaged."""
     suffix = _suffix(model)
     try:
         return len(_parse(model / f"images{suffix}", _PARSERS[suffix][1]))
@@ -102,13 +102,13 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
         rows = np.array(_parse(points_file, parse_points), dtype=np.float64).reshape(-1, 6)
         positions = rows[:, :3].astype(np.float32)
         if not np.isfinite(positions).all():
-            raise NeecoError("holds points that are NaN or infinite; remove them")
+            raise NeecoError("contains points that are NaN or infinite; remove them")
         parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
     except NeecoError as error:
         parsed.points_place.error(*str(error).removeprefix(f"{points_file}: ").split("; ", 1))
     file = relative_name(model / f"images{suffix}", root)
     if not images:
-        report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
+        report.error(file, "", "contains no images", "reconstruct again: no image was registered")
     _note_left_out(model, unused_models, images, root, Node(None, file, "", report))
     images.sort(key=lambda item: natural_order(item.name))
     orders = instants([image.name for image in images], [image.camera_id for image in images])
@@ -129,31 +129,31 @@ def _note_left_out(model: Path, others: Sequence[Path], images: Sequence[_Image]
     if others:
         counts = ", ".join(f"{relative_name(other, root)} with {_image_count(other)}" for other in others)
         message = f"{relative_name(model, root)} with {len(images)} images is read; left out: {counts}"
-        place.warning(message, "to read another, copy it and images/ into a folder of its own")
-    pictures = [file for file in (root / "images").rglob("*") if file.suffix.lower() in EXTENSIONS and file.is_file()]
-    named = {os.path.normpath(image.name) for image in images}
-    absent = sorted(str(file.relative_to(root / "images")) for file in pictures)
-    absent = [name for name in absent if os.path.normpath(name) not in named]
-    if absent:
-        message = f"{len(absent)} of {len(pictures)} images in images/ have no camera ({printable(absent[0])})"
+        place.warning(message, "to read another, copy it and images/ into a separate folder")
+    files = [file for file in (root / "images").rglob("*") if file.suffix.lower() in EXTENSIONS and file.is_file()]
+    registered = {os.path.normpath(image.name) for image in images}
+    unregistered = sorted(str(file.relative_to(root / "images")) for file in files)
+    unregistered = [name for name in unregistered if os.path.normpath(name) not in registered]
+    if unregistered:
+        message = f"{len(unregistered)} of {len(files)} images in images/ have no camera ({printable(unregistered[0])})"
         place.warning(message, "they are left out")
 
 
 def _camera(place: Node, image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> Camera:
-    """Raises NeecoError, which does not name the image, for distorted images read in place, too."""
+    """Return an image's camera. Raises NeecoError, without the image's name, also if distorted and read in place."""
     if image.camera_id not in cameras:
-        raise NeecoError(f"uses camera {image.camera_id}, which the model lacks; export it again")
+        raise NeecoError(f"uses camera {image.camera_id}, which is missing in the model; export it again")
     camera = cameras[image.camera_id]
     names = _COEFFICIENTS.get(camera.model)
     if names is None:
         raise NeecoError(
-            f"its camera model is {camera.model}; run `colmap image_undistorter` first, which gives PINHOLE"
+            f"its camera model is {camera.model}; convert it to PINHOLE with `colmap image_undistorter` first"
         )
     fx, fy, cx, cy = (camera.params[0], *camera.params[: len(camera.params) - len(names)])[-4:]  # or one focal length
     width, height, coefficients = camera.width, camera.height, camera.params[len(camera.params) - len(names) :]
     fault = size_fault(width, height) or focal_fault(fx, fy, width, height) or center_fault(cx, cy, width, height)
     if fault is not None or not all(math.isfinite(value) for value in coefficients):
-        message = "its distortion is not finite" if fault is None else f"its camera is impossible: {fault[0]}"
+        message = "its distortion is not finite" if fault is None else f"its camera is invalid: {fault[0]}"
         raise NeecoError(f"{message}; repair the cameras file")
     stated = dict(zip(names, coefficients, strict=True))
     distortion = opencv_distortion(camera.model, stated, (fx, fy, cx, cy), (width, height))
@@ -165,7 +165,7 @@ def _camera(place: Node, image: _Image, cameras: dict[int, _Intrinsics], parsed:
     quaternion, translation = np.array(image.quaternion), np.array(image.translation)
     norm = np.linalg.norm(quaternion)
     if not (0.99 < norm < 1.01 and np.abs(translation).max() < 1e9):  # nor when NaN
-        raise NeecoError("its pose is not a finite unit quaternion and translation; drop it")
+        raise NeecoError("its pose is not a finite unit quaternion and translation; remove the image")
     rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
     world_from_camera = COLMAP.camera_to_opencv(rigid(rotation.T, -rotation.T @ translation))
     pose = torch.from_numpy(world_from_camera).float()
@@ -173,7 +173,7 @@ def _camera(place: Node, image: _Image, cameras: dict[int, _Intrinsics], parsed:
 
 
 def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:
-    """`parse` applied to a file's content; damage becomes NeecoError."""
+    """Return `parse` of a file's content. Raises NeecoError for damage."""
     content = read_bytes(path, "a file of a COLMAP model", "no such file; export the whole COLMAP model")
     try:
         return parse(content)
@@ -212,7 +212,7 @@ def _cameras_binary(content: bytes) -> dict[int, _Intrinsics]:
     for _ in range(stream.take("Q")[0]):
         camera_id, model_id, width, height = stream.take("iiQQ")
         if model_id not in _MODELS and 0 <= model_id < MAX_MODEL_ID:
-            raise NeecoError(f"its camera model {model_id} is not known; run `colmap image_undistorter` first")
+            raise NeecoError(f"its camera model {model_id} is unknown; run `colmap image_undistorter` first")
         model, count = _MODELS[model_id]
         cameras[camera_id] = _Intrinsics(model, width, height, stream.take(f"{count}d"))
     return cameras
@@ -256,7 +256,7 @@ def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
 
 def _images_text(content: bytes) -> list[_Image]:
     images = []
-    # two lines an image; the second (observations) may be empty, so only every other line is read
+    # two lines per image; the second (observations) may be empty, so only every other line is read
     for line in list(dropwhile(lambda line: not line.strip(), _lines(content)))[::2]:
         if line.strip():
             _, *pose, camera_id, name = line.split(maxsplit=9)

@@ -1,4 +1,4 @@
-"""Instrument states in JSON: those of a transforms file's frames, and files of one state a line.
+"""Instrument states in JSON: in the frames of a transforms file, and in files with one state per line.
 
 A line is `{"time": 0, "instruments": [{"name", "pose": 4x4, "joints": {name: rad}}], "camera": 4x4}`;
 `camera` (world_from_camera, OpenGL axes, as in transforms.json) and `time` may be left out, other keys are ignored.
@@ -27,7 +27,7 @@ Limits = tuple[float, float] | None
 
 @dataclass(frozen=True)
 class StateLine:
-    """One line: a state and, when given, the camera that sees it."""
+    """One line: a state and optionally the camera that observes it."""
 
     state: State
     world_from_camera: np.ndarray | None  # [4, 4], OpenCV axes
@@ -45,12 +45,12 @@ def read_states(path: Path, instruments: Sequence[Instrument]) -> list[StateLine
         _parse_line(line, f"{path}: line {number}", instruments) for number, line in enumerate(lines, 1) if line.strip()
     ]
     if not states:
-        raise NeecoError(f"{path}: no states in it; give one JSON object per line")
+        raise NeecoError(f"{path}: contains no states; write one JSON object per line")
     return states
 
 
 def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
-    """The instrument states of one frame ({} where it lists none); None, and reported, where one cannot be read."""
+    """Return the instrument states of one frame ({} if it lists none); None, and reported, if one cannot be read."""
     if not frame.has("instruments"):
         return {}
     node = frame.child("instruments")
@@ -60,26 +60,26 @@ def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
         if (named := item.tried(_parse_state)) is not None:
             name, state = named
             if name in states:
-                item.child("name").error(f"{printable(name)} comes twice here", "keep one state per instrument")
+                item.child("name").error(f"{printable(name)} is listed twice", "keep one state per instrument")
                 return None
             states[name] = state
     return states if items is not None and len(states) == len(items) else None
 
 
 def _parse_state(item: Node) -> tuple[str, InstrumentState]:
-    """An instrument's name and state."""
+    """Return an instrument's name and state."""
     item.members()
     name, pose = item.child("name").text(), item.child("pose").rigid()
     joints = {joint: node.number() for joint, node in item.child("joints").members(optional=True).items()}
     trust = item.given("trust", Node.number, None)
     if trust is not None and not 0 <= trust <= 1:
-        item.child("trust").fail(f"is {trust:g}, not a share", "give 0 to 1, or leave it out")
+        item.child("trust").fail(f"is {trust:g}, must be from 0 to 1", "correct or remove it")
     uncertainty = item.given("uncertainty", lambda node: _parse_uncertainty(node, joints), None)
     return name, InstrumentState(torch.from_numpy(pose), joints, trust, uncertainty)
 
 
 def declared_instruments(document: Node) -> tuple[Instrument, ...]:
-    """The instruments of the header, with their joints' limits and kinematics; () where the header lists none."""
+    """Return the instruments of the header, with joint limits and kinematics; () if the header lists none."""
     if not document.has("instruments"):
         return ()
     instruments: dict[str, Instrument] = {}
@@ -104,7 +104,7 @@ def _parse_declared(item: Node) -> Instrument:
         if not node.given("recorded", Node.flag, True):
             unrecorded.append(joint)
             if joints[joint] is None:
-                node.child("limits").fail("is missing", "state between which values to look for the joint")
+                node.child("limits").fail("is missing", "state the range in which to estimate the joint")
     tree = item.given("kinematics", parse_kinematics, None)
     shaft = item.given("from_video", _parse_from_video, None)
     shared = item.given("base_uncertainty", _parse_base_uncertainty, None)
@@ -112,7 +112,7 @@ def _parse_declared(item: Node) -> Instrument:
 
 
 def all_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -> tuple[Instrument, ...]:
-    """Declared instruments, then those that only frames name; joints likewise."""
+    """Return declared instruments, then those named only in frames; joints likewise."""
     joints: dict[str, dict[str, Limits]] = {item.name: dict(item.joints) for item in declared}
     for frame in frames:
         for name, state in frame.state.instruments.items():
@@ -137,18 +137,18 @@ def _parse_base_uncertainty(node: Node) -> BaseUncertainty:
     rows = tuple(row.numbers(6, "rad and mm") for row in covariance.items())
     matrix = np.array(rows)
     if matrix.shape != (6, 6) or not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix).min() <= 0:
-        covariance.fail("is no covariance", "give 6 x 6 numbers, symmetric and positive definite")
+        covariance.fail("is not a covariance", "give 6 x 6 numbers, symmetric and positive definite")
     return BaseUncertainty(center, rows)
 
 
 def _parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty:
     """`{"translation_mm": [x, y, z], "rotation_deg": [x, y, z], "joints_deg": {name: sd}}`, of a state with `joints`"""
-    across, down, depth = node.child("translation_mm").numbers(3, "deviations in the camera's axes, mm", least=0)
-    tilt, turn, roll = node.child("rotation_deg").numbers(3, "deviations about its x, y, z, degrees", least=0)
+    across, down, depth = node.child("translation_mm").numbers(3, "standard deviations in camera axes, mm", least=0)
+    tilt, turn, roll = node.child("rotation_deg").numbers(3, "standard deviations about its x, y, z, deg", least=0)
     deviations = node.child("joints_deg").members(optional=True)
     for name, deviation in deviations.items():
         if name not in joints:
-            deviation.fail("the state has no such joint", "leave it out")
+            deviation.fail("the state has no such joint", "remove it")
     named = {name: deviation.number(least=0) for name, deviation in deviations.items()}
     return Uncertainty((across, down, depth), (tilt, turn, roll), named)
 
@@ -176,7 +176,7 @@ def _parse_state_line(node: Node, instruments: Sequence[Instrument]) -> StateLin
         if not isinstance(name.value, str) or name.value not in by_name:
             name.fail(f"{name.value!r} is not in the scene", f"it has {', '.join(by_name) or 'no instruments'}")
         if name.value in parsed:
-            name.fail(f"{printable(name.value)} comes twice here", "keep one state per instrument")
+            name.fail(f"{printable(name.value)} is listed twice", "keep one state per instrument")
         parsed[name.value] = _parse_state(item)[1]
         _check_joints(item, by_name[name.value])
     if missing := [name for name in by_name if name not in parsed]:
@@ -185,7 +185,7 @@ def _parse_state_line(node: Node, instruments: Sequence[Instrument]) -> StateLin
     if isinstance(camera.value, dict):
         camera = camera.child("transform_matrix")
     pose = None if camera.value is None else swap_camera_axes(camera.rigid())
-    # in the scene's order, so that files list them in one order, without joints that the scene does not have
+    # in the scene's order, so that the order in the file has no effect, and without joints unknown to the scene
     states = {
         name: InstrumentState(
             parsed[name].pose,
@@ -197,7 +197,7 @@ def _parse_state_line(node: Node, instruments: Sequence[Instrument]) -> StateLin
 
 
 def _check_joints(item: Node, instrument: Instrument) -> None:
-    """Refuse a state without one of its instrument's joints, with one that it does not have, or an impossible value."""
+    """Raise Fault for a missing or unknown joint, or an impossible joint value."""
     joints = item.child("joints")
     if not all(joints.has(joint) for joint in instrument.joints if joint not in instrument.unrecorded):
         joints.fail(f"expected these joints, in rad: {', '.join(instrument.joints)}")

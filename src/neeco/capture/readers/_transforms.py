@@ -1,4 +1,4 @@
-"""Read transforms files: neeco-capture/1, what nerfstudio writes, and Blender's and D-NeRF's of one split each."""
+"""Read transforms files: neeco-capture/1, nerfstudio's, and Blender's and D-NeRF's with one file per split."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from neeco.capture.readers.parsed import Parsed, instants, named_file, named_ima
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import Lens
 
-BLENDER_HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
-STATE_LIKE = ("instrument", "instrument_pose", "instrument_states", "tool", "tools", "joints", "states")  # frames' keys
+BLENDER_HALF_SIZE = 1.5  # half side of the cube of the synthetic scenes, in which 3DGS starts from random points
+STATE_LIKE = ("instrument", "instrument_pose", "instrument_states", "tool", "tools", "joints", "states")  # frame keys
 _MILLIMETRES = ("mm", "millimeter", "millimetre", "millimeters", "millimetres")
 
 
 def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
-    """A JSON file as the node of its object. What cannot be parsed is reported and gives an empty object."""
+    """Return a JSON file as the node of its object. Invalid JSON is reported and returns an empty object."""
     node = Node({}, relative_name(file, root), "", report)
     try:
         node = node.at(read_json(file), "")
@@ -48,12 +48,11 @@ def is_blender(document: Node) -> bool:
 def parse_transforms(
     files: dict[Path, Node], root: Path, background: float = 1.0, *, blender: bool = False, as_source: bool = False
 ) -> Parsed:
-    """Read the transforms file of the capture at `root`, or Blender's files of one split each, named by the file; all
-    given with their content. Relative paths start at the file. as_source: see `Parsed`.
+    """Read the transforms file of the capture at `root`, or Blender's files with one split each, by file name.
+    files: with their content. Relative paths start at the file. as_source: see `Parsed`.
 
-    Transparent pixels show `background`. Of Blender's without states, and without a point cloud, seeded random points
-    in a cube are used; where no frame at all has a time nothing moves (NeRF's synthetic scenes): every frame then has
-    time 0.
+    Transparent pixels show `background`. Blender files without states and point cloud get seeded random points in a
+    cube; if no frame has a time, the scene is static (NeRF's synthetic scenes) and every frame has time 0.
     """
     parsed, documents = Parsed(root, as_source=as_source), list(files.values())
     declared: dict[str, Instrument] = {}
@@ -102,29 +101,28 @@ def _frame_objects(document: Node) -> list[dict[str, Any]]:
 
 
 def _warn_of_unread_states(document: Node, parsed: Parsed) -> None:
-    """Warn of states under other names than `instruments`, where no frame has any under that."""
+    """Warn of states under other keys than `instruments`, if no frame has that key."""
     for index, frame in enumerate(_frame_objects(document)):
         keys = [key for key in STATE_LIKE if frame.get(key) is not None]
         if keys and not parsed.instruments:
-            message = "is not read: instrument states belong into `instruments`"
+            message = "is ignored: instrument states must be in `instruments`"
             remedy = 'write [{"name", "pose": 4x4 mm, "joints": {name: rad}}] there'
             document.child("frames").item(index).child(keys[0]).warning(message, remedy)
             return
 
 
 def _parse_header(document: Node, parsed: Parsed) -> None:
-    """Check what holds for the whole file: schema and units, and read `instrument_frame`, `camera_motion` and
-    `lens`."""
+    """Check schema and units, and read `instrument_frame`, `camera_motion` and `lens`."""
     value = document.value
     if (schema := value.get("schema", SCHEMA)) != SCHEMA:
         message = f"is {printable(schema)}, not {SCHEMA!r}"
-        document.child("schema").error(message, "use a version of neeco that knows it")
+        document.child("schema").error(message, "use a version of neeco that supports it")
     if value.get("units", "mm") not in _MILLIMETRES:
         message = f"is {printable(value['units'])}; lengths must be mm"
         document.child("units").error(message, "convert all poses and points")
-    for key, words in (("instrument_frame", ("world", "unregistered")), ("camera_motion", ("moving", "still"))):
-        if (stated := value.get(key, words[0])) not in words:
-            document.child(key).error(f"is {printable(stated)}", f"write {' or '.join(map(repr, words))}")
+    for key, choices in (("instrument_frame", ("world", "unregistered")), ("camera_motion", ("moving", "still"))):
+        if (stated := value.get(key, choices[0])) not in choices:
+            document.child(key).error(f"is {printable(stated)}", f"write {' or '.join(map(repr, choices))}")
     parsed.registered = parsed.registered and value.get("instrument_frame") != "unregistered"
     parsed.still = parsed.still or value.get("camera_motion") == "still"
     parsed.lens = document.given("lens", lambda node: node.tried(parse_lens), parsed.lens)
@@ -139,7 +137,7 @@ def _parse_frames(
     split: str | None = None,
     extensions: tuple[str, ...] = (),
 ) -> None:
-    """Append the file's frames. `split` names them all where given; `extensions` are tried on paths without one."""
+    """Append the file's frames. split: of all frames, if not None; extensions: tried for paths without one."""
     frames = document.child("frames")
     if not frames.value:
         frames.error("is missing" if frames.value is None else "is empty", "list the images and their cameras there")
@@ -170,15 +168,15 @@ def _parse_frames(
         parsed.frames.append(Frame(image_path, camera, State(instruments, time), name, mask_path, background))
         parsed.places.append(node)
     _count_shared(document.report, first, len(nodes))
-    if timed < len(nodes):  # where not every frame has a time, the order stands in for all: no mix of units
+    if timed < len(nodes):  # unless every frame has a time, all get their index, so that units are not mixed
         parsed.timed = False
         for order, frame in enumerate(parsed.frames):
             parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
 
 
 def _count_shared(report: ProblemReport, first: int, frames: int) -> None:
-    """Merge problems, from the `first` on, of the camera at the file's top level: each once, before those of frames,
-    with the number of frames it concerns."""
+    """Merge equal problems, from index `first`, of the top-level camera, with the number of frames concerned; they
+    precede the problems of frames."""
     new_problems = report.problems[first:]
     shared = Counter(problem for problem in new_problems if not problem.field.startswith("frames["))
     merged = []
@@ -215,7 +213,7 @@ def _parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
 
 
 class _Splits:
-    """Return the split of each frame: its own, else by nerfstudio's lists, else every 8th is test."""
+    """Split of each frame: as stated in the frame, else by nerfstudio's lists, else every 8th is test."""
 
     def __init__(self, document: Node, split: str | None) -> None:
         self.fixed = split
@@ -237,9 +235,9 @@ class _Splits:
         if self.listed is not None:
             name = self.listed.get(str(frame.value.get("file_path")))
             if name is None:
-                frame.warning("is in none of train_filenames, val_filenames, test_filenames and is left out")
+                frame.warning("is left out: not in train_filenames, val_filenames or test_filenames")
             return name
         if self.some_say:
-            frame.child("split").error("is missing while other frames have one", "name the frame's split")
+            frame.child("split").error("is missing, but other frames have one", "state the frame's split")
             return None
         return "test" if index % TEST_EVERY == 0 else "train"

@@ -26,7 +26,7 @@ POLYNOMIAL = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV", "SIMPLE_RADI
 MODELS = (*POLYNOMIAL, *FISHEYE)
 NAMES = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LISTS = ("distortion_params", "distortion_coefficients", "distortion")  # keys of bare lists of coefficients
-NOT_READ = ("ftheta_p0", "ftheta_p1", "latlong", "orthographic")  # instant-ngp's keys of lenses that are none of MODELS
+NOT_READ = ("ftheta_p0", "ftheta_p1", "latlong", "orthographic")  # instant-ngp's keys of unsupported lenses
 # order of a bare list of coefficients, by its length: six are nerfstudio's, the rest OpenCV's
 LISTED = {
     4: ("k1", "k2", "p1", "p2"),
@@ -34,35 +34,35 @@ LISTED = {
     6: ("k1", "k2", "k3", "k4", "p1", "p2"),
     8: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-MAX_ANGLE = math.radians(80)  # off the axis, of a lens fitted by OpenCV's rational model
+MAX_ANGLE = math.radians(80)  # maximum angle from the axis of a lens fitted by OpenCV's rational model
 MAX_MISFIT_PX = 0.1  # largest error of that fit
 
 
 @dataclass(frozen=True)
 class StatedDistortion:
-    """Distortion of a lens as a file states it: one of MODELS, and the coefficients that are not 0, by NAMES."""
+    """Distortion of a lens as stated in a file: one of MODELS, and the non-zero coefficients, by NAMES."""
 
     model: str
     coefficients: Mapping[str, float]
-    place: Node | None  # where it is stated: a fisheye model or the first coefficient; None: there is no distortion
+    place: Node | None  # node of the fisheye model or the first coefficient; None: no distortion
 
 
 def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion:
-    """Read a lens's distortion as nerfstudio and instant-ngp write it; `node_of` gives the value of a key. Raises Fault
-    where it cannot be read."""
-    named = node_of("camera_model")
-    model = str(named.value or "PINHOLE").upper()
+    """Read a lens's distortion as written by nerfstudio and instant-ngp; node_of: returns the node of a key. Raises
+    Fault if it is invalid."""
+    model_node = node_of("camera_model")
+    model = str(model_node.value or "PINHOLE").upper()
     if node_of("is_fisheye").value is True:
         model = "OPENCV_FISHEYE"
-    wrong = [node for key in NOT_READ if (node := node_of(key)).value]
-    for node in wrong + ([named] if model not in MODELS else []):
+    unsupported = [node for key in NOT_READ if (node := node_of(key)).value]
+    for node in unsupported + ([model_node] if model not in MODELS else []):
         message = f"is {printable(node.value)}: this lens model cannot be undistorted"
         node.fail(message, "undistort the images first, and write PINHOLE")
     nodes: dict[str, Node] = {}
     for key in LISTS:
         node = node_of(key)
         zeros = isinstance(node.value, list) and all(as_float(item) == 0 for item in node.value)
-        if node.value is None or isinstance(node.value, str) or zeros:  # text is a remark
+        if node.value is None or isinstance(node.value, str) or zeros:  # text is a comment
             continue
         names = LISTED.get(len(node.value)) if isinstance(node.value, list) else None
         if names is None:
@@ -77,7 +77,7 @@ def stated_distortion(node_of: Callable[[str], Node]) -> StatedDistortion:
         nodes.setdefault(name, node)
     coefficients = {name: number for name, node in nodes.items() if (number := node.number())}
     if model in FISHEYE:
-        return StatedDistortion(model, coefficients, named if named.value else node_of("is_fisheye"))
+        return StatedDistortion(model, coefficients, model_node if model_node.value else node_of("is_fisheye"))
     return StatedDistortion(model, coefficients, nodes[min(coefficients, key=NAMES.index)] if coefficients else None)
 
 
@@ -87,7 +87,7 @@ def opencv_distortion(
     intrinsics: tuple[float, float, float, float],
     size: tuple[int, int] | None,
 ) -> tuple[float, ...]:
-    """OpenCV's k1, k2, p1, p2[, k3, k4, k5, k6] of a lens of one of MODELS; empty without distortion.
+    """Return OpenCV's k1, k2, p1, p2[, k3, k4, k5, k6] of a lens of one of MODELS; empty without distortion.
 
     coefficients: by NAMES, absent ones are 0. intrinsics: fl_x, fl_y, cx, cy px; size: (width, height) px, None: twice
     the principal point. Other models than OpenCV's are fitted. Raises NeecoError ("what is wrong; what to do").
@@ -105,9 +105,9 @@ def _opencv_distortion(
     k1, k2, k3, k4, k5, k6, p1, p2 = coefficients
     if model in FISHEYE:
         if any((k5, k6, p1, p2)):
-            raise NeecoError("a fisheye lens has coefficients k1 to k4 alone; calibrate again")
+            raise NeecoError("a fisheye lens has only coefficients k1 to k4; calibrate again")
         return fit_rational(lambda angle: angle * _polynomial(angle**2, (k1, k2, k3, k4)), intrinsics, size)
-    if k4 and not (k5 or k6 or model == "FULL_OPENCV"):  # nerfstudio's, of the radius to the eighth power
+    if k4 and not (k5 or k6 or model == "FULL_OPENCV"):  # nerfstudio's k4, coefficient of the radius' eighth power
         radial = fit_rational(lambda a: np.tan(a) * _polynomial(np.tan(a) ** 2, (k1, k2, k3, k4)), intrinsics, size)
         return (*radial[:2], p1, p2, *radial[4:])
     if k4 or k5 or k6:
@@ -122,7 +122,7 @@ def fit_rational(
 ) -> tuple[float, ...]:
     """Fit OpenCV's rational model of eight coefficients to the radial distortion `bend`, to MAX_MISFIT_PX or better.
 
-    bend: angles [N] off the axis, rad, to radii [N] in the image, in focal lengths. Least squares, reweighted by the
+    bend: angles [N] from the axis, rad, to radii [N] in the image, in focal lengths. Least squares, reweighted by the
     denominator. Raises NeecoError ("what is wrong; what to do").
     """
     fl_x, fl_y, cx, cy = intrinsics
@@ -132,7 +132,7 @@ def fit_rational(
     beyond = bent > math.hypot(max(cx, width - cx) / fl_x, max(cy, height - cy) / fl_y)
     used = slice(int(np.argmax(beyond)))
     if not beyond.any() or (np.diff(bent[used]) <= 0).any():
-        problem = f"covers more than {math.degrees(MAX_ANGLE):.0f} degrees off its axis, or folds the image over"
+        problem = f"covers more than {math.degrees(MAX_ANGLE):.0f} degrees from its axis, or is not monotonic"
         raise NeecoError(f"this lens {problem}; crop the images, or calibrate again")
     radius, share = np.tan(theta[used]), bent[used] / np.tan(theta[used])
     powers = (radius[:, None] ** 2) ** np.arange(1, 4)  # [N, 3]
@@ -144,24 +144,24 @@ def fit_rational(
     error = np.abs((1 + powers @ solution[:3]) / (1 + powers @ solution[3:]) - share) * radius * max(fl_x, fl_y)
     if not error.max() < MAX_MISFIT_PX:
         raise NeecoError(
-            f"this lens bends too much for OpenCV's rational model ({error.max():.2f} px off); crop the images, or "
+            f"OpenCV's rational model does not fit this lens (error {error.max():.2f} px); crop the images, or "
             "calibrate again"
         )
     return (*solution[:2].tolist(), 0.0, 0.0, *solution[2:].tolist())
 
 
 def _polynomial(squares: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """1 + k1 s + k2 s^2 + ... of squares s [N]."""
+    """Return 1 + k1 s + k2 s^2 + ... for squares s [N]."""
     return np.asarray(np.polynomial.polynomial.polyval(squares, (1.0, *coefficients)))
 
 
 def parse_lens(node: Node) -> Lens:
-    """The lens that a node describes. Raises Fault where that is none."""
+    """Return the lens that a node describes. Raises Fault if it is invalid."""
     stated = node.members()
     width, height = (node.child(key).integer(least=1) for key in ("w", "h"))
     fl_x, fl_y = (node.child(key).number(above=0, below=MAX_PX) for key in INTRINSICS[:2])
     cx, cy = (node.child(key).number(above=-MAX_PX, below=MAX_PX) for key in INTRINSICS[2:])
-    # the coefficients up to the last that is given, as many as one of OpenCV's models has
+    # the coefficients up to the last stated one, padded to the number of one of OpenCV's models
     last = max((k for k, name in enumerate(COEFFICIENT_NAMES, 1) if node.has(name)), default=0)
     names = COEFFICIENT_NAMES[: min(count for count in COEFFICIENT_COUNTS if count >= last)]
     distortion = tuple(
@@ -185,7 +185,7 @@ def _border(node: Node) -> Border:
 
 
 def placeholder_camera(image_path: Path) -> Camera:
-    """A camera for an image whose own is wrong, so that image and states can still be checked."""
+    """Return a camera for an image whose camera is invalid, so that image and states can still be checked."""
     width, height = _size_or_largest(image_path)
     return Camera(torch.eye(4), fx=width, fy=width, cx=width / 2, cy=height / 2, width=width, height=height)
 
@@ -198,14 +198,13 @@ def _size_or_largest(image_path: Path) -> tuple[int, int]:
 
 
 class CameraFields:
-    """Looks a camera's numbers up in the frame first, then at the top level, and checks them; every fault is
-    reported."""
+    """Checked lookup of a camera's numbers, first in the frame, then at the top level; every fault is reported."""
 
     def __init__(self, frame: Node, document: Node, image_path: Path, parsed: Parsed) -> None:
         self.frame, self.document, self.image_path, self.parsed = frame, document, image_path, parsed
 
     def camera(self) -> Camera | None:
-        """The frame's camera at the origin; None, and reported, where its numbers are wrong."""
+        """Return the frame's camera at the origin; None, and reported, if its numbers are invalid."""
         stated = self._node("camera_model").tried(lambda _: self._distortion())
         size = self.frame.child("file_path").tried(lambda _: self._size())
         width, height = size or _size_or_largest(self.image_path)
@@ -232,7 +231,7 @@ class CameraFields:
         return (self.frame if self.frame.has(key) else self.document).child(key)
 
     def _distortion(self) -> StatedDistortion:
-        """Raises Fault where it cannot be read, and for distorted images that are read in place."""
+        """Return the stated distortion. Raises Fault if it is invalid, or not zero for images read in place."""
         stated = stated_distortion(self._node)
         if stated.place is not None and not self.parsed.as_source:
             message = f"is {printable(stated.place.value)}: cameras must be PINHOLE, and the images are distorted"
@@ -240,7 +239,7 @@ class CameraFields:
         return stated
 
     def _size(self) -> tuple[int, int]:
-        """(width, height), from the image itself where not stated."""
+        """Return (width, height), from the image if not stated."""
         if not self._has("w", "h"):
             try:
                 return image_size(self.image_path)
@@ -252,17 +251,17 @@ class CameraFields:
         return int(width), int(height)
 
     def _focal(self, node: Node, angle_key: str, extent: int) -> float:
-        """Focal length in px, from the field of view where only that is given."""
+        """Return the focal length in px, from the field of view if only that is stated."""
         if node.value is not None or not self._has(angle_key):
             return _positive(node)
         angle = _positive(self._node(angle_key))
         if angle >= math.pi:
-            self._node(angle_key).fail(f"is {angle:g} rad, not below pi", "give the field of view in radians")
+            self._node(angle_key).fail(f"is {angle:g} rad, must be below pi", "give the field of view in radians")
         return 0.5 * extent / math.tan(0.5 * angle)
 
 
 def _center(node: Node, extent: int) -> float:
-    """Principal point in px: inside the image, its middle where not stated."""
+    """Return the principal point in px, inside the image; default: the image centre."""
     value = extent / 2 if node.value is None else node.number()
     if not 0 < value < extent:
         node.fail(f"is {value:g}, outside the image (0 .. {extent})", "give it in pixels of this image")

@@ -30,7 +30,7 @@ POSES_FILE = "poses_bounds.npy"
 MASKS = "masks"
 COLUMNS = 17
 FIRST_TEST = 1  # frames 1, 9, 17, ... test, as in EndoGaussian, SurgicalGaussian and Deform3DGS: numbers compare
-MAX_STILL_CHANGE = 1e-6  # of the entries of a still camera's pose
+MAX_STILL_CHANGE = 1e-6  # maximum change of any entry of a still camera's pose
 
 
 def is_endonerf_folder(root: Path) -> bool:
@@ -39,10 +39,10 @@ def is_endonerf_folder(root: Path) -> bool:
 
 
 def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
-    """Read an EndoNeRF folder; problems and what such a folder lacks go to `report`. Lengths are in its own unit.
+    """Read an EndoNeRF folder; problems and missing data go to `report`. Lengths are in the folder's unit.
 
-    Images are paired with poses by sorted name. There are no instrument states; tool masks and depth maps are not used;
-    where the depth bounds are usable, random points fill the space between them.
+    Images are paired with poses by sorted name. There are no instrument states; tool masks and depth maps are not used.
+    If the depth bounds are usable, random points fill the space between them.
     """
     file = Node(None, POSES_FILE, "", report)
     parsed = Parsed(root, timed=False, points_place=file.child("points"), is_endonerf=True)
@@ -71,7 +71,7 @@ def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
 
 
 def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
-    """The images in a folder of the capture, sorted by name; those that lead out of it are reported and left out."""
+    """Return the images in a folder of the capture, sorted by name; links that leave it are reported and skipped."""
     if not (root / folder).is_dir():
         return []
     paths = []
@@ -86,16 +86,16 @@ def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
 
 
 def _load(root: Path) -> np.ndarray:
-    """The table [N, 17] as float64. Raises NeecoError, which does not name the file."""
+    """Return the table [N, 17] as float64. Raises NeecoError, without the file's name."""
     remedy = "write an array of N x 17 numbers with numpy.save"
     path = inside(root, root, POSES_FILE)
     if problem := placeholder(path):
         raise NeecoError(problem)
     try:
-        # mapped, so that a wrong header cannot make us allocate more than the file holds
-        with warnings.catch_warnings(action="ignore"):  # of files that Python 2 wrote
+        # memory-mapped, so that a wrong header cannot allocate more than the file's size
+        with warnings.catch_warnings(action="ignore"):  # about files written by Python 2
             table = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception:  # damaged headers make numpy raise nearly anything
+    except Exception:  # numpy raises many types for damaged headers
         raise NeecoError(f"is damaged or not an array of plain numbers; {remedy}") from None
     if not isinstance(table, np.ndarray) or table.dtype.kind not in "fiu":
         raise NeecoError(f"is not an array of plain numbers; {remedy}")
@@ -105,7 +105,7 @@ def _load(root: Path) -> np.ndarray:
 
 
 def _camera(place: Node, values: np.ndarray) -> Camera:
-    """The camera of an image's row [17] of numbers. Raises Fault."""
+    """Return the camera of an image's row [17] of numbers. Raises Fault."""
     matrix = values[:15].reshape(3, 5)
     with np.errstate(invalid="ignore"):
         pose = LLFF.camera_to_opencv(matrix[:, :4])
@@ -120,7 +120,7 @@ def _camera(place: Node, values: np.ndarray) -> Camera:
 
 
 def _points(cameras: Sequence[Camera], poses: np.ndarray, near: np.ndarray, far: np.ndarray) -> PointCloud | None:
-    """Random points about the middle of depth bounds [N] of cameras at poses [N, 3, 4]; None for unusable bounds."""
+    """Return random points around the centre of depth bounds [N] of cameras at poses [N, 3, 4]; None if unusable."""
     with np.errstate(invalid="ignore"):
         if not ((near >= 0) & (near < far) & (far < 1e9)).all():  # nor when NaN
             return None
@@ -131,20 +131,20 @@ def _points(cameras: Sequence[Camera], poses: np.ndarray, near: np.ndarray, far:
 
 
 def _warn_of_limits(root: Path, poses: np.ndarray, file: Node) -> None:
-    """Warn of what such a folder lacks, and of what in it is not read."""
-    remedy = "only methods that need none can be trained, such as 3dgs"
+    """Warn of missing data, and of files that are not read."""
+    remedy = "only methods without instrument states can be trained, such as 3dgs"
     file.child("instruments").warning("no instrument states", remedy)
-    file.child("units").warning("names no unit of length", "lengths are taken as mm: distances may be off")
+    file.child("units").warning("has no unit of length", "mm is assumed: distances may be wrong")
     if len(poses) > 1 and np.ptp(poses, axis=0).max() < MAX_STILL_CHANGE:
         message = "the camera never moves, so the images do not determine depth"
         file.child("poses").warning(message, "views other than the recorded one will be wrong")
     elif len(poses) > 1:
-        remedy = "folders prepared for some EndoNeRF successors hold right, down, forwards: reorder those"
-        file.child("poses").warning("camera axes are taken as LLFF's: down, right, backwards", remedy)
+        remedy = "folders prepared for some EndoNeRF successors have right, down, forwards: reorder those"
+        file.child("poses").warning("LLFF's camera axes are assumed: down, right, backwards", remedy)
     if (root / MASKS).is_dir():
         message = "tool masks (white = tool) are not loss masks (black = ignored) and are left out"
         remedy = (
-            f"`neeco ingest {printable(root.name)} --output CAPTURE` turns them into loss masks that ignore the tool"
+            f"`neeco ingest {printable(root.name)} --output CAPTURE` converts them to loss masks that ignore the tool"
         )
         file.report.warning(f"{MASKS}/", "", message, remedy)
     if (root / "depth").is_dir():

@@ -1,8 +1,8 @@
 """Kinematic trees: the block of transforms.json, tool files of the dVRK (`share/tool/*.json`) and URDF files.
 
 The block, which `KinematicTree.to_json` writes, is `{"pose_of": NAME, "links": [{"name", "parent", "type", "origin",
-"axis", "value": {reading: gain}, "offset", "limits", "body"}]}`, as `Link` has them; all but a link's name may be left
-out where it is as `Link` says.
+"axis", "value": {reading: gain}, "offset", "limits", "body"}]}`, the fields of `Link`; all but a link's name have the
+defaults of `Link`.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from neeco.geometry.rotations import rigid
 
 MAX_MM = 1e4  # beyond any instrument
 MAX_GAIN = 1e3
-UNIT_TOLERANCE = 1e-12  # of the length of a unit vector of float64
+UNIT_TOLERANCE = 1e-12  # tolerance of the length of a unit vector in float64
 
 
 def parse_kinematics(node: Node) -> KinematicTree:
-    """The tree that a node describes. Raises Fault where that is none."""
+    """Return the tree that a node describes. Raises Fault if it is invalid."""
     node.members()
     links, pose_of = node.child("links"), node.given("pose_of", Node.text, None)
     parsed = tuple(map(_parse_link, links.items()))
@@ -39,7 +39,7 @@ def parse_kinematics(node: Node) -> KinematicTree:
 
 
 def kinematics_of(value: Any, file: str) -> KinematicTree:
-    """The tree of a plain dict, as in a JSON or YAML file. Raises NeecoError naming `file` and the field."""
+    """Return the tree of a plain dict, as in a JSON or YAML file. Raises NeecoError naming `file` and the field."""
     with faults_in(file):
         return parse_kinematics(Node(value, file, "kinematics"))
 
@@ -66,12 +66,12 @@ def _parse_link(node: Node) -> Link:
 
 
 def _origin(node: Node) -> Array:
-    """parent_from_link of three numbers (mm) or a rigid transform."""
+    """Return parent_from_link of three numbers (mm) or a rigid transform."""
     if isinstance(node.value, list) and any(isinstance(row, list) for row in node.value):
         return node.rigid()
     place = np.array(node.numbers(3, "x, y, z in mm"))
     if np.abs(place).max() > MAX_MM:
-        node.fail(f"lies {np.abs(place).max():g} mm away", "give it in mm, in the parent's frame")
+        node.fail(f"is {np.abs(place).max():g} mm away", "give it in mm, in the parent's frame")
     return rigid(np.eye(3), place)
 
 
@@ -79,33 +79,32 @@ def _axis(node: Node) -> Array:
     direction = np.array(node.numbers(3, "x, y, z of the axis in the parent's frame"))
     length = math.hypot(*direction)
     if not 1e-6 < length < 1e6:
-        node.fail("is no direction", "give three numbers that are not all 0")
-    # as written by us it stays: divided again, its last digits would change with every reading
+        node.fail("is not a direction", "give three numbers that are not all 0")
+    # unit vectors are kept: normalised again, their last digits would change with every reading of the file
     return direction if abs(length - 1) < UNIT_TOLERANCE else direction / length
 
 
-DVRK_READINGS = ("wrist_pitch", "wrist_yaw", "jaw")  # what drives the joints beyond the roll
+DVRK_READINGS = ("wrist_pitch", "wrist_yaw", "jaw")  # readings of the joints distal to the roll
 MM = 1000.0  # per m
-# a string, which stays, or a comment of JSON as the dVRK writes it
+# a string, which is kept, or a comment in the dVRK's JSON
 _STRING_OR_COMMENT = re.compile(r'("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/', re.DOTALL)
 DVRK_TOOL = "a tool file of the dVRK: JSON, with comments"
 
 
 def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) -> KinematicTree:
-    """The links beyond the roll of a tool: shaft, wrist, and two jaws on the axis of the yaw (one end effector where
-    the tool has no jaws), joined by readings wrist_pitch, wrist_yaw and jaw in rad. Recorded poses are those of `tip`,
-    the frame of `measured_cp`, which has no body.
+    """Read the links of a tool distal to the roll: shaft, wrist, and two jaws on the yaw axis (one end effector for
+    tools without jaws), with readings wrist_pitch, wrist_yaw and jaw in rad. Recorded poses are poses of `tip`, the
+    frame of `measured_cp`, which has no body.
 
-    `readings`: how the recording calls any of these. Lengths become mm. The joints' frames are those of Denavit and
-    Hartenberg as modified by Craig. Raises NeecoError for a file of another kind, or a name that is none of the
-    readings.
+    readings: the recording's names of these readings. Lengths are converted to mm. Joint frames follow the modified
+    Denavit-Hartenberg convention (Craig). Raises NeecoError for a file of another kind, or an unknown reading.
     """
     path = Path(path)
     text = _STRING_OR_COMMENT.sub(lambda match: match[1] or " ", read_text(path, DVRK_TOOL))
     try:
         document = json.loads(text, object_pairs_hook=distinct_keys)
     except (ValueError, RecursionError) as error:
-        raise NeecoError(f"{path}: not readable as {DVRK_TOOL} ({error}); correct it") from None
+        raise NeecoError(f"{path}: cannot be read as {DVRK_TOOL} ({error}); correct it") from None
     with faults_in(path):
         return _dvrk_tool(Node(document, str(path)), dict(readings or {}))
 
@@ -116,9 +115,9 @@ def _dvrk_tool(document: Node, names: Mapping[str, str]) -> KinematicTree:
     if frames.child("convention").value != "modified":
         convention = printable(frames.child("convention").value)
         frames.child("convention").fail(f"is {convention}, not 'modified'", "give a tool file of the dVRK")
-    # older files call them outer_wrist_pitch and outer_wrist_yaw
+    # named outer_wrist_pitch and outer_wrist_yaw in older files
     joints = {item.child("name").text().removeprefix("outer_"): item for item in frames.child("joints").items()}
-    # hooks and spatulas have an entry for jaws, too, which no force moves
+    # hooks and spatulas also have an entry for jaws, with zero maximum force
     has_jaws = document.has("jaw") and document.child("jaw").child("ftmax").value != 0
     for joint in DVRK_READINGS[:2]:
         if joint not in joints:
@@ -126,7 +125,7 @@ def _dvrk_tool(document: Node, names: Mapping[str, str]) -> KinematicTree:
     available = DVRK_READINGS if has_jaws else DVRK_READINGS[:2]
     for name in names:
         if name not in available:
-            raise Fault("readings", f"{name!r} is no joint of this tool; it has {', '.join(available)}")
+            raise Fault("readings", f"{name!r} is not a joint of this tool; choose one of: {', '.join(available)}")
     pitch, yaw, jaw = (names.get(joint, joint) for joint in DVRK_READINGS)
     wrist, pitch_axis = _frame(joints["wrist_pitch"])
     pivot, yaw_axis = _frame(joints["wrist_yaw"])
@@ -145,10 +144,10 @@ def _dvrk_tool(document: Node, names: Mapping[str, str]) -> KinematicTree:
 
 
 def _frame(joint: Node) -> tuple[Array, Array]:
-    """(parent_from_link [4, 4] mm at a value of 0, the axis [3] in the parent's frame) of a joint in modified
+    """Return (parent_from_link [4, 4] mm at value 0, the axis [3] in the parent's frame) of a joint in modified
     Denavit-Hartenberg parameters: Rx(alpha) Tx(A) Rz(theta + offset) Tz(D)."""
     if joint.child("type").value != REVOLUTE:
-        joint.child("type").fail(f"is {printable(joint.child('type').value)}", "wrists turn: write revolute")
+        joint.child("type").fail(f"is {printable(joint.child('type').value)}", "wrist joints must be revolute")
     alpha, length, theta, offset, depth = (joint.child(key).number() for key in ("alpha", "A", "theta", "offset", "D"))
     c, s = math.cos(alpha), math.sin(alpha)
     before = np.array([[1, 0, 0, MM * length], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]], np.float64)
@@ -158,22 +157,22 @@ def _frame(joint: Node) -> tuple[Array, Array]:
 
 
 TYPES = {"fixed": FIXED, "revolute": REVOLUTE, "continuous": REVOLUTE, "prismatic": PRISMATIC}
-URDF = "a URDF file: XML (of a .xacro, what `xacro` makes of it)"
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)  # a processed file names its source in one
-_XACRO_PREFIX = re.compile(r"xmlns:([\w.-]+)\s*=\s*[\"'][^\"']*xacro[^\"']*[\"']")  # a processed file keeps it, too
+URDF = "a URDF file: XML (for a .xacro, the output of `xacro`)"
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)  # a processed file names its source in a comment
+_XACRO_PREFIX = re.compile(r"xmlns:([\w.-]+)\s*=\s*[\"'][^\"']*xacro[^\"']*[\"']")  # kept in processed files
 _SUBSTITUTION = re.compile(r"\$\{|\$\((?:arg|find|eval|env|optenv|dirname|anon)\b")
 
 
 def read_urdf(
     path: Path | str, root: str | None = None, pose_of: str | None = None, readings: Mapping[str, str] | None = None
 ) -> KinematicTree:
-    """The links of a URDF from `root` on (by default its own), joined as it says. Recorded poses are those of the link
-    `pose_of` (by default of `root`).
+    """Read the links of a URDF from link `root` (default: the URDF's root). Recorded poses are poses of the link
+    `pose_of` (default: `root`).
 
-    Every joint is driven by the reading of its name, or as `readings` calls it; one that mimics another, by
-    the other's. Lengths become mm, and so do the readings of joints that slide. Where any of the links has something
-    visual, those without are frames only. Raises NeecoError for a file of another kind, a joint that neither turns nor
-    slides, or a name that is none of the links or joints.
+    Every joint is driven by the reading of its name, renamed by `readings`; a mimicking joint by the reading of the
+    mimicked one. Lengths and readings of prismatic joints are converted to mm. If any link has a visual, links without
+    one are frames without a body. Raises NeecoError for a file of another kind, an unsupported joint type, or an
+    unknown link or joint.
     """
     path, names = Path(path), dict(readings or {})
     robot = _parse(path)
@@ -186,15 +185,15 @@ def read_urdf(
         for name in (joint.parent, joint.child):
             if name not in by_name:
                 raise NeecoError(
-                    f"{path}: joint {joint.name!r} joins {name!r}, which is no link; add it, or correct it"
+                    f"{path}: joint {joint.name!r} connects {name!r}, which is not a link; add or correct it"
                 )
     carried = {joint.child for joint in robot.joints}
     tops = [name for name in by_name if name not in carried]
     for key, name in (("root", root), ("pose_of", pose_of)):
         if name is not None and name not in by_name:
-            raise NeecoError(f"{path}: {key}: there is no link {name!r}; name one of {', '.join(by_name)}")
+            raise NeecoError(f"{path}: {key}: there is no link {name!r}; choose one of: {', '.join(by_name)}")
     if root is None and len(tops) != 1:
-        raise NeecoError(f"{path}: one link has no parent, the root; found {', '.join(tops) or 'none'}; name `root`")
+        raise NeecoError(f"{path}: expected one root link, found {', '.join(tops) or 'none'}; set `root`")
     first = tops[0] if root is None else root
     assert first is not None
     reached = [(first, None), *((joint.child, joint) for joint in _below(first, children, path))]
@@ -202,9 +201,11 @@ def read_urdf(
         if twice := next((name for name in defined if defined.count(name) > 1), None):
             raise NeecoError(f"{path}: {key} {twice!r} is defined twice; rename one of them")
     moving = {joint.name for _, joint in reached if joint is not None and TYPES.get(joint.type) != FIXED}
-    for named in names:
-        if named not in moving:
-            raise NeecoError(f"{path}: readings: {named!r} is no joint that moves; it has {', '.join(sorted(moving))}")
+    for name in names:
+        if name not in moving:
+            raise NeecoError(
+                f"{path}: readings: {name!r} is not a moving joint; choose of: {', '.join(sorted(moving))}"
+            )
     visible = {name for name, _ in reached if by_name[name].visuals}
     reached_joints = {joint.name: joint for _, joint in reached if joint is not None}
     links = []
@@ -225,17 +226,17 @@ def _parse(path: Path) -> Any:
         raise NeecoError(f"{path}: needs urdfdom-py to be read; {install_hint('urdf')}") from None
     text = read_text(path, URDF)
     _refuse_xacro(path, text)
-    core.on_error = lambda message: None  # of tags that it does not know, which it would print
+    core.on_error = lambda message: None  # it would print unknown tags
     try:
         return urdf.URDF.from_xml_string(text.encode())
     # the package raises ParseError, lxml's XMLSyntaxError, AssertionError and others
     except Exception as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise NeecoError(f"{path}: not readable as {URDF} ({reason}); correct it") from None
+        raise NeecoError(f"{path}: cannot be read as {URDF} ({reason}); correct it") from None
 
 
 def _refuse_xacro(path: Path, text: str) -> None:
-    """Raise NeecoError for unprocessed xacro, of which a URDF parser would read what lies outside its macros."""
+    """Raise NeecoError for unprocessed xacro, of which a URDF parser would ignore the macros."""
     text = _COMMENT.sub("", text)
     prefixes = "|".join(map(re.escape, {"xacro", *_XACRO_PREFIX.findall(text)}))
     if _SUBSTITUTION.search(text) or re.search(rf"[<\s/](?:{prefixes}):[\w.-]+[\s=/>]", text):
@@ -245,20 +246,20 @@ def _refuse_xacro(path: Path, text: str) -> None:
 
 
 def _below(first: str, children: Mapping[str, list[Any]], path: Path) -> Iterator[Any]:
-    """Joints beyond a link, parents first. Raises NeecoError where they lead in a circle."""
-    waiting, met = [first], {first}
-    while waiting:
-        for joint in children.get(waiting.pop(0), []):
-            if joint.child in met:
-                raise NeecoError(f"{path}: {joint.child!r} is reached twice; every link needs one way to the root")
-            met.add(joint.child)
-            waiting.append(joint.child)
+    """Yield the joints distal to a link, parents first. Raises NeecoError for a cycle."""
+    queue, visited = [first], {first}
+    while queue:
+        for joint in children.get(queue.pop(0), []):
+            if joint.child in visited:
+                raise NeecoError(f"{path}: {joint.child!r} has several paths to the root; give every link one parent")
+            visited.add(joint.child)
+            queue.append(joint.child)
             yield joint
 
 
 def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body: bool, path: Path) -> Link:
     if joint.type not in TYPES:
-        raise NeecoError(f"{path}: joint {joint.name!r} is {joint.type}; {', '.join(TYPES)} are supported")
+        raise NeecoError(f"{path}: joint {joint.name!r} is {joint.type}; use one of: {', '.join(TYPES)}")
     kind, origin = TYPES[joint.type], np.eye(4)
     if joint.origin is not None:
         turn = Rotation.from_euler("xyz", joint.origin.rpy or [0, 0, 0]).as_matrix()
@@ -268,7 +269,7 @@ def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body:
     axis = np.array(joint.axis or [1.0, 0.0, 0.0], np.float64)  # URDF's own default
     length = float(np.linalg.norm(axis))
     if not 1e-6 < length < 1e6:
-        raise NeecoError(f"{path}: joint {joint.name!r}: its axis is no direction; give three numbers, not all 0")
+        raise NeecoError(f"{path}: joint {joint.name!r}: its axis is not a direction; give three numbers, not all 0")
     axis = origin[:3, :3] @ (axis / length)
     unit = MM if kind == PRISMATIC else 1.0
     limit = joint.limit
@@ -278,7 +279,7 @@ def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body:
         driver = joint.mimic.joint
         if driver not in joints or joints[driver].mimic is not None:
             raise NeecoError(
-                f"{path}: joint {joint.name!r} mimics {driver!r}; name a joint beyond the root that is driven"
+                f"{path}: joint {joint.name!r} mimics {driver!r}; choose a driven joint distal to the root"
             )
         of_driver = MM if TYPES.get(joints[driver].type) == PRISMATIC else 1.0
         gain = (1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)) * unit / of_driver
@@ -289,8 +290,8 @@ def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body:
 
 def _limits(limit: Any, unit: float, name: str, path: Path) -> tuple[float, float] | None:
     low, high = unit * float(limit.lower or 0.0), unit * float(limit.upper or 0.0)
-    if low == high == 0.0:  # URDF's own default: none stated
+    if low == high == 0.0:  # URDF's default: no limits
         return None
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise NeecoError(f"{path}: joint {name!r}: its limits {low:g} to {high:g} are no range; correct them")
+        raise NeecoError(f"{path}: joint {name!r}: its limits {low:g} to {high:g} are not a range; correct them")
     return low, high

@@ -1,4 +1,4 @@
-"""Captures as far as a reader could parse them, and the files that they name."""
+"""Partially parsed captures, and the files that they name."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ from neeco.capture.model import Frame, Instrument, InstrumentState
 from neeco.capture.points import PointCloud
 from neeco.geometry.lens import Lens
 
-NOWHERE = "put it there or correct the path"
+NOWHERE = "add the file or correct the path"
 
 
 @dataclass(kw_only=True)
 class Parsed:
     """A partially parsed capture.
 
-    Frames without readable image, split, time or states are left out (and reported); those with only a wrong camera are
-    kept, so that the rest of them can be checked. `as_source`: parsed for conversion; then distorted images (with a
-    lens model) and absent ones (listed as `absent`) are no errors.
+    Frames without readable image, split, time or states are left out and reported. Frames with only an invalid camera
+    are kept, so that their other data can be checked. as_source: parsed for conversion; then distorted images (with a
+    lens model) and missing images (listed in `absent`) are not errors.
     """
 
     root: Path = field(kw_only=False)
     frames: list[Frame] = field(default_factory=list)
-    places: list[Node] = field(default_factory=list)  # where each frame is described
+    places: list[Node] = field(default_factory=list)  # node of each frame
     instruments: tuple[Instrument, ...] = ()
-    points: PointCloud | None = None  # None: none named
+    points: PointCloud | None = None  # None: not stated
     points_place: Node | None = None
     registered: bool = True
-    timed: bool = True  # the recording says when each frame was taken
-    says_units: bool = False  # the file names its unit of length
-    lens: Lens | None = None  # through which it was recorded
-    still: bool = False  # its cameras stood still
-    is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
-    without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
+    timed: bool = True  # whether every frame states a time
+    says_units: bool = False  # whether the file states its unit of length
+    lens: Lens | None = None  # lens of the recording
+    still: bool = False  # whether the cameras did not move
+    is_endonerf: bool = False  # an EndoNeRF folder, whose masks show the tool
+    without_camera: set[int] = field(default_factory=set)  # frames with a placeholder for an invalid camera
     as_source: bool = False
     absent: list[Problem] = field(default_factory=list)
 
     def header(self, field: str) -> Node:
-        """The place `field` of the file that describes the first frame."""
+        """Return the node `field` of the file that describes the first frame."""
         return Node(None, self.places[0].file, field, self.places[0].report)
 
     def with_cameras(self) -> Parsed:
@@ -56,13 +56,13 @@ class Parsed:
         return self.of_rows([row for row in range(len(self.frames)) if row not in self.without_camera])
 
     def of_rows(self, rows: Sequence[int]) -> Parsed:
-        """Return the same with the frames of these rows, in their order."""
+        """Return the capture with only the frames of these rows, in their order."""
         without = {index for index, row in enumerate(rows) if row in self.without_camera}
         frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
         return replace(self, frames=frames, places=places, without_camera=without)
 
     def states_of(self, name: str) -> list[tuple[Node, InstrumentState]]:
-        """(place of the state, state) of one instrument, over the frames that have it."""
+        """Return (node of the state, state) of one instrument, for the frames that have it."""
         return [
             (place.child("instruments").item(list(frame.state.instruments).index(name)), frame.state.instruments[name])
             for frame, place in zip(self.frames, self.places, strict=True)
@@ -71,10 +71,10 @@ class Parsed:
 
 
 def inside(root: Path, folder: Path, text: str) -> Path:
-    """The path `text`, taken relative to `folder`, which must lie inside `root` also after following symbolic links.
+    """Return the path `text`, relative to `folder`, which must be inside `root` after resolving symbolic links.
 
-    Raises NeecoError (without naming the field: the caller does) when it is absolute, leads out or is no path at all.
-    A link in the folder may lead out of it where the user says so (`follows_links`).
+    Raises NeecoError (the caller adds the field) if it is absolute, outside `root` or not a path. A link in the folder
+    may point outside if the user allows it (`follows_links`).
     """
     if os.path.isabs(text) or PureWindowsPath(text).is_absolute():
         raise NeecoError(f"{printable(text)} is absolute; give a path relative to the capture's folder")
@@ -96,8 +96,8 @@ def inside(root: Path, folder: Path, text: str) -> Path:
 
 
 def named_file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path:
-    """The existing file inside the capture that a node names; `extensions` are tried on paths without one. Raises Fault
-    and, for paths that lead out, NeecoError."""
+    """Return the existing file inside the capture that a node names; extensions: tried for paths without one. Raises
+    Fault, and NeecoError for paths outside the capture."""
     text = node.text()
     candidates = [inside(root, folder, text + extension) for extension in ("", *extensions)]
     if not (existing := [candidate for candidate in candidates if candidate.is_file()]):
@@ -106,10 +106,10 @@ def named_file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...]
 
 
 def named_image(node: Node, folder: Path, parsed: Parsed, extensions: tuple[str, ...] = ()) -> Path | None:
-    """`named_file` of a frame's image; None, and reported, without one. Of a source, one that is nowhere is counted,
-    and no error."""
+    """Return `named_file` of a frame's image; None, and reported, if there is none. For `as_source`, a missing image is
+    listed as absent instead of an error."""
     if node.value is None:
-        node.error("is missing", "name the frame's image")
+        node.error("is missing", "state the frame's image")
         return None
     path, problems = node.tried(named_file, folder, parsed.root, extensions), node.report.problems
     if path is None and parsed.as_source and problems[-1].remedy == NOWHERE:
@@ -118,7 +118,7 @@ def named_image(node: Node, folder: Path, parsed: Parsed, extensions: tuple[str,
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
-    """Key that sorts frame2 before frame10."""
+    """Return a sort key that sorts frame2 before frame10."""
     parts = re.split(r"(\d+)", name.lower())
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
@@ -126,15 +126,15 @@ def natural_order(name: str) -> list[tuple[int, int, str]]:
 def instants(names: Sequence[str], lenses: Sequence[Hashable]) -> list[int] | None:
     """Return the rank in time of images by the numbers in their names; None if the names have different patterns.
 
-    The same name in several folders is one instant unless two folders share a lens: cameras of a rig.
+    Images of one name in several folders (cameras of a rig) have one rank, unless two folders share a lens.
     """
     parts = [PurePosixPath(name.replace("\\", "/")) for name in names]
     folders: dict[str, set[Hashable]] = {}
     for part, lens in zip(parts, lenses, strict=True):
         folders.setdefault(str(part.parent), set()).add(lens)
     stems = {part.with_suffix("").name for part in parts}
-    apart = sum(map(len, folders.values())) == len(set(lenses))
-    rig = len(folders) > 1 and apart and len(stems) <= len(names) * 2 / (1 + len(folders))
+    distinct_lenses = sum(map(len, folders.values())) == len(set(lenses))
+    rig = len(folders) > 1 and distinct_lenses and len(stems) <= len(names) * 2 / (1 + len(folders))
     keys = [part.with_suffix("").name if rig else str(part.with_suffix("")) for part in parts]
     if len({re.sub(r"\d+", "0", key) for key in keys}) > 1:
         return None
@@ -143,39 +143,39 @@ def instants(names: Sequence[str], lenses: Sequence[Hashable]) -> list[int] | No
 
 
 def relative_name(file: Path, root: Path) -> str:
-    """Name of a file of the capture in messages."""
+    """Return the name of a file of the capture for messages."""
     return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name
 
 
 def missing_file(folder: Path, text: str) -> Fault:
-    """Return the fault of a path, relative to `folder`, without a file, and its remedy."""
+    """Return the fault and remedy for a path, relative to `folder`, without a file."""
     message, similar = f"no such file: {printable(text)}", similar_file(folder, text)
     if similar is None:
         return message, NOWHERE
     form = ", in another Unicode form or case" if _normal(similar) == _normal(text) else ""
-    return message, f"{printable(similar)} is there{form}: correct the path"
+    return message, f"{printable(similar)} exists{form}: correct the path"
 
 
 def similar_file(folder: Path, text: str) -> str | None:
     """Find a file under `folder` that differs from a path in separators, case, Unicode form, image extension or folder.
 
-    Relative to `folder`; None where there is none.
+    Relative to `folder`; None if there is none.
     """
-    wanted = PurePosixPath(_normal(text.replace("\\", "/")))
-    if not wanted.parts or ".." in wanted.parts:
+    path = PurePosixPath(_normal(text.replace("\\", "/")))
+    if not path.parts or ".." in path.parts:
         return None
     try:
         names = _names_under(folder, os.stat(folder).st_mtime_ns)
     except OSError:
         return None
-    keys = (str(wanted), _without_extension(str(wanted)), wanted.name, _without_extension(wanted.name))
+    keys = (str(path), _without_extension(str(path)), path.name, _without_extension(path.name))
     return next((names[key] for key in keys if key in names), None)
 
 
 @lru_cache(maxsize=1)
 def _names_under(folder: Path, changed: int) -> dict[str, str]:
-    """Files under `folder` by their normalised paths and names, also without an image's extension. `changed`: when,
-    for the cache."""
+    """Return files under `folder` by normalised path and name, also without an image's extension. changed: the folder's
+    modification time, for the cache."""
     files = (entry.relative_to(folder) for entry in folder.rglob("*") if entry.is_file())
     names: dict[str, str] = {}
     for file in sorted(files, key=lambda file: (len(file.parts), file)):
