@@ -130,7 +130,7 @@ def resumed(verb: Verb, whole: Undisturbed, work: Path) -> list[str]:
     ended = Child([*verb.words, *verb.resume], work).wait()
     if ended.status == 1 and "nothing was begun" in ended.told:
         ended = Child(verb.words, work).wait()
-    if ended.status == 1 and "exists already" in ended.told and not verb.resume:
+    if ended.status == 1 and "already exists" in ended.told and not verb.resume:
         return differences(whole.files, digests(verb.shelf))  # it was whole when it was killed
     if ended.status != 0:
         return [f"resumption ended with {ended.status}: {ended.told[-1500:]}"]

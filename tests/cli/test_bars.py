@@ -28,7 +28,7 @@ def test_a_file_gets_a_line_at_intervals_with_what_how_far_and_how_long_still(ca
         bars.training(row)
         time.sleep(0.1)
     first, *_, last = capsys.readouterr().err.splitlines()
-    assert first.startswith("training: 25 %, iteration 12345678, PSNR 30.0 dB, 23456 Gaussians, 0:00:00 passed")
+    assert first.startswith("training: 25 %, iteration 12345678, PSNR 30.0 dB, 23456 Gaussians, 0:00:00 elapsed")
     assert last.startswith("training: 25 %")
     assert len(first) > 80
 
@@ -44,7 +44,7 @@ def test_a_stage_that_reports_nothing_is_told_too_and_an_error_alone_ends_it(cap
 
     with pytest.raises(NeecoError):
         work()
-    assert set(capsys.readouterr().err.splitlines()) == {"matching: 0:00:00 passed"}
+    assert set(capsys.readouterr().err.splitlines()) == {"matching: 0:00:00 elapsed"}
 
 
 def test_the_time_left_follows_from_the_speed_without_preparation(capsys):
@@ -63,7 +63,7 @@ def test_jobs_that_all_ended_have_said_so_and_leave_no_last_line(capsys):
     with Bars() as bars:
         bars.job(JobEvent(index=0, total=1, job=job, stage="training", share=0.5))
         bars.job(JobEvent(index=0, total=1, job=job, stage="done", result={"iterations": 3}))
-    assert capsys.readouterr().err == "1/1 kinematic, seed 0: done: 3 iterations (1 of 1 ended)\n"
+    assert capsys.readouterr().err == "1/1 kinematic, seed 0: done: 3 iterations (1 of 1 finished)\n"
 
 
 def test_work_of_some_length_ends_with_its_total_time(capsys):

@@ -18,7 +18,7 @@ def test_the_bundled_sample_is_found_with_its_masks() -> None:
 
 def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("precious")
-    with pytest.raises(NeecoError, match="exists already"):
+    with pytest.raises(NeecoError, match="already exists"):
         run(Arguments(output=tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 

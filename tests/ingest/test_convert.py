@@ -187,7 +187,7 @@ def test_poses_without_instrument_joints_or_registration_are_named(tmp_path):
 def test_nothing_is_overwritten_and_failures_leave_nothing(nerfstudio, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").write_text("keep")
-    with pytest.raises(NeecoError, match="exists already"):
+    with pytest.raises(NeecoError, match="already exists"):
         convert_folder(nerfstudio, tmp_path / "full")
     assert (tmp_path / "full/mine.txt").read_text() == "keep"
     (tmp_path / "empty").mkdir()

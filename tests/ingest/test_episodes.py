@@ -199,7 +199,7 @@ def test_several_recordings_are_given_on_the_command_line(tmp_path: Path) -> Non
 @pytest.mark.parametrize(("option", "given"), [("json", Path("numbers.json")), ("strict", True)])
 def test_options_of_a_verdict_are_refused_with_a_folder_to_convert(tmp_path: Path, option: str, given: object) -> None:
     (tmp_path / "other").mkdir()
-    with pytest.raises(NeecoError, match=rf"other: --{option} has no effect with it; leave it out"):
+    with pytest.raises(NeecoError, match=rf"other: --{option} does not apply to a converted folder; remove it"):
         run(Ingest(source=(tmp_path / "other",), output=tmp_path / "capture", **{option: given}))
     assert not (tmp_path / "capture").exists()
 

@@ -155,7 +155,7 @@ def test_images_that_show_nothing_leave_nothing_behind(tmp_path: Path) -> None:
 def test_an_output_that_exists_is_not_touched(recording: Path, tmp_path: Path) -> None:
     (tmp_path / "capture").mkdir()
     (tmp_path / "capture" / "mine.txt").write_text("keep")
-    with pytest.raises(NeecoError, match="exists already"):
+    with pytest.raises(NeecoError, match="already exists"):
         ingest(read_recording(recording), tmp_path / "capture", silent)
     assert (tmp_path / "capture" / "mine.txt").read_text() == "keep"
 

@@ -41,7 +41,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path):
 
 def test_what_is_there_stays(tmp_path):
     fill(tmp_path)
-    with pytest.raises(NeecoError, match="exists already"), staged(tmp_path / "capture"):
+    with pytest.raises(NeecoError, match="already exists"), staged(tmp_path / "capture"):
         pass
     assert (tmp_path / "capture" / "file").exists()
 
@@ -72,6 +72,6 @@ def test_what_a_process_killed_after_its_last_step_left_is_swept_too(tmp_path):
             shutil.rmtree = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
     assert len(list(tmp_path.iterdir())) == 2
-    with pytest.raises(NeecoError, match="exists already"):
+    with pytest.raises(NeecoError, match="already exists"):
         staged(tmp_path / "output").__enter__()
     assert [path.name for path in tmp_path.rglob("*")] == ["output", "file"]

@@ -219,8 +219,8 @@ def test_files_are_numbered_anew_and_the_card_and_the_command_say_so(made, recor
     monkeypatch.setattr("neeco.training.run.open_gaussian_run", lambda *_, **__: nullcontext(trusted))
     assert main(["annotate", "run", "--output", str(tmp_path / "set")]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        f"2 of 3 frames in {tmp_path / 'set'}; 1 trusted less than 0.8: left out",
-        "numbered anew; field frame of states.jsonl has the capture's name; worst first: "
+        f"2 of 3 frames in {tmp_path / 'set'}; 1 left out with a trust below 0.8",
+        "frames are renumbered; `frame` in states.jsonl is the original name; all frames, worst first: "
         f"{tmp_path / 'set' / 'annotate.html'}",
     ]
 

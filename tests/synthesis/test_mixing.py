@@ -146,10 +146,13 @@ def test_what_cannot_be_mixed_is_told(near: GaussianScene, scene: GaussianScene)
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--count", "2"], "synthesize: give a RUN, or --tissue RUN with --instruments RUN"),
-        (["a", "--tissue", "b", "--instruments", "c", "--count", "2"], "synthesize: give a RUN, or --tissue RUN"),
-        (["--tissue", "b", "--count", "2"], "--instruments: needs --tissue RUN"),
-        (["a", "--instruments", "b", "--count", "2"], "--instruments: needs --tissue RUN"),
+        (["--count", "2"], "synthesize: give either a RUN, or --tissue RUN with --instruments RUN"),
+        (
+            ["a", "--tissue", "b", "--instruments", "c", "--count", "2"],
+            "synthesize: give either a RUN, or --tissue RUN",
+        ),
+        (["--tissue", "b", "--count", "2"], "--instruments: requires --tissue RUN"),
+        (["a", "--instruments", "b", "--count", "2"], "--instruments: requires --tissue RUN"),
         (["--tissue", "b", "--instruments", "c", "--count", "2"], "b: no such run folder"),
     ],
 )

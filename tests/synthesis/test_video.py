@@ -66,7 +66,7 @@ def test_a_missing_package_is_named(run: FakeRun, tmp_path: Path, uninstalled) -
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "render: give --output FOLDER, or --video FILE.mp4"),
+        ([], "render: give exactly one of --output FOLDER and --video FILE.mp4"),
         (["--output", "a", "--video", "b.mp4"], "one of the two"),
         (["--video", "film.avi"], "--video: film.avi: wrong file name extension"),
         (["--output", "a", "--frames", "9"], "--frames: applies to --video only"),

@@ -193,7 +193,7 @@ def test_the_verb_writes_and_refuses(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "3,165 Gaussians" in capsys.readouterr().out
     assert gaussians_of_spz((run / "scene.spz").read_bytes()).means.shape == (3165, 3)
     assert main(["export", str(run), "--frame", "2"]) == 1
-    assert "--frame: 2: the scene was trained on frames 0 to 1" in capsys.readouterr().err
+    assert "--frame: must be from 0 to 1, the training frames (got 2)" in capsys.readouterr().err
     states = tmp_path / "states.jsonl"
     states.write_text('{"instruments": [{"name": "other", "pose": 1, "joints": {}}]}\n')
     assert main(["export", str(run), "--states", str(states), "--output", str(tmp_path / "a.ply")]) == 1

@@ -25,7 +25,7 @@ from neeco.base.files import FOLLOW_LINKS, require_utf8
 
 VERBS = {
     "demo": "The whole main job on the bundled sample capture, in five minutes.",
-    "check": "Report everything that is wrong with a capture.",
+    "check": "Report all problems of a capture.",
     "ingest": "Make a capture from a recording: video and tracker logs.",
     "train": "Learn a scene from a capture.",
     "evaluate": "Score a run: images, masks, parts, speed; writes a report.",
@@ -35,12 +35,12 @@ VERBS = {
     "score-masks": "Score a folder of masks from any source against the truth.",
     "view": "Show a run interactively, in a browser or as one file.",
     "export": "Write a scene in one state for other viewers of Gaussians (PLY, SPZ, OpenUSD).",
-    "synthesize": "Render a labelled data set of states that nobody recorded.",
-    "annotate": "Label the recorded frames by the scene, each with its confidence.",
-    "track": "Find instruments in footage that has no states, by their learned scene.",
-    "refine": "Train a run again, with frames that were tracked by it.",
+    "synthesize": "Render a labelled data set of unrecorded instrument states.",
+    "annotate": "Label recorded frames with the learned scene, with a confidence per frame.",
+    "track": "Estimate instrument states in footage without states, with a learned scene.",
+    "refine": "Train a run again, with additional frames that it tracked.",
     "downstream": "Train detectors and segmenters on synthetic images; test them on recorded frames.",
-    "ablate": "Remove parts of the methods one by one, for the paper's tables and ours; a sweep.",
+    "ablate": "Remove components of the methods one by one, for the paper's tables and ours; a sweep.",
 }
 
 DESCRIPTION = """Labelled images of surgical instruments in states nobody recorded.
@@ -60,9 +60,9 @@ PIPE_CLOSED = 141  # 128 + SIGPIPE
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line (default: this process's) and return its exit status.
 
-    0 done; 1 bad input or too little memory, one line on stderr; 130 interrupted by Ctrl-C; 141 when the reader of our
-    output went away. Usage errors (2) and `--help` (0) leave through SystemExit. Standard streams may be closed, and
-    may be in any encoding.
+    0 done; 1 invalid input or insufficient memory, one line on stderr; 130 interrupted by Ctrl-C; 141 if the output
+    pipe was closed. Usage errors (2) and `--help` (0) raise SystemExit. Standard streams may be closed, and may have
+    any encoding.
     """
     words = _with_target(list(sys.argv[1:] if arguments is None else arguments))
     _prepare_streams()
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         words.remove("--follow-links")
         os.environ[FOLLOW_LINKS] = "1"
     if threading.current_thread() is threading.main_thread():
-        # SIGTERM ends as Ctrl-C does: tidily
+        # SIGTERM is handled as Ctrl-C, with the same clean-up
         terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with warnings.catch_warnings():
@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _with_target(words: list[str]) -> list[str]:
-    """Words in which every `--json` that no file follows is followed by `-`, standard output."""
+    """Insert `-`, standard output, after every `--json` without a file."""
     for at in reversed([at for at, word in enumerate(words) if word == "--json"]):
         if at + 1 == len(words) or words[at + 1].startswith("--"):
             words.insert(at + 1, "-")
@@ -118,8 +118,8 @@ def _with_target(words: list[str]) -> list[str]:
 
 
 def _prepare_streams() -> None:
-    """Replace standard streams that are closed, as under cron, by the null device, so that no file gets their numbers,
-    and escape what their encoding cannot write."""
+    """Replace closed standard streams, as under cron, by the null device, so that no file gets their descriptors, and
+    escape characters that their encoding lacks."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         stream = getattr(sys, name)
         if stream is None:
@@ -131,7 +131,7 @@ def _prepare_streams() -> None:
 
 
 def _discard_unwritable() -> None:
-    """Discard what cannot be written, so that the interpreter does not fail on exit."""
+    """Discard unwritable output, so that the interpreter does not fail on exit."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -153,7 +153,7 @@ def _dispatch(words: list[str]) -> int:
 
     config = (tyro.conf.FlagCreatePairsOff,)
     if words and words[0] in ("-h", "--help", *COMPLETION):
-        choices = {  # stand-ins in the overview, for which no verb is imported
+        choices = {  # placeholders in the overview, without importing the verbs
             name: _verb([name])[1]
             if words[0] in COMPLETION
             else make_dataclass(name.replace("-", "_"), [], namespace={"__doc__": line})
@@ -170,7 +170,7 @@ def _dispatch(words: list[str]) -> int:
     run, arguments = _verb(words)
     from neeco.cli._output import usage_error
 
-    box = io.StringIO()  # tyro frames what is wrong
+    box = io.StringIO()  # tyro prints usage errors in a frame
     try:
         with contextlib.redirect_stderr(box):
             parsed = tyro.cli(arguments, prog=f"neeco {words[0]}", args=words[1:], config=config)
@@ -180,7 +180,7 @@ def _dispatch(words: list[str]) -> int:
         elif words[0] == "train":
             importlib.import_module(f"{__name__}.train").explain(words)
         raise
-    with contextlib.suppress(FileNotFoundError):  # the current folder was removed: absolute paths may do
+    with contextlib.suppress(FileNotFoundError):  # the current folder was removed: absolute paths may still work
         for word in (os.getcwd(), *words):
             require_utf8(word)
     from neeco.raster.devices import readable_failures
@@ -190,7 +190,7 @@ def _dispatch(words: list[str]) -> int:
     groups = (parsed, *filter(is_dataclass, vars(parsed).values()))
     for word in (word for word in words if word.startswith("--")):
         if any(vars(group).get(word[2:].replace("-", "_")) == () for group in groups):
-            raise NeecoError(f"{word}: no value follows; give one or more, or leave it out")
+            raise NeecoError(f"{word}: needs at least one value; give one, or remove the option")
     with readable_failures():
         return run(parsed)
 
@@ -201,7 +201,7 @@ def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
 
 
 def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any]]:
-    """The first word's `run` and the dataclass of its arguments, which is what `run` takes."""
+    """Return the `run` of the first word's module, and the dataclass of its arguments."""
     module = importlib.import_module(f"{__name__}.{words[0].replace('-', '_')}")
     arguments = next(iter(get_type_hints(module.run).values()))
     from neeco.cli._output import state_defaults

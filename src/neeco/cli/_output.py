@@ -67,20 +67,20 @@ def fitted(table: ResultTable, width: int) -> list[Table]:
     ]
     pieces: list[list[int]] = []
     for at in range(keys, len(headings)):
-        taken = [*range(keys), *(pieces[-1] if pieces else ()), at]
-        if not pieces or sum(BORDER + widths[index] for index in taken) >= width:
+        columns = [*range(keys), *(pieces[-1] if pieces else ()), at]
+        if not pieces or sum(BORDER + widths[index] for index in columns) >= width:
             pieces.append([])
         pieces[-1].append(at)
     tables: list[Table] = []
     for piece in pieces or [[]]:
         title = f"{table.title}, continued" if tables else table.title
-        made = Table(title=Text(title, "italic", no_wrap=True, overflow="ignore"), title_justify="left")
+        part = Table(title=Text(title, "italic", no_wrap=True, overflow="ignore"), title_justify="left")
         for at in (*range(keys), *piece):
             numbers: dict[str, Any] = {"justify": "right", "width": widths[at]} if at >= keys else {"no_wrap": True}
-            made.add_column(headings[at], **numbers)
+            part.add_column(headings[at], **numbers)
         for row, cells in zip(table.rows, rows, strict=True):
-            made.add_row(*cells[:keys], *(cells[at] for at in (piece[:1] if row.failed else piece)))
-        tables.append(made)
+            part.add_row(*cells[:keys], *(cells[at] for at in (piece[:1] if row.failed else piece)))
+        tables.append(part)
     return tables
 
 
@@ -107,8 +107,8 @@ def print_outcome(
         console.print(f"{title}: {place}", markup=False, highlight=False, soft_wrap=True)
     if not failed:
         return 0
-    more = f" (and {len(failed) - 1} more, listed above)" if len(failed) > 1 else ""
-    text = f"neeco: error: {len(failed)} of {runs} failed: {failed[0]}{more}"
+    others = f" (and {len(failed) - 1} more, listed above)" if len(failed) > 1 else ""
+    text = f"neeco: error: {len(failed)} of {runs} failed: {failed[0]}{others}"
     Console(stderr=True).print(text, markup=False, highlight=False, soft_wrap=True)
     return 1
 
@@ -138,7 +138,7 @@ def ready_for_json(path: Path | None) -> Iterator[None]:
     file = None if path == STANDARD_OUTPUT else path
     if file is not None:
         if file.is_dir():
-            raise NeecoError(f"--json: {file}: is a folder; name a file, or none, to print the numbers")
+            raise NeecoError(f"--json: {file}: is a folder; give a file, or no value to print to standard output")
         require_ending("--json", file, ".json")
         require_replaceable(file)
     with nullcontext() if file is None else new_folder(file.parent):

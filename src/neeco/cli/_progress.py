@@ -43,7 +43,7 @@ PROGRESS = ProgressSettings()
 
 class Bars:
     """A bar for each count and each running job on a terminal; elsewhere a line for each every `line_interval_s`.
-    Nothing before there is progress, so that invalid input prints its one line only."""
+    Nothing is printed before there is progress, so that invalid input prints its error line only."""
 
     def __init__(self, settings: ProgressSettings = PROGRESS) -> None:
         self.settings, console = settings, whole_lines(stderr=True)
@@ -111,8 +111,8 @@ class Bars:
         if news.result is not None:
             self.ended.add(news.index)
             self.bar.update(task, visible=False)
-            words = news.text if news.stage == "failed" else f"{news.result['iterations']} iterations"
-            line = f"{title}: {news.stage}: {words} ({len(self.ended)} of {news.total} ended)"
+            outcome = news.text if news.stage == "failed" else f"{news.result['iterations']} iterations"
+            line = f"{title}: {news.stage}: {outcome} ({len(self.ended)} of {news.total} finished)"
             self._print(line, style="red" if news.stage == "failed" else "")
             return
         share = news.share * (1 - PROGRESS.evaluation_share)
@@ -145,12 +145,12 @@ class Bars:
 def _line(task: Task) -> str:
     """Return a line with the task, its progress, and the remaining time at the recent speed."""
     passed = task.finished_time or task.elapsed or 0.0
-    words = [f"{task.percentage:.0f} %"] if task.total else []
-    words += [task.fields["text"]] if task.fields["text"] else []
-    words += [f"{_duration(passed)} passed"]
+    parts = [f"{task.percentage:.0f} %"] if task.total else []
+    parts += [task.fields["text"]] if task.fields["text"] else []
+    parts += [f"{_duration(passed)} elapsed"]
     if task.time_remaining:
-        words += [f"about {_duration(task.time_remaining)} left"]
-    return f"{task.description}: {', '.join(words)}"
+        parts += [f"about {_duration(task.time_remaining)} left"]
+    return f"{task.description}: {', '.join(parts)}"
 
 
 def _duration(seconds: float) -> str:
@@ -166,7 +166,7 @@ def counting(title: str, total: int | None = None) -> Iterator[Callable[..., Non
 
 
 @contextmanager
-def resumable(begun: Path, how: str = "it is kept; run the same command again with --resume") -> Iterator[None]:
+def resumable(begun: Path, how: str = "work so far is kept; run the same command with --resume") -> Iterator[None]:
     """Report `how` to resume when Ctrl-C (whose own message is first), a failing GPU or insufficient memory ends the
     block, once folder `begun` has files. Raises KeyboardInterrupt and NeecoError."""
     try:
@@ -184,21 +184,20 @@ def resumable(begun: Path, how: str = "it is kept; run the same command again wi
 def train_with_progress(
     capture: Path, output: Path, config: TrainConfig, device: torch.device, *, resume: bool = False
 ) -> Path:
-    """`train` with a bar that shows PSNR, Gaussians and time left. Returns the run's folder."""
+    """Call `train` with a bar that shows PSNR, Gaussians and remaining time. Return the run's folder."""
     from neeco.training.run import resume_command
     from neeco.training.train import train
 
-    run, hint = shlex.quote(str(output)), f"go on with: {resume_command(capture, output)}"
+    run, hint = shlex.quote(str(output)), f"continue with: {resume_command(capture, output)}"
     started: list[int] = []  # the iteration of the first row
 
     def show(row: ProgressRow) -> None:
         if not row.note and not started:
             started.append(row.iteration)
-            slow = "; a CUDA device would be used if there were one" if device.type == "cpu" else ""
+            slow = " (no CUDA device found)" if device.type == "cpu" else ""
             remaining = row.seconds_left
-            whole = "begins" if remaining is None else f"takes about {_duration(row.seconds + remaining)} in all"
-            forecast = f"{whole}, estimated anew as it goes on"
-            bars.training(replace(row, note=f"training on {device.type} {forecast}{slow}; watch it: neeco view {run}"))
+            whole = "" if remaining is None else f", estimated total time {_duration(row.seconds + remaining)}"
+            bars.training(replace(row, note=f"training on {device.type}{slow}{whole}; view it: neeco view {run}"))
         bars.training(row)
 
     with Bars() as bars, resumable(output, hint):

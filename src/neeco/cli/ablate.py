@@ -1,4 +1,4 @@
-"""`neeco ablate`: the study of what each part of the methods contributes."""
+"""`neeco ablate`: the study of the contribution of each component of the methods."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from neeco.studies.configurations import SweepRequest, ablations
 
 @dataclass(frozen=True, kw_only=True)
 class Ablate(SweepRequest):
-    """Take parts of the methods away one by one, as the paper does and beyond; writes tables and a report.
+    """Remove components of the methods one by one, as in the paper and beyond; writes tables and a report.
 
-    Interrupted, the same command goes on where it stopped.
+    After an interruption, the same command continues the study.
     """
 
     tables: tuple[str, ...] = ("density", "sh-compensation", "uniform-motion", "kinematic")
-    """Which to make: the paper's density, sh-compensation and uniform-motion, and kinematic without its parts."""
+    """Tables to write: the paper's density, sh-compensation and uniform-motion, and kinematic without components."""
 
 
 def run(args: Ablate) -> int:

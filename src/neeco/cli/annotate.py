@@ -1,4 +1,4 @@
-"""`neeco annotate`: the recorded frames, labelled by the scene."""
+"""`neeco annotate`: label recorded frames with the learned scene."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, Im
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Label the frames of a recording by the scene, poses fitted to each; writes those that can be trusted as a data
-    set, and annotate.html: all of them, worst first."""
+    """Label the frames of a recording with the learned scene, with poses fitted to each frame. Writes the trusted
+    frames as a data set, and annotate.html with all frames, worst first."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder that `neeco train` wrote."""
+    """Run folder written by `neeco train`."""
     output: Path
     """Data set folder to write; must be empty or absent unless --resume."""
     capture: Path | None = None
     """Another recording of the same instruments over the same tissue. Default: the run's own."""
     min_trust: float = MIN_TRUST
-    """Frames trusted less are listed, not written: 0 to 1, about the overlap (IoU) that the image speaks for."""
+    """Minimum trust of a written frame, 0 to 1, about the IoU estimated from the image; others are only listed."""
     formats: Annotated[tuple[str, ...], tyro.conf.arg(help=formats_help())] = DEFAULT_FORMATS
     images: tyro.conf.OmitArgPrefixes[ImageSettings] = AS_RECORDED
     class_names: tuple[str, ...] = ()
-    """INSTRUMENT=CLASS: names of classes in the data set's formats, which instruments may share. Default: those of the
-    instruments."""
+    """INSTRUMENT=CLASS: class names in the data set's formats, which instruments may share. Default: the instruments'
+    names."""
     resume: bool = False
     """Continue a data set begun with the same settings."""
     force: bool = False
@@ -65,7 +65,7 @@ def run(arguments: Arguments) -> int:
             )
         page = write_annotated_page(annotated.output, annotated.records, annotated.capture, arguments.min_trust)
     count, omitted = len(annotated.records), len(annotated.records) - annotated.written
-    out = f"; {omitted} trusted less than {arguments.min_trust:g}: left out" if omitted else ""
+    out = f"; {omitted} left out with a trust below {arguments.min_trust:g}" if omitted else ""
     print(f"{annotated.written} of {count} frames in {annotated.output}{out}")
-    print(f"numbered anew; field frame of states.jsonl has the capture's name; worst first: {page}")
+    print(f"frames are renumbered; `frame` in states.jsonl is the original name; all frames, worst first: {page}")
     return 0

@@ -1,4 +1,4 @@
-"""`neeco check`: report everything that is wrong with a capture."""
+"""`neeco check`: report all problems of a capture."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Report everything that is wrong with a capture, at once. Exit status 1 when it cannot be trained on."""
+    """Report all problems of a capture. Exit status 1 if it has errors, which prevent training."""
 
     capture: tyro.conf.Positional[Path]
     """The capture's folder, or a transforms file in it."""
     transforms: str = "transforms.json"
-    """Which transforms file of the folder to check."""
+    """Transforms file of the folder to check."""
     json: JsonTarget = None
 
 
@@ -64,9 +64,7 @@ def _summary_lines(summary: CaptureSummary) -> list[str]:
     frames = ", ".join(f"{count} {name!r}" for name, count in summary.splits.items()) or "none"
     lines = [f"frames: {frames}", f"sparse points: {summary.points}"]
     if summary.still:
-        lines.append(
-            "scope: stands still; nothing shows the scene from elsewhere, so render views near the recorded ones"
-        )
+        lines.append("scope: still; other viewpoints were not observed, so render views near the recorded ones")
     for name, travel in summary.travel_mm.items():
         joints = [
             f"{joint.removeprefix(name + '.')} {low:.3g} .. {high:.3g}"

@@ -11,10 +11,10 @@ from neeco.studies.configurations import Configuration, Study, SweepRequest
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(SweepRequest):
-    """Train and score methods on the same frames, equally long; writes tables and a report.
+    """Train and score methods on the same frames, for the same time or number of steps; writes tables and a report.
 
-    Give one of --minutes, --cpu-minutes and --iterations. Interrupted, the same command goes on where it stopped;
-    with more methods or seeds it adds them to what is there.
+    Give one of --minutes, --cpu-minutes and --iterations. After an interruption, the same command continues the study;
+    additional methods or seeds are added to the existing results.
     """
 
     methods: tuple[str, ...]

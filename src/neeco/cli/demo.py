@@ -1,4 +1,4 @@
-"""`neeco demo`: the whole main job on the bundled sample, by the other verbs."""
+"""`neeco demo`: the complete workflow on the bundled sample, with the other verbs."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ IMAGES = 24
 
 @dataclass(frozen=True)
 class Arguments:
-    """The whole main job on the bundled sample capture: check, train, evaluate, synthesize, report."""
+    """The complete workflow on the bundled sample capture: check, train, evaluate, synthesize, report."""
 
     output: Path = Path("neeco-demo")
     """Folder to write to; must be empty or absent."""
     minutes: float = 2.0
-    """How long to train."""
+    """Training time, minutes."""
     device: Device = "auto"
 
 
 def run(args: Arguments) -> int:
-    """Do it all and say where everything lies."""
+    """Run all steps and print the paths of the results."""
     from neeco.cli import check, evaluate, synthesize, train
     from neeco.raster.devices import device_of
     from neeco.synthesis.settings import Settings
@@ -33,7 +33,7 @@ def run(args: Arguments) -> int:
     if not args.minutes > 0:
         raise NeecoError(f"--minutes must be above 0 (got {args.minutes})")
     if args.output.exists() and (not args.output.is_dir() or any(args.output.iterdir())):
-        raise NeecoError(f"{args.output}: exists already; give another --output, or remove it")
+        raise NeecoError(f"{args.output}: already exists; give another --output, or remove it")
     device_of(args.device)
     start = time.monotonic()
     capture, trained, dataset = sample_capture(), args.output / "run", args.output / "dataset"
@@ -66,9 +66,9 @@ def run(args: Arguments) -> int:
 
 
 def sample_capture() -> Path:
-    """The bundled sample's folder: inside the installed package, or in the checkout it is run from.
+    """Return the bundled sample's folder, in the installed package or in the source checkout.
 
-    Raises NeecoError when neither is there.
+    Raises NeecoError if neither exists.
     """
     package = Path(__file__).resolve().parents[1]
     places = (package / "samples" / SAMPLE, package.parents[1] / "samples" / SAMPLE)

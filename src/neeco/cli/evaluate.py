@@ -1,4 +1,4 @@
-"""`neeco evaluate`: how good a run is."""
+"""`neeco evaluate`: evaluate a run."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class Evaluate:
     """Score a run: images, masks, parts, speed; writes evaluation.json and report.html into it."""
 
     run: Annotated[Path, tyro.conf.Positional]
-    """Folder that `neeco train` wrote."""
+    """Run folder written by `neeco train`."""
     splits: tuple[str, ...] | None = None
     """Splits to score. Default: all but train."""
     align: bool = False
-    """Also score with instrument and camera pose of each frame fitted to its image, the scene frozen."""
+    """Also score with instrument and camera poses fitted to each image, with the scene fixed."""
     lpips_weights: Path | None = None
-    """Folder with alexnet.safetensors and/or vgg16.safetensors. Default: that of NEECO_LPIPS_WEIGHTS."""
+    """Folder with alexnet.safetensors and/or vgg16.safetensors. Default: NEECO_LPIPS_WEIGHTS."""
     json: JsonTarget = None
     force: bool = False
     """Use the run although its capture has changed since training."""
@@ -63,7 +63,7 @@ def run(args: Evaluate) -> int:
 
 
 def evaluation_table(evaluation: dict[str, Any]) -> Table:
-    """Return the scores of the report, one column per split and kind of pose, so that they fit a narrow terminal."""
+    """Return the scores of the report, one column per split and kind of pose, which fits a narrow terminal."""
     from neeco.report.run_page import SCORES, Score
 
     scored = [(kind, split) for kind in ("given", "aligned") for split in evaluation.get(kind, {})]

@@ -16,27 +16,27 @@ Format = Literal["ply", "spz", "usdc", "glb"]
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Write a run's scene for other viewers, in the light of one camera: in one state, or (glb, usdc) moving."""
+    """Write a run's scene for other viewers, with the light of one camera: in one state, or animated (glb, usdc)."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder that `neeco train` wrote."""
+    """Run folder written by `neeco train`."""
     format: Format | None = None
-    """ply; spz: a tenth of the size; glb (glTF); usdc (OpenUSD, extra usd). Default: as --output ends or ply."""
+    """ply; spz: a tenth of the size; glb (glTF); usdc (OpenUSD, extra usd). Default: by --output's suffix, else ply."""
     output: Path | None = None
     """File to write, .ply, .spz, .usdc or .glb. Default: scene.ply (or as --format) in the run folder."""
     frame: int = 0
-    """Number of the frame, of those trained on, whose state and light are taken."""
+    """Index of the training frame whose state and light are used."""
     states: Path | None = None
-    """The first state of this states.jsonl instead (glb, usdc: all), in its own camera's light where it names one."""
+    """Use the first state of this states.jsonl (glb, usdc: all) instead, with its camera's light if it has one."""
     spz_version: Literal[3, 4] = 4
-    """Version of SPZ: 4, or 3 for viewers that do not read it yet."""
+    """Version of SPZ: 4, or 3 for viewers without support for it."""
     unit: Literal["m", "cm", "mm"] = "m"
-    """Unit of lengths in glb: m, as glTF has it, or a smaller one for viewers that hide what is near."""
+    """Unit of lengths in glb: m, as in glTF, or a smaller one for viewers with a distant near plane."""
     device: Device = "auto"
 
 
 def run(arguments: Arguments) -> int:
-    """Write the file and print what it holds."""
+    """Write the file and print a summary of its content."""
     from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run
@@ -52,15 +52,15 @@ def run(arguments: Arguments) -> int:
         if arguments.format is None and arguments.output.suffix:
             format = cast(Format, arguments.output.suffix[1:].lower())
     if arguments.spz_version != 4 and format != "spz":
-        raise NeecoError("--spz-version: applies to spz only; leave it out")
+        raise NeecoError("--spz-version: applies to spz only; remove it")
     if arguments.unit != "m" and format != "glb":
-        raise NeecoError("--unit: applies to glb only; leave it out")
+        raise NeecoError("--unit: applies to glb only; remove it")
     if format == "usdc":
         require_usd()
     with open_gaussian_run(arguments.run, "export", device_of(arguments.device)) as trained:
         scene, frames = trained.scene, len(trained.scene.recorded.states)
         if not 0 <= arguments.frame < frames:
-            raise NeecoError(f"--frame: {arguments.frame}: the scene was trained on frames 0 to {frames - 1}")
+            raise NeecoError(f"--frame: must be from 0 to {frames - 1}, the training frames (got {arguments.frame})")
         state, camera = exported_state(scene, arguments.frame, arguments.states)
         output = arguments.output or arguments.run / f"scene.{format}"
         if format == "glb" or format == "usdc":

@@ -1,4 +1,4 @@
-"""`neeco ingest`: from a video and logs to a capture."""
+"""`neeco ingest`: make a capture from a video and logs."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from neeco.ingest.request import IngestRequest
 
 @dataclass(frozen=True, kw_only=True)
 class Ingest(IngestRequest):
-    """Make a capture from a recording: video and tracker logs; CAPTURE/ingest.html reports how good it is."""
+    """Make a capture from a recording: video and tracker logs; CAPTURE/ingest.html reports its quality."""
 
     output: Path | None = None
-    """Folder of the capture to write; must not exist. Default: none; needed, but with --init and --formats."""
+    """Folder of the capture to write; must not exist. Default: none; required without --init and --formats."""
     init: bool = False
-    """Look at the files in SOURCE (a folder; default: here), or into a file of several streams, and write a
-    recording.yaml into it, or next to it."""
+    """Inspect the files in SOURCE (a folder; default: the current one), or a file with several streams, and write a
+    recording.yaml into the folder, or next to the file."""
     formats: bool = False
-    """List the formats that recordings are read from."""
+    """List the supported formats of recordings."""
     json: JsonTarget = None
     strict: bool = False
-    """End with exit status 1 where the verdict is DOUBTFUL."""
+    """Exit with status 1 if the verdict is DOUBTFUL."""
 
 
 def run(args: Ingest) -> int:
@@ -40,7 +40,7 @@ def run(args: Ingest) -> int:
     from neeco.report.ingest_page import ingest_and_report
 
     if args.formats:
-        table = Table("format", "read of it", "extra")
+        table = Table("format", "content that is read", "extra")
         for reader in recording_formats():
             table.add_row(reader.format, reader.holds, reader.extra or "")
         whole_lines().print(table)
@@ -55,7 +55,7 @@ def run(args: Ingest) -> int:
     if folder is not None:
         if args.strict or args.json is not None:  # both concern the verdict, which a converted folder does not have
             option = "--strict" if args.strict else "--json"
-            raise NeecoError(f"{folder}: {option} has no effect with it; leave it out")
+            raise NeecoError(f"{folder}: {option} does not apply to a converted folder; remove it")
         for sentence in convert_folder(folder, output):
             print(f"note: {visible(sentence)}")
         print(f"capture: {output}  (next: neeco check {shlex.quote(str(output))})")

@@ -1,4 +1,4 @@
-"""`neeco refine`: train a run again, with frames that were tracked by it."""
+"""`neeco refine`: train a run again, with additional frames that it tracked."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from neeco.base.settings import Device
 
 @dataclass(frozen=True)
 class Arguments:
-    """Train a run again with frames whose states were tracked by it, so that sides of the instruments that only they
-    show become known. Writes OUTPUT/capture, the frames of both, and OUTPUT/run."""
+    """Train a run again with additional frames whose states it tracked, to learn sides of the instruments that only
+    these frames show. Writes OUTPUT/capture, with the frames of both, and OUTPUT/run."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder that `neeco train` wrote, by method kinematic."""
+    """Run folder written by `neeco train`, with method kinematic."""
     tracked: tyro.conf.Positional[tuple[Path, ...]]
-    """Captures that `neeco track` made with it, over its tissue."""
+    """Captures written by `neeco track` with this run, over its tissue."""
     output: Path
     """Folder to write; must be empty or absent unless --resume."""
     resume: bool = False
@@ -31,14 +31,14 @@ class Arguments:
 
 
 def run(arguments: Arguments) -> int:
-    """Fit, merge and train; print where the run is."""
+    """Fit, merge and train; print the path of the run."""
     from neeco.cli._progress import Bars, resumable
     from neeco.raster.devices import device_of
     from neeco.tracking.refine import refine_run
     from neeco.training.run import open_gaussian_run
 
     if not arguments.tracked:
-        raise NeecoError("refine: give the captures that `neeco track` made, after the run")
+        raise NeecoError("refine: no captures given; add those written by `neeco track` after the run")
     device = device_of(arguments.device)
     with (
         open_gaussian_run(arguments.run, "refine", device, force=arguments.force) as opened,

@@ -14,20 +14,20 @@ from neeco.synthesis.settings import AS_RECORDED, MAX_IMAGES, ImageSettings
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Render frames of a capture, or states from a file, with part ids and masks; or as a video."""
+    """Render frames of a capture, or states from a file, as images with part ids and masks, or as a video."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder that `neeco train` wrote."""
+    """Run folder written by `neeco train`."""
     output: Path | None = None
-    """Folder to write to; pictures go into OUTPUT/SPLIT or OUTPUT/states."""
+    """Folder to write to; images are written to OUTPUT/SPLIT or OUTPUT/states."""
     video: Path | None = None
-    """Instead of --output: write the images as an MP4 of 25 images per second (needs the extra ingest)."""
+    """Instead of --output: write the images as an MP4 with 25 images per second (needs the extra ingest)."""
     frames: int | None = None
-    """With --video: how many images, evenly spread along the path of states and cameras. Default: one for each."""
+    """With --video: number of images, evenly spaced along the path of states and cameras. Default: one per state."""
     capture: Path | None = None
     """Capture whose frames are rendered. Default: the run's own."""
     split: str = "test"
-    """Which frames."""
+    """Split of the frames to render."""
     states: Path | None = None
     """Render these states (JSON lines) instead of a split."""
     images: tyro.conf.OmitArgPrefixes[ImageSettings] = AS_RECORDED
@@ -54,12 +54,12 @@ def run(arguments: Arguments) -> int:
 
     arguments.images.check()
     if (arguments.output is None) == (arguments.video is None):
-        raise NeecoError("render: give --output FOLDER, or --video FILE.mp4; one of the two")
+        raise NeecoError("render: give exactly one of --output FOLDER and --video FILE.mp4")
     if arguments.video is not None:
         require_ending("--video", arguments.video, ".mp4")
         require_pyav()
     if arguments.frames is not None and arguments.video is None:
-        raise NeecoError("--frames: applies to --video only; leave it out")
+        raise NeecoError("--frames: applies to --video only; remove it")
     if arguments.frames is not None and not 2 <= arguments.frames <= MAX_IMAGES:
         raise NeecoError(f"--frames must be 2 to {MAX_IMAGES:,} (got {arguments.frames})")
     with open_run(arguments.run, device_of(arguments.device), force=arguments.force) as trained:

@@ -19,15 +19,15 @@ class Arguments:
     """Score a folder of masks against the truth: IoU, Challenge IoU, Dice and boundary F, per part."""
 
     predicted: Annotated[Path, tyro.conf.Positional]
-    """Folder of masks: PNG with part ids or 0/255, or what `neeco render` wrote."""
+    """Folder of masks: PNG with part ids or 0/255, or the output of `neeco render`."""
     truth: Annotated[Path, tyro.conf.Positional]
     """A capture (its truth/masks or reference_masks), or a folder of masks. Files are matched by name."""
     splits: tuple[str, ...] | None = None
-    """Splits of the capture. Default: those of which PREDICTED has an image."""
+    """Splits of the capture. Default: all splits with an image in PREDICTED."""
     classes: tuple[str, ...] = ()
-    """What PREDICTED's ids mean, such as shaft=10 wrist=20. Default: 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right."""
+    """Parts of PREDICTED's ids, such as shaft=10 wrist=20. Default: 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right."""
     truth_classes: tuple[str, ...] = ()
-    """What TRUTH's ids mean. Default: as above."""
+    """Parts of TRUTH's ids. Default: as above."""
     json: JsonTarget = None
 
 
@@ -67,7 +67,7 @@ def _table(scores: dict[str, Any]) -> Table:
 
 
 def _lines(scores: dict[str, Any]) -> list[str]:
-    """The numbers that belong to no part."""
+    """Return lines with the numbers that belong to no part."""
 
     def formatted(value: float | None) -> str:
         return "-" if value is None else f"{value:.3f}"
@@ -79,5 +79,5 @@ def _lines(scores: dict[str, Any]) -> list[str]:
         lines[0] += f", of its parts {formatted(scores['classes']['challenge_iou'])}"
     for pair, way in scores["pair_assignment"].items():
         if way == "swapped":
-            lines.append(f"{pair}: left and right are taken the other way round, which fits this folder better")
+            lines.append(f"{pair}: left and right are swapped, which matches this folder better")
     return lines

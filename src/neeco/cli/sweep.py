@@ -1,4 +1,4 @@
-"""`neeco sweep`: configurations x seeds on one capture; and how `compare` and `ablate` run theirs."""
+"""`neeco sweep`: configurations x seeds on one capture; also used by `compare` and `ablate`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neeco.studies.configurations import Study, SweepRequest, read_study
 class Sweep(SweepRequest):
     """Train and score configurations of methods, each with several seeds; writes one table of all scores and a report.
 
-    Interrupted, the same command goes on where it stopped; with more configurations or seeds it adds them.
+    After an interruption, the same command continues the study; additional configurations or seeds are added.
     """
 
     study: Annotated[Path, tyro.conf.Positional]
@@ -29,7 +29,7 @@ def run(args: Sweep) -> int:
 
 
 def run_study(request: SweepRequest, study: Study, source: Path | None = None) -> int:
-    """Run a study with progress bars; print its tables and where the files lie; 1 when a run failed."""
+    """Run a study with progress bars; print its tables and file paths; return 1 if a run failed."""
     from neeco.cli._progress import Bars
     from neeco.report.sweep_page import write_sweep_report
     from neeco.studies.sweep import RESULTS_FILE, failures, plan_sweep, run_sweep, tables_of

@@ -1,4 +1,4 @@
-"""`neeco track`: the states of instruments in footage, from its images alone."""
+"""`neeco track`: estimate instrument states in footage, from its images alone."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from neeco.base.settings import Device
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Find the run's instruments in footage whose states nobody recorded, by the run's own scene; writes a capture of
-    the frames that can be trusted, and track.html: what was found in all of them."""
+    """Estimate the states of a run's instruments in footage without recorded states, with the run's scene. Writes a
+    capture of the trusted frames, and track.html with the results of all frames."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder that `neeco train` wrote, by method kinematic."""
+    """Run folder written by `neeco train`, with method kinematic."""
     footage: tyro.conf.Positional[Path]
-    """Capture with cameras, whose states are not read."""
+    """Capture with cameras; its states are not read."""
     output: Path
     """Capture folder to write; must be empty or absent unless --resume."""
     start: Literal["first", "none"] = "none"
-    """first: the footage states the first frame's states roughly. none: nothing is known."""
+    """first: start from the footage's approximate states of the first frame. none: no prior."""
     tissue: str = "run"
-    """run: the footage shows the run's tissue, its cameras in the run's world. The path of a run of method 3dgs that
-    learned the footage's tissue, where that is another; OUTPUT/run becomes a run of the instruments over it."""
+    """run: the footage shows the run's tissue, with cameras in the run's world. Otherwise the path of a run of method
+    3dgs that learned the footage's tissue; OUTPUT/run then combines it with the instruments."""
     min_trust: float = 0.5
-    """Frames trusted less are left out of the capture: 0 to 1. With --resume another value chooses anew."""
+    """Minimum trust of a frame in the capture, 0 to 1. With --resume another value selects again."""
     resume: bool = False
     """Continue interrupted tracking."""
     force: bool = False
@@ -37,7 +37,7 @@ class Arguments:
 
 
 def run(arguments: Arguments) -> int:
-    """Track, and print where the capture and the page are."""
+    """Track, and print the paths of the capture and the page."""
     from neeco.api import track
     from neeco.cli._progress import Bars, resumable
 

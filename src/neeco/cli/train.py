@@ -19,39 +19,39 @@ class Arguments:
     """Learn a scene from a capture's training frames."""
 
     capture: tyro.conf.Positional[Path]
-    """Capture folder (or a transforms file in one)."""
+    """Capture folder, or a transforms file in it."""
     output: Path
     """Run folder to write."""
     method: str | None = None
     """kinematic, nps (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's training
     adjustment. Default: kinematic."""
     iterations: int | None = None
-    """Frames rendered and learned from. Default: 6,000, with fewer than 60 training frames less (kinematic)."""
+    """Number of rendered training frames. Default: 6,000; less for fewer than 60 training frames (kinematic)."""
     batch_size: int | None = None
-    """Frames between two optimisation steps, whose mean loss is minimised; more than 1 are for a GPU. Default: 1."""
+    """Frames per optimisation step, whose mean loss is minimised; values above 1 suit a GPU. Default: 1."""
     minutes: float | None = None
-    """Stop in time with a finished run. Default: no limit."""
+    """Time limit; the run is finished within it. Default: no limit."""
     device: Device = "auto"
     seed: int | None = None
     """The same seed gives the same scene on the same machine (without --minutes). Default: 0."""
     resume: bool = False
-    """Continue an interrupted run in --output, under the settings it was started with; others are refused."""
+    """Continue an interrupted run in --output, with its original settings; other settings are rejected."""
     transforms: str | None = None
-    """Which transforms file of the capture to read. Default: transforms.json."""
+    """Transforms file of the capture to read. Default: transforms.json."""
     scale: float | None = None
-    """Share of the recorded images' size to learn at: less for a quick run or little memory. Default: 1."""
+    """Training resolution relative to the recorded images; smaller is faster and needs less memory. Default: 1."""
     joints: tuple[str, ...] | None = None
-    """Joints that move parts. Default: those that the pose does not already explain."""
+    """Joints that move parts. Default: those not determined by the pose."""
     max_tissue_gaussians: int | None = None
-    """Most Gaussians of the tissue. Default: 20,000 for images of 320x256, more for larger ones."""
+    """Maximum number of tissue Gaussians. Default: 20,000 for images of 320x256, more for larger ones."""
     max_instrument_gaussians: int | None = None
-    """Most Gaussians of each instrument. Default: 4,000 for images of 320x256, more for larger ones."""
+    """Maximum number of Gaussians per instrument. Default: 4,000 for images of 320x256, more for larger ones."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Any other field of the training config, as NAME=VALUE (e.g. schedule.opacity_reset=inverse); repeatable."""
 
 
 def run(args: Arguments) -> int:
-    """Train with a progress bar; print where the run lies."""
+    """Train with a progress bar; print the path of the run."""
     from neeco.cli._progress import train_with_progress
     from neeco.raster.devices import device_of
     from neeco.training.config import FLAGS, training_config
@@ -66,7 +66,7 @@ def run(args: Arguments) -> int:
 
 
 def explain(words: Sequence[str]) -> None:
-    """Print the settings of the method that `words` name, a table behind `--help`."""
+    """Print the settings of the method named in `words`, as a table after the help text."""
     from neeco.cli._output import print_settings
     from neeco.scene.method_registry import DEFAULT, method_class, methods
 

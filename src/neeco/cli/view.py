@@ -17,31 +17,31 @@ from neeco.base.errors import NeecoError
 from neeco.base.settings import Device
 from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 
-POLL_S = 0.5  # between two looks for Ctrl-C
+POLL_S = 0.5  # s between two checks for Ctrl-C
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Show a run in a web browser: any state, any view, what is made up and what is wrong; one that is still trained,
-    too; or a capture before training. With --export, write one file that shows a run without a server. With
-    --annotate, set roll and joints of an instrument found in a video by hand, in the frames that help most."""
+    """Show a run, also during training, in a web browser: any state and view, with unobserved regions and errors; or
+    a capture before training. With --export, write one file that shows a run without a server. With --annotate, set
+    roll and joints of an instrument detected in a video by hand, in the most informative frames."""
 
     source: Annotated[Path, tyro.conf.arg(metavar="RUN|CAPTURE"), tyro.conf.Positional]
-    """Run folder that `neeco train` wrote or is writing; or a capture. With --annotate: a capture, or a run of one,
-    whose scene then shows as a ghost."""
+    """Run folder of `neeco train`, finished or not, or a capture. With --annotate: a capture, or a run of one, whose
+    scene is then overlaid semi-transparently."""
     port: int = 8080
-    """Port to listen on; the next free one where it is taken."""
+    """Port to listen on; the next free one if it is in use."""
     host: str = "127.0.0.1"
-    """Address to listen on. Other machines reach any but this machine's own loopback, by plain HTTP."""
+    """Address to listen on. All but the loopback address are reachable from other machines, by plain HTTP."""
     no_browser: bool = False
-    """Open no web browser; only print the address."""
+    """Do not open a web browser; only print the address."""
     annotate: bool = False
-    """Pose frames of the capture given by hand; answers go to hand_posed.yaml in it, and its states are solved anew."""
+    """Pose frames of the capture by hand; they are stored in its hand_posed.yaml, and its states are solved again."""
     export: Path | None = None
     """Write one HTML file instead, as in --export page.html."""
     size: tyro.conf.OmitArgPrefixes[SizeSettings] = RECORDED_SIZE
     sh: int = 3
-    """Degree of the spherical harmonics that an exported file keeps, 0 to 3; lower is smaller."""
+    """Degree of the spherical harmonics in an exported file, 0 to 3; lower is smaller."""
     device: Device = "auto"
 
 
@@ -50,7 +50,7 @@ def run(arguments: Arguments) -> int:
     from neeco.raster.devices import device_of
 
     if arguments.annotate and arguments.export is not None:
-        raise NeecoError("--annotate, --export: give one of the two")
+        raise NeecoError("--annotate, --export: cannot be combined; give one of the two")
     if arguments.annotate:
         from neeco.viewer.posing import PosingServer
 
@@ -61,7 +61,7 @@ def run(arguments: Arguments) -> int:
         from neeco.viewer.export import export_page
 
         if arguments.size != RECORDED_SIZE:
-            raise NeecoError("--size, --scale: an exported page renders at the size of its window; leave them out")
+            raise NeecoError("--size, --scale: an exported page renders at the size of its window; remove them")
         require_ending("--export", arguments.export, ".html", ".htm")
         print(export_page(arguments.source, arguments.export, arguments.sh, device_of(arguments.device)))
         return 0
@@ -79,7 +79,7 @@ def run(arguments: Arguments) -> int:
 
 
 def is_capture(path: Path) -> bool:
-    """Whether a folder is a capture, and no run. Raises NeecoError where nothing is there."""
+    """Return whether a folder is a capture and not a run. Raises NeecoError if it does not exist."""
     if not path.exists():
         raise NeecoError(f"{path}: neither a run folder nor a capture; correct the path")
     return (path / "transforms.json").is_file() and not (path / "config.yaml").exists()
@@ -91,14 +91,14 @@ def _serve(address: str, arguments: Arguments) -> int:
 
     if not is_loopback(arguments.host):
         warnings.warn(
-            f"--host {arguments.host}: plain HTTP: whoever listens on the network reads the images and the token; "
-            "use a network you trust, or the default host and `ssh -L`",
+            f"--host {arguments.host}: plain HTTP: others on the network can read the images and the token; "
+            "use a trusted network, or the default host with `ssh -L`",
             stacklevel=2,
         )
     try:
         print(f"{address}  (Ctrl-C ends)", flush=True)
         with contextlib.nullcontext() if arguments.no_browser else _opened(address):
-            while True:  # in short waits: a signal that comes just before one begins is heard after it
+            while True:  # short waits, because a signal just before a wait is handled after it
                 time.sleep(POLL_S)
     except KeyboardInterrupt:
         print()
@@ -107,7 +107,7 @@ def _serve(address: str, arguments: Arguments) -> int:
 
 @contextlib.contextmanager
 def _opened(address: str) -> Iterator[None]:
-    """Open a browser by way of a file that its user alone can read: all users can read a process's arguments."""
+    """Open a browser via a file that only its user can read: all users can read a process's arguments."""
     import webbrowser
 
     with tempfile.TemporaryDirectory(prefix="neeco-view-") as folder:

@@ -28,7 +28,7 @@ def staged(output: Path) -> Iterator[Path]:
         if folder.is_dir():  # of a process killed after its last step
             with _emptied(folder, place):
                 pass
-        raise NeecoError(f"{output}: exists already; choose another --output or remove it")
+        raise NeecoError(f"{output}: already exists; choose another --output or remove it")
     with new_folder(place.parent), _emptied(folder, place):
         yield folder
         try:

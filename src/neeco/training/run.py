@@ -133,7 +133,7 @@ def load_run(path: Path, device: torch.device | None = None, *, force: bool = Fa
     config = read_config(path)
     if not (path / SCENE_FILE).is_file():
         command = resume_command(config["capture"], path)
-        raise NeecoError(f"{path}: training has not finished here; go on with: `{command}`")
+        raise NeecoError(f"{path}: training has not finished here; continue with: `{command}`")
     scene = load_scene(path / SCENE_FILE)
     return TrainedRun(path, scene if device is None else scene.to(device), config, force)
 
@@ -235,7 +235,7 @@ def save_checkpoint(session: Session, run: Path) -> None:
         require_numbers(tensors)
     except ValueError as error:
         raise NeecoError(
-            f"training: the scene diverged: {error} after {session.iteration} iterations; train anew with another "
+            f"training: the scene diverged: {error} after {session.iteration} iterations; train again with another "
             "--seed or a milder schedule"
         ) from None
     device = session.generator.device
@@ -302,7 +302,7 @@ def restore_session(session: Session, header: dict[str, Any], tensors: dict[str,
     device = session.generator.device
     before = header.get("device", "cpu")  # not in older checkpoints
     if before != device.type:
-        raise NeecoError(f"--device: the run was begun on {before}; go on with --device {before}")
+        raise NeecoError(f"--device: the run was begun on {before}; continue with --device {before}")
     moved = {name: tensor.to(device) for name, tensor in tensors.items() if not name.startswith("random/")}
     session.adam.restore(members(moved, "adam"), header["adam_steps"])
     session.restore(moved, header)

@@ -128,7 +128,7 @@ def train(
     frames = _training_frames(capture, capture_path, config)
     config = config.for_frames(len(frames))
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
-    go_on = f"go on with: {resume_command(capture_path, output)}"
+    go_on = f"continue with: {resume_command(capture_path, output)}"
     with own_folder(output), method_class(config.method).torch_threads(), _stating_memory(frames, config):
         try:
             views = TrainingViews.read(frames, config.scale).to(device)
