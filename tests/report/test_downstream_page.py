@@ -106,7 +106,7 @@ def test_the_page_is_whole_and_fetches_nothing(plan, experiment):
 def test_findings_come_first_then_tables_examples_and_how_it_was_made(plan, experiment):
     body = page_of(plan, experiment)[0].partition("</header>")[2]
     assert body.index("unet, test: kinematic+real, 5 labelled: IoU 0.6") < body.index("<table")
-    places = [body.index(f"<h2>{title}") for title in ("Results", "The same frame", "Notes", "How it was made")]
+    places = [body.index(f"<h2>{title}") for title in ("Results", "Predictions on", "Notes", "Configuration")]
     assert places == sorted(places)
     assert body.count('class="charts large"') == 4  # of each model and test
 
@@ -133,7 +133,7 @@ def test_failed_trainings_and_lost_predictions_are_left_out_and_told(plan, exper
     for file in plan.request.output.glob("jobs/dfine-*/predictions/*.npz"):
         file.unlink()
     text, images = page_of(plan, experiment_of(plan, lost))
-    assert "What failed" in text
+    assert "Failed trainings" in text
     assert "no &lt;memory&gt;" in text
     assert len(images) == (4 + 1) * 3  # of the set alone
     everything = [job | {"splits": {}, "error": "all of it"} for job in experiment["jobs"]]

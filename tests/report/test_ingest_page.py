@@ -177,7 +177,7 @@ def test_a_stretch_without_a_training_frame_is_named():
     assert [degree.name for degree in degrees[3:]] == ["pitch", "yaw", "roll", "jaw_angle"]
     jaw = degrees[-1]
     hole = replace(jaw, values=np.where(jaw.values > 30, jaw.values + 30, jaw.values))
-    assert any(sentence.startswith("jaw_angle: nothing between") for sentence in unvisited([hole]))
+    assert any(sentence.startswith("jaw_angle: no frames between") for sentence in unvisited([hole]))
 
 
 def test_roll_about_the_z_axis_is_roll_alone():
@@ -331,16 +331,16 @@ def without_instruments(document):
             (
                 "do not meet",
                 "camera_from_base",
-                "nothing can be overlaid",
-                "No joint was read",
-                "proportions only",
-                "Nothing: every video frame",
+                "cannot be overlaid",
+                "No joint was recorded",
+                "lengths are only relative",
+                "None: every video frame",
             ),
         ),
         (
             without_instruments,
             {"reprojection_px": None, "clocks": {}, "points": 0},
-            ("Cameras only", "no instrument states", "random stand-ins"),
+            ("Cameras only", "no instrument states", "points are random"),
         ),
     ],
 )

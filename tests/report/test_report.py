@@ -63,7 +63,7 @@ def test_the_page_says_the_numbers_and_the_notes(reported):
 def test_a_tile_says_what_its_number_means(reported):
     tiles = re.findall(r'<div class="tile">.*?</div>', reported[-1].read_text(), re.DOTALL)
     assert len(tiles) >= 4
-    for abbreviation, meaning in (("PSNR", "30 is close"), ("IoU", "1 is perfect"), ("Gaussians", "make up the scene")):
+    for abbreviation, meaning in (("PSNR", "30 is good"), ("IoU", "1 is perfect"), ("Gaussians", "of the scene")):
         assert all(meaning in tile for tile in tiles if abbreviation in tile)
     assert not any("as given" in tile for tile in tiles)
 

@@ -1,1 +1,1 @@
-"""HTML pages, each one file without anything to fetch, and their figures."""
+"""Self-contained HTML pages, one file each, and their figures."""

@@ -1,8 +1,8 @@
 """Charts as inline SVG in the colours of the page's style sheet: lines of series, and their keys.
 
-Matplotlib draws them in placeholder colours (PALETTE), which become the style sheet's variables, so
-that it is readable in a light, a dark and a printed page; its background is transparent and its text stays text. An
-artist's gid becomes the class of its group.
+Matplotlib draws in placeholder colours (PALETTE), which are replaced by the style sheet's variables, so that charts are
+readable on light, dark and printed pages. The background is transparent, and text stays text. An artist's gid becomes
+the class of its SVG group.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ChartSettings:
     size: tuple[int, int] = (460, 270)  # view box units; the page scales them
     small: tuple[int, int] = (420, 190)  # the same, of a chart among others
     colors: int = 7
-    # of lines, which tell them apart in grey print
+    # of lines, to distinguish them in grey print
     dashes: tuple[tuple[int, ...], ...] = ((), (7, 3), (2, 3), (10, 3, 2, 3), (14, 4), (5, 2, 1, 2, 1, 2), (1, 2, 6, 2))
 
 
@@ -39,7 +39,7 @@ CHARTS = ChartSettings()
 MARKS = ("o", "s", "^", "x", "D", "+", "v")
 
 VARIABLES = ("ink", "soft", "edge", "accent", "phase", "good", "bad", *(f"m{order}" for order in range(CHARTS.colors)))
-PALETTE = {name: f"#0101{index:02x}" for index, name in enumerate(VARIABLES)}  # of the style sheet's variables
+PALETTE = {name: f"#0101{index:02x}" for index, name in enumerate(VARIABLES)}  # placeholders of CSS variables
 STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.grid": True,
@@ -57,7 +57,7 @@ STYLE: dict[Any, Any] = {
     "path.simplify": False,
     "svg.fonttype": "none",
     "text.color": PALETTE["soft"],
-    "text.parse_math": False,  # a name with two dollars in it is a name
+    "text.parse_math": False,  # names may contain two dollar signs
     **{f"{axis}tick.color": PALETTE["soft"] for axis in "xy"},
     **{f"{axis}tick.labelsize": 11 for axis in "xy"},
     **{f"{axis}tick.{kind}.size": 0 for axis in "xy" for kind in ("major", "minor")},
@@ -68,10 +68,10 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Series:
-    """One method (or level) in a chart. `order`: its place among all, which gives it colour, dashes and mark."""
+    """One method (or level) in a chart. order: its index, which determines colour, dashes and mark."""
 
     order: int
-    main: tuple[Point, ...] = ()  # the line to read
+    main: tuple[Point, ...] = ()  # main line
     faint: tuple[tuple[Point, ...], ...] = ()  # thin lines, one per seed
     dots: tuple[Point, ...] = ()  # faint marks
     band: tuple[tuple[float, float, float], ...] = ()  # x, low, high: an interval about the line
@@ -79,7 +79,7 @@ class Series:
 
 @contextmanager
 def page_style() -> Iterator[None]:
-    """Matplotlib's settings for our charts, whatever the user's own are; put back afterwards."""
+    """Apply Matplotlib's settings for our charts, independent of the user's, which are restored afterwards."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(STYLE)
@@ -87,7 +87,7 @@ def page_style() -> Iterator[None]:
 
 
 def new_axes(size: tuple[int, int], left: float, right: float, top: float, bottom: float) -> Axes:
-    """Axes in a figure of their own; width, height and margins in units of the SVG's view box."""
+    """Return axes in a new figure; width, height and margins in units of the SVG's view box."""
     width, height = size
     figure = Figure((width / 72, height / 72), dpi=72, frameon=False)
     axes = figure.add_axes((left / width, bottom / height, 1 - (left + right) / width, 1 - (top + bottom) / height))
@@ -96,24 +96,24 @@ def new_axes(size: tuple[int, int], left: float, right: float, top: float, botto
 
 
 def inline_svg(axes: Axes, label: str) -> Markup:
-    """The figure of `axes` as an SVG element for a page, texts escaped. label: its text for screen readers.
+    """Return the figure of `axes` as an SVG element, with escaped texts. label: text for screen readers.
 
-    The same figure gives the same text. Ids of definitions depend on `label` and on what is defined, so charts of one
-    page do not get in each other's way.
+    The output is deterministic. Ids of definitions depend on `label` and their content, so charts of one page do not
+    conflict.
     """
     figure, stream = axes.get_figure(), io.StringIO()
     assert isinstance(figure, Figure)
     for artist in figure.findobj():
         artist.set_clip_on(False)
-    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    no_metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     with warnings.catch_warnings(), matplotlib.rc_context({"svg.hashsalt": label}):
-        warnings.filterwarnings("ignore", message="Glyph")  # the page's font may have what matplotlib's lacks
-        figure.savefig(stream, format="svg", metadata=nothing)
-    body = stream.getvalue().partition("</defs>")[2]  # after the XML header and a style that would be the whole page's
+        warnings.filterwarnings("ignore", message="Glyph")  # the page's font may have glyphs that matplotlib's lacks
+        figure.savefig(stream, format="svg", metadata=no_metadata)
+    body = stream.getvalue().partition("</defs>")[2]  # without XML header and a style that would affect the whole page
     body = re.sub('<g id="([a-z-]+)"', r'<g class="\1"', body)
     body = re.sub('<g id="[^"]*"', "<g", body)
     body = re.sub("#0101([0-9a-f]{2})", lambda match: f"var(--{VARIABLES[int(match[1], 16)]})", body)
-    body = re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", body)  # what markup cannot hold
+    body = re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", body)  # invalid in markup
     width, height = figure.get_size_inches() * 72
     return Markup(f'<svg viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{escape(label)}">{body}')
 
@@ -131,11 +131,10 @@ def line_chart(
     over_logarithmic: bool = False,
     size: tuple[int, int] = CHARTS.size,
 ) -> str:
-    """Lines and marks over a shared x axis as inline SVG; "" when nothing has two points.
+    """Return lines and marks over a shared x axis as inline SVG; "" if no series has two points.
 
-    starts: (x, what begins there), shown as dashed vertical lines. levels: (order, value) of thin dashed lines from
-    side to side; with them a single point is a chart. note: stands at the right, above the chart. over_logarithmic: the
-    axis of x, whose ticks are then the points' own.
+    starts: (x, label) of dashed vertical lines. levels: (order, value) of thin dashed horizontal lines; with them one
+    point is enough. note: text at the upper right. over_logarithmic: logarithmic x axis, ticks at the points.
     """
     xs = sorted({x for item in series for line in (item.main, *item.faint, item.dots) for x, _ in line})
     if len(xs) < (1 if levels else 2):
@@ -153,7 +152,7 @@ def line_chart(
             axes.fill_between(across, low, high, color=_color(item.order), alpha=0.12, linewidth=0)
         for line in item.faint:
             _draw_line(axes, item.order, line, linewidth=0.7, alpha=0.55)
-    for item in series:  # above all that is faint
+    for item in series:  # above all faint elements
         _draw_line(axes, item.order, item.main, linewidth=2, dashes=CHARTS.dashes[item.order % len(CHARTS.dashes)])
     for order, value in levels:
         axes.axhline(value, color=_color(order), linewidth=1.1, dashes=(4, 4), gid="level")
@@ -172,23 +171,23 @@ def line_chart(
     round_ticks(axes.yaxis, 4, short)
     if logarithmic:
         axes.yaxis.set_minor_locator(NullLocator())
-        if high / low > 10:  # 1, 2 and 5 of each decade where there are few
+        if high / low > 10:  # 1, 2 and 5 of each decade if there are few
             axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high / low < 300 else (1.0,)))
     falling = any(item.main and item.main[-1][1] < item.main[0][1] for item in series)
     first, last = axes.get_xlim()
-    for x, words in starts:  # the name stands where lines leave room for it
+    for x, text in starts:  # placed where the lines leave room
         x = min(max(x, first), last)
         right = x - first > 0.75 * (last - first)
         axes.axvline(x, color=PALETTE["phase"], linewidth=1, dashes=(4, 3), gid="phase")
         offset, align = (-4 if right else 4, -12 if falling else 5), "right" if right else "left"
         at, transform = (x, 1 if falling else 0), axes.get_xaxis_transform()
-        axes.annotate(words, at, offset, transform, "offset points", ha=align, color=PALETTE["phase"])
+        axes.annotate(text, at, offset, transform, "offset points", ha=align, color=PALETTE["phase"])
     return inline_svg(axes, f"{title} over {over}{', vertical axis cut' if cut else ''}")
 
 
 @page_style()
 def legend(names: Sequence[str], used: Sequence[str]) -> list[tuple[str, Markup]]:
-    """(name, its line and mark as inline SVG) of every method shown; `names`: all, whose order gives them these."""
+    """Return (name, line and mark as inline SVG) of every used method; names: of all, whose order determines styles."""
     entries = []
     for order, name in enumerate(names):
         if name in used:
@@ -202,37 +201,37 @@ def legend(names: Sequence[str], used: Sequence[str]) -> list[tuple[str, Markup]
 
 
 def round_ticks(axis: Axis, count: int, label: Callable[[float], str]) -> None:
-    """About `count` round numbers along an axis, written by `label`."""
+    """Set about `count` ticks at round numbers of an axis, formatted by `label`."""
     axis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10], min_n_ticks=3))
     axis.set_major_formatter(lambda value, _: label(round(value, 12)))
 
 
 def short(value: float) -> str:
-    """A number for a tick."""
+    """Return a number formatted for a tick."""
     if abs(value) >= 10_000:
         return f"{value / 1000:.3g}k"
     return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def _color(order: int) -> str:
-    """A method's colour, as the style sheet has it."""
+    """Return a method's colour, as in the style sheet."""
     return PALETTE[f"m{order % CHARTS.colors}"]
 
 
 def _mark(order: int, size: float = 6.4) -> dict[str, Any]:
-    """A method's mark, hollow."""
+    """Return the style of a method's hollow mark."""
     shape = {"marker": MARKS[order % len(MARKS)], "markersize": size, "markeredgewidth": 1, "fillstyle": "none"}
     return {**shape, "linestyle": "", "color": _color(order)}
 
 
 def _draw_line(axes: Axes, order: int, points: Sequence[Point], dashes: tuple[int, ...] = (), **style: Any) -> None:
-    """A line through points, or a mark where there is but one."""
+    """Draw a line through points, or a mark for a single point."""
     style = {"color": _color(order), **({"dashes": dashes} if dashes else {}), **style}
     axes.plot(*np.array(points).reshape(-1, 2).T, **(style if len(points) > 1 else _mark(order, 8.0)))
 
 
 def _set_logarithmic_x(axes: Axes, xs: Sequence[float]) -> None:
-    """Make x logarithmic from the first to the last of `xs` (rising), which are its ticks but where they crowd."""
+    """Make x logarithmic from the first to the last of increasing `xs`, with ticks at those that do not overlap."""
     span = xs[-1] / xs[0]
     margin = span**0.03 if span > 1 else 2.0
     axes.set_xscale("log")

@@ -36,8 +36,8 @@ TRUTH_COLOR = (255, 255, 0)
 JOB_KEYS = ("model", "condition", "real", "fold")
 EXPLANATION = (
     "Means over folds with 95 % intervals: a bootstrap over seeds and blocks of neighbouring frames. Differences are "
-    "taken on the same folds and frames; one whose interval reaches 0 shows none. Of twenty comparisons that differ in "
-    "nothing about one is called a difference all the same. Dashed levels are sets alone, without any labelled frame."
+    "paired by folds and frames; an interval that contains 0 shows no difference. Of twenty comparisons without a true "
+    "difference about one is reported as a difference. Dashed levels are sets alone, without labelled frames."
 )
 
 Experiment = Mapping[str, Any]
@@ -45,8 +45,8 @@ Row = Mapping[str, Any]
 
 
 def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Path:
-    """Write `report.html` into the study's folder, and return its path. experiment: what `run_downstream` returned.
-    Raises NeecoError when a picture cannot be read or the page not be written."""
+    """Write `report.html` into the study's folder, and return its path. experiment: the result of `run_downstream`.
+    Raises NeecoError if an image cannot be read or the page cannot be written."""
     capture, computer = plan.capture, machine_words(experiment["machine"], "torch_threads")
     files = {"downstream.csv": summary_text(experiment)}
     budget = [
@@ -64,32 +64,32 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
         sections.append(Section(title=table.title, split=test, level=3, results=table, figures=figures))
     if examples := [section for pair in pairs for section in _examples(plan, experiment, *pair)]:
         text = (
-            "Frames where a condition with synthetic images gains most over its reference, and where it gains least or "
-            "loses, of the first fold; the truth in yellow, under each prediction its IoU."
+            "Frames of the first fold with the largest and smallest gain of a condition with synthetic images over its "
+            "reference; ground truth in yellow, IoU below each prediction."
         )
-        sections += [Section(title="The same frame, trained otherwise", text=text), *examples]
+        sections += [Section(title="Predictions on the same frame", text=text), *examples]
     failed, notes = failed_jobs(experiment), experiment["notes"]
     sections += [
-        Section(title=name, notes=lines) for name, lines in (("What failed", failed), ("Notes", notes)) if lines
+        Section(title=name, notes=lines) for name, lines in (("Failed trainings", failed), ("Notes", notes)) if lines
     ]
-    sections.append(Section(title="How it was made", facts=_facts(experiment, capture, computer)))
+    sections.append(Section(title="Configuration", facts=_facts(experiment, capture, computer)))
     return write_page(
         plan.request.output / REPORT_FILE,
         "study.html",
-        title=f"{capture.root.name}: what synthetic images are worth",
+        title=f"{capture.root.name}: benefit of synthetic images",
         name=capture.root.name,
-        subtitle="what synthetic images are worth",
+        subtitle="benefit of synthetic images",
         version=experiment["version"],
         stamps=[computer],
-        intro="Every training has as many steps; no training saw the tested frames, which were recorded.",
+        intro="All trainings have the same number of steps; the recorded test frames were not used for training.",
         findings=experiment["findings"],
         sections=sections,
     )
 
 
 def score_chart(model: Row, test: str, rows: list[Row]) -> str:
-    """The main score over the number of labelled frames, with its intervals; sets alone are levels. The legend names
-    the lines: on a narrow page their names would take its width."""
+    """Return the chart of the main score over the number of labelled frames, with intervals; sets alone are levels. The
+    lines are named in the legend, because labels would use up a narrow page's width."""
     metric, levels, series = MAIN[model["predicts"]], [], []
     for order, condition in enumerate(dict.fromkeys(row["condition"] for row in rows)):
         points = [row for row in rows if row["condition"] == condition and row[metric] is not None]
@@ -104,8 +104,8 @@ def score_chart(model: Row, test: str, rows: list[Row]) -> str:
 
 
 def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: str) -> list[Section]:
-    """The frames where the condition with synthetic images that gains most gains most and least, with its predictions
-    and those of its reference; none where a prediction of the first fold is missing."""
+    """Return the frames with the largest and smallest gain of the best condition with synthetic images, with its
+    predictions and those of its reference; none if a prediction of the first fold is missing."""
     rows = [row for row in rows_of(experiment, model, test) if "against" in row and is_synthetic(row, experiment)]
     if not rows:
         return []
@@ -114,9 +114,9 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
     key = "iou" if model["predicts"] == "masks" else "box_iou"
     predictions, scores = [], []
     for condition, real in arms:
-        wanted = (model["name"], condition, real, plan.request.kept_fold)
-        predictions.append(read_predictions(plan.request.job_folder(*wanted), test))
-        jobs = [job for job in experiment["jobs"] if tuple(job[name] for name in JOB_KEYS) == wanted]
+        key_values = (model["name"], condition, real, plan.request.kept_fold)
+        predictions.append(read_predictions(plan.request.job_folder(*key_values), test))
+        jobs = [job for job in experiment["jobs"] if tuple(job[name] for name in JOB_KEYS) == key_values]
         frames = jobs[0]["splits"].get(test, {}).get("per_frame", ()) if jobs else ()
         scores.append({frame["frame"]: frame[key] for frame in frames if frame[key] is not None})
     gains = {name: scores[1][name] - scores[0][name] for name in scores[1] if name in scores[0]}
@@ -138,15 +138,15 @@ def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: st
 
 
 def picture(example: Example, prediction: Prediction | None = None) -> Pixels:
-    """The recorded image with a prediction, in the classes' colours, and the truth's outlines or boxes."""
+    """Return the recorded image with a prediction, in the classes' colours, and the truth's outlines or boxes."""
     if isinstance(prediction, Detections):
         image = Image.fromarray(example.image)
         pen, width = ImageDraw.Draw(image), max(1, image.width // 160)
-        sure = prediction.scores >= min(0.5, prediction.scores.max(initial=0.0))
+        confident = prediction.scores >= min(0.5, prediction.scores.max(initial=0.0))
         boxes = [(TRUTH_COLOR, box) for box in example.boxes()[0]]
         boxes += [
             (tuple(PART_COLORS[(number - 1) % len(PART_COLORS)].astype(int).tolist()), box)
-            for box, number in zip(prediction.boxes[sure], prediction.classes[sure], strict=True)
+            for box, number in zip(prediction.boxes[confident], prediction.classes[confident], strict=True)
         ]
         for color, (x0, y0, x1, y1) in boxes:
             pen.rectangle((x0, y0, max(x0, x1 - 1), max(y0, y1 - 1)), outline=color, width=width)
@@ -163,7 +163,7 @@ def _facts(experiment: Experiment, capture: Capture, computer: str) -> list[tupl
     return [
         ("capture", experiment["capture"]),
         ("frames", split_counts(capture)),
-        ("labelled frames", f"of {experiment['labelled']:,}, others in every fold; labels: {labels}"),
+        ("labelled frames", f"of {experiment['labelled']:,}, different in every fold; labels: {labels}"),
         *((f"other recording {name}", path) for name, path in experiment["captures"].items()),
         *((f"set {data['name']}", f"{data['images']:,} images of {data['path']}") for data in experiment["sets"]),
         ("classes", ", ".join(experiment["classes"])),

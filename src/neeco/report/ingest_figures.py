@@ -74,10 +74,10 @@ def posed_picture(
 ) -> str:
     """Draw instruments at poses, world_from_instrument [4, 4], over a frame; return a data URI.
 
-    length: of their axes, mm; shafts: diameters in mm, of those whose z goes along a shaft that ends at their origin.
-    Raises NeecoError when the image cannot be read.
+    length: of the axes, mm; shafts: diameters in mm of instruments with z along a shaft that ends at their origin.
+    Raises NeecoError if the image cannot be read.
     """
-    # at twice the size shown, then shrunk: smooth lines
+    # supersampled by 2 for smooth lines
     scale = 2 * MAX_WIDTH / frame.camera.width
     fx, fy, cx, cy = (scale * value for value in (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy))
     size = (2 * MAX_WIDTH, round(frame.camera.height * scale))
@@ -140,10 +140,10 @@ def _project(points: np.ndarray, pose: Tensor, camera: Camera) -> tuple[np.ndarr
     return project_world(world, camera, nearest=SETTINGS.min_depth_mm)
 
 
-def round_length(wanted: float) -> float:
-    """Return the greatest of 1, 2, 5, 10, 20, ... not above `wanted`."""
-    power = 10.0 ** np.floor(np.log10(max(wanted, 1e-9)))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= wanted * 1.000001))
+def round_length(limit: float) -> float:
+    """Return the largest of 1, 2, 5, 10, 20, ... not above `limit`."""
+    power = 10.0 ** np.floor(np.log10(max(limit, 1e-9)))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= limit * 1.000001))
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ def unvisited(degrees: Sequence[Degree]) -> list[str]:
             continue
         steps = np.diff(values)
         sentences += [
-            f"{name}: nothing between {_number(values[place])} and {_number(values[place + 1])} {degree.unit}."
+            f"{name}: no frames between {_number(values[place])} and {_number(values[place + 1])} {degree.unit}."
             for place in np.flatnonzero(steps > 0.1 * np.ptp(values))
         ]
     return sentences
@@ -231,7 +231,7 @@ def histogram(degree: Degree) -> str:
     left, right = low - 0.02 * (high - low), high + 0.02 * (high - low)
     axes.set_xlim(left, right)
     for start, end in [(left, right)] if trained is None else [(left, trained[0]), (trained[1], right)]:
-        if end - start > 0.0125 * (right - left):  # a thinner one would be a stroke
+        if end - start > 0.0125 * (right - left):  # thinner ones would look like lines
             axes.axvspan(start, end, color=PALETTE["phase"], alpha=0.13, linewidth=0, gid="beyond")
     edges, floor = np.linspace(low, high, SETTINGS.bins + 1), np.zeros(SETTINGS.bins)
     for name in sorted(set(degree.splits), key=lambda name: [*SPLIT_COLORS, name].index(name)):

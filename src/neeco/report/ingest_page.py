@@ -1,4 +1,4 @@
-"""A finished ingest: its verdicts, and the page on its quality, one file, offline."""
+"""A finished ingest: its verdicts, and the self-contained page on its quality."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PAGE = "ingest.html"
 class Ingested:
     """Result of `ingest`: the capture in folder `output`, the report on it, and the verdict.
 
-    A folder converted from another format has neither, but `notes` on what it lacks."""
+    A folder converted from another format has neither, but `notes` on missing data."""
 
     output: Path
     result: IngestResult | None = None
@@ -61,20 +61,20 @@ class Ingested:
         return numbers
 
     def lines(self) -> list[str]:
-        """Return what was found, where it lies and how good it is, for a terminal."""
+        """Return results, paths and the verdict, for a terminal."""
         lines = [] if self.result is None else self.result.lines()
-        lines += [f"wrong: {problem}" for problem in errors_only(self.problems)]
-        lines.append(f"capture: {self.output}  ({counted(len(self.problems), 'remark')} by `neeco check`)")
+        lines += [f"error: {problem}" for problem in errors_only(self.problems)]
+        lines.append(f"capture: {self.output}  ({counted(len(self.problems), 'problem')} in `neeco check`)")
         verdict: list[str] = []
         if self.assessment is not None:
             lines.append(f"page: {self.output / PAGE}")
             first, *caveats = self.assessment.lines()
             verdict = [f"verdict: {first}", *caveats, self.assessment.conclusion]
-        stated = " ".join(verdict).casefold()
+        verdict_text = " ".join(verdict).casefold()
 
         def repeats(line: str) -> bool:
-            kind, _, words = line.partition(": ")
-            return kind in ("note", "wrong") and words.rstrip(".").casefold() in stated
+            kind, _, text = line.partition(": ")
+            return kind in ("note", "error") and text.rstrip(".").casefold() in verdict_text
 
         return [line for line in lines if not repeats(line)] + verdict
 
@@ -99,10 +99,10 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, capture: Capture | None = None) -> None:
-    """Write one HTML file about an ingest, with style, pictures and charts inside.
+    """Write a self-contained HTML page about an ingest.
 
-    verdict: of `assess_ingest`; capture: what lies at `result.capture`, read here unless given. Raises NeecoError when
-    it or one of the images shown cannot be read, or the page cannot be written.
+    verdict: of `assess_ingest`; capture: of `result.capture`, read here if None. Raises NeecoError if it or a displayed
+    image cannot be read, or the page cannot be written.
     """
     capture, fit = capture or read_capture(result.capture), result.registration
     registration = None
@@ -146,8 +146,8 @@ def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
 
 
 def _frames(result: IngestResult, capture: Capture) -> dict[str, Any]:
-    """Return sample frames as (picture, picture before registration, frame, its second, its split), and the key to the
-    overlays. The second picture is empty where there is none."""
+    """Return sample frames as (picture, picture before registration or "", frame, its time, its split), and the legend
+    of the overlays."""
     length = figures.axis_length(capture)
     rows = {time: row for row, time in enumerate(np.round(result.selected_times, 6).tolist())}
     start = min(frame.state.time for frame in capture.frames)
@@ -185,7 +185,7 @@ def _frames(result: IngestResult, capture: Capture) -> dict[str, Any]:
 
 
 def _coverage(capture: Capture) -> dict[str, Any]:
-    """Return the range of states: stretches without a training frame, and charts by instrument."""
+    """Return the range of states: intervals without a training frame, and charts by instrument."""
     degrees = figures.degrees_of_freedom(capture)
     named = [name for name in capture.splits if name in figures.SPLIT_COLORS]
     rest = ", ".join(name for name in capture.splits if name not in named)
@@ -206,7 +206,7 @@ def _coverage(capture: Capture) -> dict[str, Any]:
 
 
 def _dropped(result: IngestResult) -> list[list[str]]:
-    """Return rows of reason, count and frames; reasons that differ in a number only are one."""
+    """Return rows of reason, count and frames; reasons that differ only in a number are merged."""
     groups: dict[str, list[tuple[int, str]]] = {}
     for frame, reason in result.dropped:
         groups.setdefault(_NUMBER.sub("…", reason.why), []).append((frame, reason.why))

@@ -1,5 +1,4 @@
-"""Pages from templates, which escape all text that is put into them; the pictures inside pages; sections of a study's
-page."""
+"""Pages from templates, which escape all inserted text; embedded images; sections of a study's page."""
 
 from __future__ import annotations
 
@@ -25,18 +24,18 @@ from neeco.evaluation.image_metrics import difference_map, to_uint8
 from neeco.studies.tables import ResultTable
 
 REPORT_FILE = "report.html"
-MAX_WIDTH = 480  # px of a picture; the page has to stay a file one can mail
-SPLITS = {  # what the usual names of splits mean
+MAX_WIDTH = 480  # px, maximum width of an image, which limits the page's size
+SPLITS = {  # meaning of the usual split names
     "test": "states inside the recorded range",
     "unseen": "states outside the recorded range",
-    "novel_view": "a camera that training never used",
-    "train": "frames it learned from",
+    "novel_view": "a camera not used in training",
+    "train": "training frames",
 }
 
 
 @dataclass(frozen=True)
 class Images:
-    """Images of one method, one below the other, as data URIs."""
+    """Images of one method as data URIs, in one column."""
 
     name: str
     pictures: tuple[str, ...]
@@ -54,10 +53,10 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of a study's page, shown in the order of these fields; what is empty is left out."""
+    """A section of a study's page, in the order of these fields; empty fields are left out."""
 
     title: str
-    split: str = ""  # of usual names the meaning is shown with the title
+    split: str = ""  # its meaning by SPLITS is shown with the title
     level: int = 2  # of the heading
     text: str = ""
     results: ResultTable | None = None
@@ -69,9 +68,9 @@ class Section:
 
 
 def write_page(path: Path, template: str, **data: Any) -> Path:
-    """Write one page: style, pictures, charts and data are inside it, nothing is fetched. Returns `path`.
+    """Write one self-contained page and return `path`.
 
-    Every page takes `title` and for its header `name`, `subtitle` and `stamps`: facts shown with time and version.
+    Every page has `title` and for its header `name`, `subtitle` and `stamps`: facts shown with time and version.
     """
     page = _templates().get_template(template)
     made_at = f"{now():%Y-%m-%d %H:%M %Z}"
@@ -80,24 +79,24 @@ def write_page(path: Path, template: str, **data: Any) -> Path:
 
 
 def split_counts(capture: Capture) -> str:
-    """`40 train, 5 test`."""
+    """Return the number of frames per split, as `40 train, 5 test`."""
     return ", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits)
 
 
 def now() -> datetime:
-    """The time that a page states."""
+    """Return the time stated on a page."""
     return datetime.now().astimezone()
 
 
 def difference(image: np.ndarray, recorded: np.ndarray, counted: Tensor | None) -> str:
-    """The difference map of two images [H, W, 3] as a data URI, without loss: its colours mean numbers. It is black
-    also where `counted` [H, W] is False."""
+    """Return the difference map of two images [H, W, 3] as a data URI, lossless because colours encode numbers. It is
+    black where `counted` [H, W] is False."""
     compared = image if counted is None else np.where(counted.numpy()[..., None], image, recorded)
     return _data_uri(Image.fromarray(difference_map(compared, recorded)), "PNG", optimize=True)
 
 
 def jpeg(pixels: np.ndarray) -> str:
-    """A data URI of uint8 [H, W, 3], shrunk to at most MAX_WIDTH px wide."""
+    """Return a data URI of uint8 [H, W, 3], downscaled to at most MAX_WIDTH px width."""
     return _data_uri(Image.fromarray(pixels), "JPEG", quality=88)
 
 
@@ -110,7 +109,7 @@ def _data_uri(image: Image.Image, form: str, **options: Any) -> str:
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3] of an image in [0, 1]."""
+    """Convert an image in [0, 1] to uint8 [H, W, 3]."""
     return to_uint8(image * 255)
 
 

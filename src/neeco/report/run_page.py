@@ -1,4 +1,4 @@
-"""The pages of a run, each one file, offline: the report of `neeco evaluate`, the frames of `neeco annotate`."""
+"""The self-contained pages of a run: the report of `neeco evaluate`, the frames of `neeco annotate`."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from neeco.studies.tables import UNKNOWN
 
 @dataclass(frozen=True, kw_only=True)
 class RunPageSettings:
-    """Settings of what the pages of a run show."""
+    """Sizes and colours of a run's pages."""
 
     max_points: int = 300  # limit on the points of a training curve
-    max_frames: int = 60  # number of frames shown: the page has to stay a file one can mail
-    # of the instruments, in turn
+    max_frames: int = 60  # maximum number of frames, which limits the page's size
+    # colours of the instruments' outlines
     outlines: tuple[tuple[int, int, int], ...] = ((255, 230, 0), (0, 230, 255), (255, 90, 200), (120, 255, 80))
 
 
@@ -41,7 +41,7 @@ SETTINGS = RunPageSettings()
 
 
 class Score(NamedTuple):
-    """A column of the table of numbers: its key in evaluation.json, how it is written, and what it means."""
+    """A column of the table of numbers: its key in evaluation.json, format, and meaning."""
 
     key: str
     heading: str
@@ -49,34 +49,36 @@ class Score(NamedTuple):
     meaning: str = ""
 
     def written(self, numbers: Mapping[str, Any]) -> str:
-        """Its value among the numbers, as the table shows it."""
+        """Return its value among the numbers, formatted for the table."""
         return UNKNOWN if numbers.get(self.key) is None else self.form.format(numbers[self.key])
 
 
 IMAGE_SCORES = (
-    Score("psnr", "PSNR dB", "{:.2f}", "Similarity of the rendered pixels to the recorded; 30 is close, 20 is rough."),
-    Score("ssim", "SSIM", "{:.3f}", "Structural similarity, 1 is equal (11x11 Gaussian window, as 3DGS scores it)."),
-    Score("lpips", "LPIPS", "{:.3f}", "Perceptual distance by AlexNet features (Zhang et al. 2018); 0 is equal."),
+    Score("psnr", "PSNR dB", "{:.2f}", "Peak signal-to-noise ratio of the rendered image; 30 is good, 20 is poor."),
+    Score("ssim", "SSIM", "{:.3f}", "Structural similarity, 1 is identical (11x11 Gaussian window, as in 3DGS)."),
+    Score("lpips", "LPIPS", "{:.3f}", "Perceptual distance by AlexNet features (Zhang et al. 2018); 0 is identical."),
     Score("lpips_vgg", "LPIPS VGG", "{:.3f}", "The same by VGG16 features."),
-    Score("psnr_instrument", "PSNR instrument", "{:.2f}", "PSNR over the pixels where the instrument truly is."),
-    Score("psnr_covered", "PSNR observed", "{:.2f}", "PSNR without the tissue that no training frame saw."),
-    Score("covered_fraction", "observed tissue", "{:.1%}", "Share of the visible tissue that some training frame saw."),
-    Score("fps", "FPS", "{:.1f}", "Posed images rendered per second on the machine that evaluated."),
-    Score("num_gaussians", "Gaussians", "{:,}", "Gaussians of the finished scene; finishing adds some, as of shafts."),
-    Score("frames", "frames", "{}", "How many frames were scored."),
+    Score("psnr_instrument", "PSNR instrument", "{:.2f}", "PSNR over the pixels of the true instrument mask."),
+    Score("psnr_covered", "PSNR observed", "{:.2f}", "PSNR without tissue that no training frame observed."),
+    Score("covered_fraction", "observed tissue", "{:.1%}", "Share of visible tissue observed in training frames."),
+    Score("fps", "FPS", "{:.1f}", "Posed images rendered per second on the machine of the evaluation."),
+    Score("num_gaussians", "Gaussians", "{:,}", "Gaussians of the finished scene, including those added at the end."),
+    Score("frames", "frames", "{}", "Number of scored frames."),
 )
 LABEL_SCORES = (
-    Score("mask_iou", "mask IoU", "{:.3f}", "Label mask against true mask: shared area over joint area; 1 is perfect."),
-    Score("mask_precision", "mask precision", "{:.3f}", "How much of the label mask is truly instrument."),
-    Score("mask_recall", "mask recall", "{:.3f}", "How much of the true mask is labelled."),
+    Score("mask_iou", "mask IoU", "{:.3f}", "Intersection over union of label mask and true mask; 1 is perfect."),
+    Score("mask_precision", "mask precision", "{:.3f}", "Share of the label mask that is instrument."),
+    Score("mask_recall", "mask recall", "{:.3f}", "Share of the true mask that is labelled."),
     Score("estimated_iou", "estimated IoU", "{:.3f}", "The mask IoU, estimated from the images alone, without masks."),
-    Score("shaft_recall", "recall on shafts", "{:.3f}", "How much of the true shafts is labelled instrument."),
-    Score("shadow_labelled", "shadow labelled", "{:.1%}", "How much of the instruments' shadow on tissue is labelled."),
+    Score("shaft_recall", "recall on shafts", "{:.3f}", "Share of the true shafts that is labelled instrument."),
+    Score(
+        "shadow_labelled", "shadow labelled", "{:.1%}", "Share of the instruments' shadow on tissue that is labelled."
+    ),
 )
 SCORES = (*IMAGE_SCORES, *LABEL_SCORES)
 KINDS = {
-    "given": "As given: rendered at the poses the capture states, tracker errors included",
-    "aligned": "Aligned: instrument and camera pose fitted to each recorded image first, the scene unchanged",
+    "given": "As given: rendered at the capture's poses, including tracker errors",
+    "aligned": "Aligned: instrument and camera pose first fitted to each recorded image, with a fixed scene",
 }
 KIND_NAMES = {"given": "in the recorded poses", "aligned": "in poses fitted to each image"}
 
@@ -89,11 +91,11 @@ def write_report(
     *,
     playable: str | None = None,
 ) -> Path:
-    """Write `report.html` into the run folder and return its path. One file: style, pictures and curves are inside it.
+    """Write the self-contained `report.html` into the run folder and return its path.
 
-    evaluation: what `evaluate_run` returned. playable: a page of its own that renders the scene, shown in a frame of
-    this one. The caller sets the number of torch threads (`open_run`). Raises NeecoError when a picture cannot be read
-    or the page cannot be written.
+    evaluation: the result of `evaluate_run`. playable: a page that renders the scene, embedded in an iframe. The caller
+    sets the number of torch threads (`open_run`). Raises NeecoError if an image cannot be read or the page cannot be
+    written.
     """
     rows = read_metrics(run_path / "metrics.jsonl")
     kind = "aligned" if "aligned" in evaluation else "given"
@@ -132,9 +134,9 @@ def write_report(
 def frame_figures(
     evaluation: dict[str, Any], capture: Capture, scene: DrawableScene, kind: str
 ) -> list[dict[str, Any]]:
-    """For every evaluated split the best, the median and the worst frame by PSNR, rendered at the poses of `kind`.
+    """Return the best, median and worst frame by PSNR of every evaluated split, rendered at the poses of `kind`.
 
-    Each has `split`, `name`, `why` (best, median, worst), `scores` (words) and `pictures`: (what it is, data URI).
+    Each has `split`, `name`, `why` (best, median, worst), `scores` (texts) and `pictures`: (title, data URI).
     """
     figures = []
     for split, rows in evaluation.get("per_frame", {}).get(kind, {}).items():
@@ -163,7 +165,7 @@ def frame_figures(
 
 
 def chosen_rows(rows: Sequence[dict[str, Any]]) -> list[tuple[str, dict[str, Any]]]:
-    """Best, median and worst of the rows that have a PSNR; fewer when there are fewer rows."""
+    """Return the best, median and worst row with a PSNR; fewer if there are fewer rows."""
     ranked = sorted((row for row in rows if row.get("psnr") is not None), key=lambda row: -row["psnr"])
     places = {"best": 0, "median": len(ranked) // 2, "worst": len(ranked) - 1}
     chosen: dict[int, str] = {}
@@ -174,7 +176,7 @@ def chosen_rows(rows: Sequence[dict[str, Any]]) -> list[tuple[str, dict[str, Any
 
 
 def _poses(frame: Frame, row: dict[str, Any]) -> tuple[State, Camera]:
-    """The fitted poses that evaluation recorded in the row, or the frame's own."""
+    """Return the fitted poses recorded in the row by the evaluation, else the frame's own."""
     state, camera = frame.state, frame.camera
     if "world_from_camera" not in row:
         return state, camera
@@ -188,15 +190,15 @@ def _poses(frame: Frame, row: dict[str, Any]) -> tuple[State, Camera]:
 
 
 def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
-    """(number, what it is) of the few that matter most."""
+    """Return (number, description) of the most important scores."""
     tiles = []
     for split, numbers in evaluation["given"].items():
         if numbers["psnr"] is not None:
-            meaning = f"PSNR, {split} frames: similarity to the recorded (30 is close, 20 rough)"
+            meaning = f"PSNR, {split} frames (30 is good, 20 is poor)"
             tiles.append((f"{numbers['psnr']:.1f} dB", meaning))
     for split, numbers in evaluation[labelled].items():
         if numbers["mask_iou"] is not None:
-            meaning = f"overlap of labels and true masks (IoU; 1 is perfect), {split} frames {KIND_NAMES[labelled]}"
+            meaning = f"IoU of labels and true masks (1 is perfect), {split} frames {KIND_NAMES[labelled]}"
             tiles.append((f"{numbers['mask_iou']:.3f}", meaning))
     doubts = evaluation.get("doubts", ())
     measured = any(numbers.get("estimated_iou") is not None for numbers in evaluation["given"].values())
@@ -204,15 +206,15 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
     tiles.append((trust, "trust in the labels, by what training measured (see Notes)"))
     first = next(iter(evaluation["given"].values()), None)
     if first is not None:
-        tiles.append((f"{first['fps']:.1f}", "images rendered per second, each of another state"))
+        tiles.append((f"{first['fps']:.1f}", "images rendered per second, each in a different state"))
         if first["num_gaussians"] is not None:
-            tiles.append((f"{first['num_gaussians']:,}", "Gaussians (coloured blobs) that make up the scene"))
+            tiles.append((f"{first['num_gaussians']:,}", "Gaussians of the scene"))
     return tiles
 
 
 def _tables(evaluation: dict[str, Any]) -> list[Any]:
-    """The tables of numbers, of images and of labels: columns that anything is known for, and rows (title of the kind,
-    its splits with their cells)."""
+    """Return the tables of image scores and of label scores: columns with any value, and rows (title of the kind, its
+    splits with their cells)."""
     kinds = {kind: evaluation[kind] for kind in KINDS if kind in evaluation}
     all_numbers = [numbers for splits in kinds.values() for numbers in splits.values()]
     tables = []
@@ -227,14 +229,14 @@ def _tables(evaluation: dict[str, Any]) -> list[Any]:
 
 
 def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
-    """Colour and name of every part."""
+    """Return the colour and name of every part."""
     several = len({instrument for instrument, _ in scene.label_names}) > 1
     names = [f"{instrument} {part}" if several else part for instrument, part in scene.label_names]
     return [(part_color(part), name.replace("_", " ")) for part, name in enumerate(names, 1)]
 
 
 def _verdicts(diagnostics: Mapping[str, Any]) -> list[str]:
-    """Every verdict in what training measured, in words."""
+    """Return all verdicts in the training diagnostics, as text."""
     return [
         verdict
         for name, item in diagnostics.items()
@@ -253,7 +255,7 @@ def _facts(capture: Capture, scene: DrawableScene, rows: list[dict[str, Any]]) -
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Rows of a metrics.jsonl; empty when there is none. A last line cut off by a kill is left out."""
+    """Return the rows of a metrics.jsonl; [] if there is none. A truncated last line is left out."""
     if not path.is_file():
         return []
     rows = []
@@ -268,12 +270,12 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: bool = False) -> str:
-    """A chart of `key` over iterations, dashed lines where a phase begins; "" when fewer than two rows have numbers."""
+    """Return a chart of `key` over iterations, with dashed lines at phase starts; "" for fewer than two numbers."""
     valid = [row for row in rows if type(row.get(key)) in (int, float) and math.isfinite(row[key])]
     points = [(float(row["iteration"]), float(row[key])) for row in valid if row[key] > 0 or not logarithmic]
     if len(points) < 2:
         return ""
-    # means of equally many, so that a noisy curve reads as its trend
+    # block means, to show the trend of a noisy curve
     if (run := -(-len(points) // SETTINGS.max_points)) > 1:
         groups = [points[start : start + run] for start in range(0, len(points), run)]
         points = [(group[-1][0], sum(y for _, y in group) / len(group)) for group in groups]
@@ -288,9 +290,9 @@ PAGE = "annotate.html"
 
 
 def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], capture: Capture, min_trust: float) -> Path:
-    """Write annotate.html into `output` and return its path. One file: its pictures are inside it.
+    """Write the self-contained annotate.html into `output` and return its path.
 
-    `records`: of every frame of `capture`, in its order, as `annotate_capture` returns them. Raises NeecoError when a
+    records: of every frame of `capture`, in its order, as returned by `annotate_capture`. Raises NeecoError if a
     recorded image cannot be read or the page cannot be written.
     """
     ranked = sorted(range(len(records)), key=lambda k: records[k]["trust"]["value"])
@@ -300,12 +302,12 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
         "annotate.html",
         title=f"{capture.root.name}: annotated",
         name=capture.root.name,
-        subtitle="recorded frames, labelled by a scene",
+        subtitle="recorded frames, labelled with a learned scene",
         stamps=[output],
         tiles=[
             (f"{written} of {len(records)}", "frames written"),
             (f"{median(record['trust']['value'] for record in records):.3f}", "trust, median"),
-            (f"{min_trust:g}", "trust asked for"),
+            (f"{min_trust:g}", "minimum trust"),
         ],
         figures=[_annotated_figure(records[k], capture.frames[k]) for k in ranked[: SETTINGS.max_frames]],
         total=len(records),
@@ -317,7 +319,7 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
 
 
 def _annotated_figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:
-    """One frame: its image with the contours of its labels, and what is known of it."""
+    """Return one frame: its image with the contours of its labels, and its confidence."""
     trust, moved = record["trust"], record["moved"]
     image = Image.fromarray(to_bytes(frame.load_image().numpy()))
     pen = ImageDraw.Draw(image)
@@ -330,7 +332,7 @@ def _annotated_figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:
         "split": record["recorded_split"],
         "written": not record.get("skipped"),
         "trust": f"{trust['value']:.3f}",
-        "votes": f"{trust['against']:.1%} of the label speak against it, it misses {trust['missed']:.1%}",
+        "votes": f"{trust['against']:.1%} of the label contradicted by the image, {trust['missed']:.1%} missed",
         "moved": ", ".join(f"{body} {by['mm']:.2f} mm, {by['deg']:.2f}°" for body, by in moved.items()),
         "picture": jpeg(np.asarray(image)),
     }

@@ -1,4 +1,4 @@
-"""The page of a sweep: one offline file with its tables, curves and pictures."""
+"""The self-contained page of a sweep, with tables, curves and images."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from neeco.training.run import open_run
 
 
 def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
-    """Write `report.html` into the output and return its path. Every frame shown is rendered once per configuration.
-    Raises NeecoError when a run cannot be opened or the page not be written."""
+    """Write `report.html` into the output and return its path. Every displayed frame is rendered once per
+    configuration. Raises NeecoError if a run cannot be opened or the page cannot be written."""
     study, capture, computer = plan.study, plan.capture, machine_words(plan.machine)
-    text = "Mean ± standard deviation over seeds; bold: the best, or what differences in brackets are taken to."
+    text = "Mean ± standard deviation over seeds; bold: the best, or the reference of the differences in brackets."
     files = {RESULTS_FILE: csv_text(COLUMNS, rows)}
     sections = [Section(title="Results", text=text, files=files, notes=plan.notes)]
     for name, split, numbers in tables_of(plan, rows):
@@ -45,13 +45,13 @@ def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
         )
     if pictures := _pictures(plan, rows):
         text = (
-            "The middle frame of each split, by the first seed of each. Below each rendering its difference to the "
-            f"recorded image, full scale {COMPARISON.full_scale:g} of the range; in yellow, where known, the true "
+            "The middle frame of each split, by the first seed. Below each rendering its difference to the recorded "
+            f"image, full scale {COMPARISON.full_scale:g} of the range; in yellow, if available, the true "
             "outline of the instrument."
         )
-        sections += [Section(title="The same frame by every configuration", text=text), *pictures]
+        sections += [Section(title="The same frame rendered by every configuration", text=text), *pictures]
     if failed := failures(rows):
-        sections.append(Section(title="What failed", notes=failed))
+        sections.append(Section(title="Failed runs", notes=failed))
     shared = " ".join((*study.settings, *plan.request.set))
     facts = [
         ("capture", str(capture.root.absolute())),
@@ -62,9 +62,9 @@ def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
         ("machine", computer),
         ("rasteriser", plan.machine["backend"]),
     ]
-    sections.append(Section(title="How it was made", facts=facts))
+    sections.append(Section(title="Configuration", facts=facts))
     frames = len(capture.split("train"))
-    intro = f"Trained on the same {frames} frames, {length_words(study)}; scored on images that no run learned from."
+    intro = f"Trained on the same {frames} frames, {length_words(study)}; scored on images not used in training."
     return write_page(
         plan.request.output / REPORT_FILE,
         "study.html",
@@ -79,8 +79,8 @@ def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
 
 
 def _curves(plan: SweepPlan, table: Table, split: str) -> list[Figure]:
-    """PSNR of some held-out frames over the training of a table's configurations: the mean over seeds, each seed thin;
-    over iterations, or over minutes where these end the runs."""
+    """Return charts of held-out PSNR over the training of a table's configurations: the mean over seeds, and a thin
+    line per seed, over iterations, or over minutes if the length is a time."""
     timed = any(plan.study.length_of(name)[0] != "iterations" for name in table.rows)
     key, over, scale = ("seconds", "training time, minutes", 1 / 60) if timed else ("iteration", "iterations", 1.0)
     names = [row.label or name for name, row in table.rows.items()]
@@ -99,7 +99,7 @@ def _curves(plan: SweepPlan, table: Table, split: str) -> list[Figure]:
 
 
 def _pictures(plan: SweepPlan, rows: Rows) -> list[Section]:
-    """The middle frame of every split, recorded and rendered by the first finished seed of each configuration."""
+    """Return the middle frame of every split, recorded and rendered by the first finished seed per configuration."""
     frames = [frames[len(frames) // 2] for frames in map(plan.capture.split, plan.splits)]
     images: list[list[Images]] = []
     for frame in frames:

@@ -28,17 +28,17 @@ class TrackPageSettings:
 
 SETTINGS = TrackPageSettings()
 HOWS = {
-    "begun": "begun from the given state",
-    "followed": "followed from the neighbouring frame",
-    "beside": "found near where it was expected",
-    "found": "found anew, anywhere",
-    "lost": "not found",
+    "begun": "initialised from the given state",
+    "followed": "tracked from the neighbouring frame",
+    "beside": "detected near the predicted state",
+    "found": "detected again, without a prior",
+    "lost": "not detected",
 }
 
 
 def write_track_page(tracked: Tracked) -> Path:
-    """Write track.html into the output folder and return its path. One file: its pictures are inside it. Raises
-    NeecoError when an image cannot be read or the page cannot be written."""
+    """Write the self-contained track.html into the output folder and return its path. Raises NeecoError if an image
+    cannot be read or the page cannot be written."""
     records = tracked.records
     frames = sorted(tracked.footage.frames, key=lambda frame: frame.state.time)
     values = [record["trust"]["value"] for record in records]
@@ -49,14 +49,14 @@ def write_track_page(tracked: Tracked) -> Path:
         "track.html",
         title=f"{tracked.footage.root.name}: tracked",
         name=tracked.footage.root.name,
-        subtitle="instruments followed by their scene",
+        subtitle="instruments tracked with a learned scene",
         stamps=[tracked.output],
         verdict=tracked.verdict,
         tiles=[
-            (f"{tracked.written} of {len(records)}", f"frames trusted by {tracked.min_trust:g}"),
+            (f"{tracked.written} of {len(records)}", f"frames with a trust of at least {tracked.min_trust:g}"),
             (f"{median(values):.3f}", "trust, median"),
-            (str(missing), "frames where nothing was found"),
-            (str(sum(record["how"] in ("beside", "found") for record in records)), "times searched for again"),
+            (str(missing), "frames without a detection"),
+            (str(sum(record["how"] in ("beside", "found") for record in records)), "re-detections"),
         ],
         charts=[chart for chart in _charts(tracked) if chart],
         strip=[_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), SETTINGS.spread)],
@@ -65,13 +65,13 @@ def write_track_page(tracked: Tracked) -> Path:
 
 
 def _charts(tracked: Tracked) -> list[str]:
-    """Trust and misfit, then the joints of every instrument with bands of `band` standard deviations, over time."""
+    """Return charts over time: trust and misfit, then every instrument's joints with bands of `band` deviations."""
     records, first = tracked.records, tracked.records[0]["time"]
     times = [record["time"] - first for record in records]
     trust = Series(0, tuple(zip(times, (record["trust"]["value"] for record in records), strict=True)))
     misfit = Series(1, tuple((t, r["misfit"]) for t, r in zip(times, records, strict=True) if r["how"] != "lost"))
     charts = [
-        line_chart("trust", "s", [trust], levels=[(1, tracked.min_trust)], note="dashed: asked for", size=CHARTS.small),
+        line_chart("trust", "s", [trust], levels=[(1, tracked.min_trust)], note="dashed: minimum", size=CHARTS.small),
         line_chart("misfit of pixels", "s", [misfit], size=CHARTS.small),
     ]
     rows = [k for k, record in enumerate(records) if record["how"] != "lost"]
@@ -93,7 +93,7 @@ def _charts(tracked: Tracked) -> list[str]:
 
 
 def _figure(tracked: Tracked, frame: Frame, record: dict[str, Any]) -> dict[str, Any]:
-    """One frame: its image, tinted by the label that the scene renders there."""
+    """Return one frame: its image, tinted by the rendered label."""
     image, trust = frame.load_image().numpy(), record["trust"]
     picture = to_bytes(image)
     if record["how"] != "lost":
