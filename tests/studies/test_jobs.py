@@ -138,8 +138,8 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(stop, trained_
 @pytest.mark.parametrize(
     ("name", "change", "reported"),
     [
-        ("job.json", {"splits": {"test": {"psnr": "good"}}}, "splits: test: psnr: is not as neeco writes it"),
-        ("job.json", {"seconds": []}, "seconds: is not as neeco writes it"),
+        ("job.json", {"splits": {"test": {"psnr": "good"}}}, "splits: test: psnr: is not in neeco's format"),
+        ("job.json", {"seconds": []}, "seconds: is not in neeco's format"),
     ],
 )
 def test_damaged_files_of_a_job_are_reported_by_file_and_field(name, change, reported, finished_job):

@@ -1,1 +1,1 @@
-"""Experiments: many runs on one capture, each a job that stands on its own, and what is read off them together."""
+"""Experiments: many independent runs (jobs) on one capture, and their combined results."""

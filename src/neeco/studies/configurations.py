@@ -1,4 +1,4 @@
-"""STUDY.yaml: the configurations of a sweep, and the tables that are read off its results. Imports nothing heavy."""
+"""STUDY.yaml: the configurations of a sweep, and the tables of its results. Without heavy imports."""
 
 from __future__ import annotations
 
@@ -36,39 +36,39 @@ COSTS = (  # of a whole run
 )
 MEASURES = {column.key: column for column in (*SCORES, *MOMENTS, *COSTS)}
 LENGTHS = ("iterations", "minutes", "cpu_minutes")
-MAX_NAME_BYTES = 200  # limit on the bytes of a configuration's name: its folder's has more, and file systems take 255
+MAX_NAME_BYTES = 200  # limit on the bytes of a configuration's name; its folder's name is longer, at most 255
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRequest:
-    """Arguments that `sweep`, `compare` and `ablate` share."""
+    """Arguments shared by `sweep`, `compare` and `ablate`."""
 
     capture: Annotated[Path, tyro.conf.Positional]
     """Capture folder."""
     output: Path
-    """Folder to write; absent, empty, or of this study begun earlier."""
+    """Folder to write; absent, empty, or of this study started earlier."""
     seeds: int | None = None
-    """How many seeds, from 0; with 2 or more the tables have standard deviations. Default: the study's, else 1."""
+    """Number of seeds, from 0; with 2 or more the tables have standard deviations. Default: the study's, else 1."""
     iterations: int | None = None
-    """Each run trains so many steps. Default: the study's."""
+    """Training steps of each run. Default: the study's."""
     minutes: float | None = None
-    """Each run trains so long by the clock on the wall."""
+    """Training time of each run, minutes of wall-clock time."""
     cpu_minutes: float | None = None
-    """Each run trains so many minutes of CPU time, all threads together: fair on a machine that others use."""
+    """Training time of each run, minutes of CPU time summed over threads; comparable on a shared machine."""
     splits: tuple[str, ...] | None = None
     """Splits to score. Default: all but train."""
     workers: int = 1
-    """Runs at once; each gets its share of the cores. RAY_ADDRESS names a Ray cluster (needs the extra `cluster`)."""
+    """Parallel runs, which share the cores. RAY_ADDRESS names a Ray cluster (needs the extra `cluster`)."""
     transforms: str = "transforms.json"
-    """Which transforms file of the capture to read."""
+    """Transforms file of the capture to read."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """A field of every run's training config, as NAME=VALUE (e.g. max_tissue_gaussians=5000); repeatable."""
     lpips_weights: Path | None = None
-    """Folder with alexnet.safetensors and/or vgg16.safetensors. Default: that of NEECO_LPIPS_WEIGHTS."""
+    """Folder with alexnet.safetensors and/or vgg16.safetensors. Default: NEECO_LPIPS_WEIGHTS."""
     device: Device = "auto"
 
     def check(self) -> None:
-        """Raises NeecoError naming the option that cannot be used."""
+        """Raise NeecoError naming the invalid option."""
         if self.seeds is not None and self.seeds < 1:
             raise NeecoError(f"--seeds must be at least 1 (got {self.seeds})")
         if any(value is not None for value in self.lengths.values()):
@@ -86,18 +86,18 @@ class SweepRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Configuration:
-    """One way to train."""
+    """One training configuration."""
 
     method: str | None = None  # as for `neeco train --method`; METHOD+dta: with the paper's dynamic training adjustment
-    like: str | None = None  # another configuration, whose method, settings and iterations come first
+    like: str | None = None  # another configuration, whose method, settings and iterations are the defaults
     settings: tuple[str, ...] = ()  # NAME=VALUE as for `neeco train --set`
     iterations: int | None = None  # in place of the study's length
 
 
 @dataclass(frozen=True, kw_only=True)
 class TableRow:
-    """One configuration in a table. `published`: numbers of others, one for each measure of the table, as far as known;
-    only the directions of their differences are compared with ours."""
+    """One configuration in a table. published: published numbers for the first measures of the table; only the
+    directions of their differences are compared with ours."""
 
     label: str = ""  # "": the configuration's name
     published: tuple[float, ...] = ()
@@ -120,39 +120,39 @@ class Study:
 
     title: str = "Sweep"
     configurations: dict[str, Configuration] = field(default_factory=dict)
-    seeds: int = 1  # how many, from 0
+    seeds: int = 1  # number of seeds, from 0
     iterations: int | None = None
-    minutes: float | None = None  # by the clock on the wall
+    minutes: float | None = None  # wall-clock time
     cpu_minutes: float | None = None  # CPU time of all threads of a run
-    settings: tuple[str, ...] = ()  # of all configurations; deformation.FIELD of those whose method has the field
-    even_db: float = 0.1  # smallest difference of PSNR from a reference, dB, that has a direction
-    tables: dict[str, Table] = field(default_factory=dict)  # none: one of all configurations
+    settings: tuple[str, ...] = ()  # of all configurations; deformation.FIELD only for methods with this field
+    even_db: float = 0.1  # dB, PSNR difference from a reference below which two results count as equal
+    tables: dict[str, Table] = field(default_factory=dict)  # empty: one of all configurations
 
     def prepared(self, request: SweepRequest) -> Study:
-        """Return the study as the request changes it, with configurations that are `like` none, and a table. Raises
-        NeecoError naming the field that cannot be used."""
+        """Return the study modified by the request, with resolved `like` references and a table. Raises NeecoError
+        naming the invalid field."""
         study = self if request.seeds is None else replace(self, seeds=request.seeds)
-        alone = {name: study.unfolded(name) for name in study.configurations}
+        resolved = {name: study.unfolded(name) for name in study.configurations}
         if any(value is not None for value in request.lengths.values()):
-            alone = {name: replace(item, iterations=None) for name, item in alone.items()}
+            resolved = {name: replace(item, iterations=None) for name, item in resolved.items()}
             study = replace(study, **request.lengths)
-        everybody = {name: TableRow() for name in alone}
+        all_rows = {name: TableRow() for name in resolved}
         tables = {
-            name: replace(table, title=table.title or name, rows=table.rows or everybody)
+            name: replace(table, title=table.title or name, rows=table.rows or all_rows)
             for name, table in (self.tables or {"results": Table(title=self.title)}).items()
         }
-        study = replace(study, configurations=alone, tables=tables)
+        study = replace(study, configurations=resolved, tables=tables)
         study.check()
         return study
 
     def check(self) -> None:
-        """Raises NeecoError naming the field that cannot be used."""
+        """Raise NeecoError naming the invalid field."""
         if not self.configurations:
-            raise NeecoError("configurations: none is given; name at least one, with its method")
+            raise NeecoError("configurations: missing; add at least one, with its method")
         for name in self.configurations:
             plain = name.isprintable() and name == name.strip() and not name.startswith(".")
             if not plain or not 0 < len(name.encode()) <= MAX_NAME_BYTES or {*name} & {"/", "\\"}:
-                problem = "cannot name a folder; give a short name in one line without /, \\ and a dot at its start"
+                problem = "is not a valid folder name; use a short name without /, \\ and a leading dot"
                 raise NeecoError(f"configurations: {name[:40]!r} {problem}")
             self.length_of(name)
         if self.seeds < 1:
@@ -161,33 +161,33 @@ class Study:
             for row, entry in table.rows.items():
                 require_known(f"tables.{name}.rows", row, self.configurations)
                 if len(entry.published) > len(table.measures):
-                    raise NeecoError(f"tables.{name}.rows.{row}.published: more numbers than measures; leave some out")
+                    raise NeecoError(f"tables.{name}.rows.{row}.published: more numbers than measures; remove some")
             for measure in table.measures:
                 require_known(f"tables.{name}.measures", measure, MEASURES)
             if table.reference is not None:
                 require_known(f"tables.{name}.reference", table.reference, table.rows)
 
     def unfolded(self, name: str) -> Configuration:
-        """Return a configuration with what it takes from the one that it is `like`. Raises NeecoError for a name that
-        is unknown or leads back to itself."""
+        """Return a configuration with its `like` reference resolved. Raises NeecoError for an unknown name or a
+        circular reference."""
         chain = [name]
         while (like := self.configurations[chain[-1]].like) is not None:
             place = f"configurations.{chain[-1]}.like"
             require_known(place, like, self.configurations)
             if like in chain:
-                raise NeecoError(f"{place}: {like} is like {chain[-1]} in turn; give one of them a method")
+                raise NeecoError(f"{place}: circular reference of {like} and {chain[-1]}; give one of them a method")
             chain.append(like)
         items = [self.configurations[each] for each in chain]
         method = next((item.method for item in items if item.method), None)
         if method is None:
-            raise NeecoError(f"configurations.{chain[-1]}.method: none is given; choose one of `neeco train --help`")
+            raise NeecoError(f"configurations.{chain[-1]}.method: missing; choose one of `neeco train --help`")
         settings = tuple(setting for item in reversed(items) for setting in item.settings)
         iterations = next((item.iterations for item in items if item.iterations is not None), None)
         return Configuration(method=method, settings=settings, iterations=iterations)
 
     def length_of(self, name: str) -> tuple[str, float]:
-        """Return the length of a configuration's runs: one of LENGTHS, and how many. Raises NeecoError where there is
-        none, or several."""
+        """Return the length of a configuration's runs: one of LENGTHS, and its value. Raises NeecoError unless there is
+        exactly one."""
         iterations = self.configurations[name].iterations
         if iterations is not None:
             return single_length({"iterations": iterations}, f"configurations.{name}.")
@@ -203,11 +203,11 @@ class Study:
 
 
 def read_study(file: Path) -> Study:
-    """Read STUDY.yaml. Raises NeecoError naming the file and the field that is unknown or does not fit."""
-    example = "write it as docs/studies.md shows"
+    """Read STUDY.yaml. Raises NeecoError naming the file and the unknown or invalid field."""
+    example = "see docs/studies.md for an example"
     values = parse_yaml(file, read_text(file, "a study in YAML"), example)
     if not isinstance(values, dict):
-        raise NeecoError(f"{file}: is not a mapping with fields such as configurations; {example}")
+        raise NeecoError(f"{file}: expected a mapping with fields such as configurations; {example}")
     try:
         return structure(Study, values)
     except NeecoError as error:
@@ -220,12 +220,12 @@ def ablations() -> Study:
 
 
 def single_length(lengths: Mapping[str, float | None], place: str) -> tuple[str, float]:
-    """Return the one of LENGTHS that has a value, and the value. Raises NeecoError where none has, or several, and
-    naming it behind `place` where nothing can be trained so long."""
+    """Return the one of LENGTHS that has a value, and the value. Raises NeecoError unless there is exactly one and it
+    is positive and finite, naming it with the prefix `place`."""
     values = {key: value for key, value in lengths.items() if value is not None}
     if len(values) != 1:
-        problem = f"{' and '.join(values)} are given" if values else "no length of the runs is given"
-        raise NeecoError(f"{problem}; all train equally long: give one of {', '.join(LENGTHS)} (try --minutes 5)")
+        problem = f"{' and '.join(values)} are given" if values else "the length of the runs is missing"
+        raise NeecoError(f"{problem}; give exactly one of {', '.join(LENGTHS)} for all runs (for example --minutes 5)")
     ((key, value),) = values.items()
     if not 0 < value < math.inf:
         field = f"--{key.replace('_', '-')}" if place == "--" else f"{place}{key}:"
@@ -234,8 +234,8 @@ def single_length(lengths: Mapping[str, float | None], place: str) -> tuple[str,
 
 
 def require_known(place: str, name: str, names: Iterable[str]) -> None:
-    """Raise NeecoError naming `place` where `name` is none of `names`."""
+    """Raise NeecoError naming `place` if `name` is not in `names`."""
     if name not in names:
         meant = nearest(name, names)
         hint = "" if meant is None else f"; did you mean {meant}?"
-        raise NeecoError(f"{place}: {name!r} is unknown; choose of {', '.join(names)}{hint}")
+        raise NeecoError(f"{place}: {name!r} is unknown; choose one of: {', '.join(names)}{hint}")

@@ -1,5 +1,5 @@
-"""The engine of every study (`sweep`, `downstream`): jobs (`Job`), each with a folder of its own, that stand on their
-own and can be resumed, in this process or in workers; the machine. A job that fails does not stop the others."""
+"""Execution of studies (`sweep`, `downstream`): independent, resumable jobs (`Job`) with a folder each, in this process
+or in workers; description of the machine. A failed job does not stop the others."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from neeco.capture import Capture
 from neeco.raster.devices import device_of, readable_failures
 from neeco.raster.native import keep_freed_memory, set_threads, simd, threads
 
-CHECKPOINT_S = 60.0  # s that interrupted jobs get to write their checkpoints
-REMEDY = "give another --output"  # where a folder holds other work
-GO_ON = "run the same command again to go on, nothing finished is lost"
+CHECKPOINT_S = 60.0  # s, time for interrupted jobs to write their checkpoints
+REMEDY = "give another --output"  # if a folder has other content
+GO_ON = "run the same command again to continue; finished jobs are kept"
 
-JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], what is going on
-Result = dict[str, Any]  # what a job returns and writes; of a failed one its identity, "error" and empty "splits"
+JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", completed share in [0, 1], description
+Result = dict[str, Any]  # result that a job returns and writes; if it failed: identity, "error" and empty "splits"
 Reporter = Callable[[int, str, float, str], None]  # `JobProgress` of the job at an index
 Finisher = Callable[[int, Result], None]  # gets the result of the job at an index
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One job of a study. It stores what it finished in its folder, and finds it there when it is run again."""
+    """One job of a study. It stores its result in its folder, and reuses it when it is run again."""
 
     capture: Path
-    folder: Path  # that it writes
-    device: str = "auto"  # a word for `device_of`, opened where the job runs
+    folder: Path  # output folder
+    device: str = "auto"  # argument of `device_of`, opened in the job's process
 
     @property
     def title(self) -> str:
@@ -51,17 +51,17 @@ class Job:
         raise NotImplementedError
 
     def identity(self) -> dict[str, Any]:
-        """Return what distinguishes it from the other jobs; part of its result, whether it finishes or fails."""
+        """Return the description that distinguishes it from other jobs; part of its result, also if it fails."""
         raise NotImplementedError
 
     def check(self) -> Any:
-        """Raises NeecoError when it cannot be run, or its folder holds the work of another job."""
+        """Raise NeecoError if it cannot be run, or its folder has the result of another job."""
         raise NotImplementedError
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
-        """Do it, and return identity, "splits" (scores by split), "iterations" and whatever else it measures.
+        """Run it, and return identity, "splits" (scores by split), "iterations" and other measurements.
 
-        capture: its own, where it is read and checked already. Raises NeecoError.
+        capture: its capture, if already read and checked. Raises NeecoError.
         """
         raise NotImplementedError
 
@@ -81,8 +81,8 @@ class JobEvent:
 
 
 def check_output(output: Path, file: str, noun: str, **same: Any) -> None:
-    """Raise NeecoError when `output` is no folder, holds something else, or a study begun earlier whose `file` differs
-    from `same`. noun: name of the study, for messages."""
+    """Raise NeecoError if `output` is not a folder, has other content, or an earlier study whose `file` differs from
+    `same`. noun: name of the study, for messages."""
     stored = read_begun(output, file, resume=None, work=noun)
     if stored is not None:
         require_same(str(output / file), ((key, stored.get(key), same[key]) for key in same), REMEDY)
@@ -100,12 +100,11 @@ def run_jobs(
 ) -> list[Result]:
     """Run every job and return their results, in their order.
 
-    workers 1: in this process, one after another; more, or where RAY_ADDRESS names a cluster: so many at once in
-    processes of their own (so that a script needs `if __name__ == "__main__"`), a job whose worker dies again from its
-    checkpoint. record: gets all results known after each job; finished: those of earlier starts, by the job's place.
-    captures: those that are read already, by path. light: small jobs, which workers do one after another, sharing the
-    GPUs. Raises NeecoError before any work when a job's folder is another job's or the cluster does not answer, and
-    KeyboardInterrupt saying which job was stopped.
+    workers: 1: sequentially in this process; more, or with RAY_ADDRESS: that many parallel processes (scripts need
+    `if __name__ == "__main__"`), where a job whose worker dies is continued from its checkpoint. record: called with
+    all results after each job; finished: earlier results by job index. captures: already read captures by path. light:
+    small jobs, which reuse a worker and share GPUs. Raises NeecoError before any work if a job's folder belongs to
+    another job or the cluster does not respond, and KeyboardInterrupt naming the stopped job.
     """
     device = device_of(jobs[0].device if jobs else "cpu", drawing=False)
     check_workers(workers, device, light)
@@ -140,7 +139,7 @@ def run_jobs(
 
 
 def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
-    """`job.run`; a failure becomes its result. One that no user can cause leaves its traceback next to the folder."""
+    """Return the result of `job.run`, or its failure. Tracebacks of internal errors are written next to its folder."""
     record = job.folder.with_name(job.folder.name + ".error.txt")
     try:
         with readable_failures():
@@ -149,15 +148,15 @@ def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture 
         return _failed(job, " ".join(str(error).split()))
     except Exception as error:
         write_text(record, traceback.format_exc())
-        reason = " ".join(str(error).split()) or "no reason given"
+        reason = " ".join(str(error).split()) or "no message"
         return _failed(job, f"{type(error).__name__}: {reason}; see {record}")
     record.unlink(missing_ok=True)
     return result
 
 
 def check_workers(workers: int, device: torch.device, share_gpus: bool = False) -> None:
-    """Raises NeecoError for fewer than one, where a cluster is named and cannot be reached, or for more than have a GPU
-    of this machine each, where `device` is one and they do not share them."""
+    """Raise NeecoError for fewer than one worker, for an unreachable cluster, or for more workers than GPUs if `device`
+    is a GPU and they do not share it."""
     check_reachable(workers)
     if workers > 1 and device.type == "cuda" and not address():
         if device.index is not None:
@@ -167,8 +166,8 @@ def check_workers(workers: int, device: torch.device, share_gpus: bool = False) 
 
 
 def spread(values: Iterable[float | None]) -> dict[str, Any]:
-    """{"mean", "std", "n"} of the values that are known: their mean, sample standard deviation (None for fewer than
-    two values) and count."""
+    """Return {"mean", "std", "n"} of the finite values: mean, sample standard deviation (None for fewer than two
+    values) and count."""
     valid = [float(value) for value in values if value is not None and math.isfinite(value)]
     return {
         "mean": statistics.fmean(valid) if valid else None,
@@ -184,11 +183,11 @@ def _failed(job: Job, error: str) -> Result:
 def _run_in_workers(
     jobs: Sequence[Job], workers: int, device: torch.device, report: Reporter, finish: Finisher, *, light: bool
 ) -> list[Result]:
-    """`run_jobs` with `workers` jobs at once, each in a process of its own; light ones one after another in it.
+    """Run jobs as `run_jobs` in `workers` parallel processes, one process per job; light jobs reuse processes.
 
-    With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
-    device is opened in its worker, who sees one GPU, that no other has. On a cluster, whose machines may have GPUs that
-    this one lacks, each worker is given a GPU unless the jobs ask for the CPU.
+    With RAY_ADDRESS they run on that cluster, whose machines must have access to capture and output. A job's device is
+    opened in its worker, which sees one exclusive GPU. On a cluster, whose machines may have GPUs that this one lacks,
+    each worker gets a GPU unless the jobs request the CPU.
     """
     folders = [job.folder.absolute().parent for job in jobs]
     pool = Workers(
@@ -209,7 +208,7 @@ def _run_in_workers(
                 index, reason = event.index, event.value
                 running.add(index)
                 if event.stage in ("started", "died"):
-                    text = f"its worker died ({reason}); it goes on from its checkpoint" if reason else ""
+                    text = f"its worker died ({reason}); continuing from its checkpoint" if reason else ""
                     report(index, "training", 0.0, text)
                     continue
                 running.remove(index)
@@ -223,7 +222,7 @@ def _run_in_workers(
 
 
 def _run_in_worker(_: None, job: Job, threads: int) -> Result:
-    """Run the job in a worker with so many threads."""
+    """Run the job in a worker with this number of threads."""
     set_threads(threads)
     torch.set_num_threads(threads)
     keep_freed_memory()
@@ -231,17 +230,17 @@ def _run_in_worker(_: None, job: Job, threads: int) -> Result:
 
 
 def machine(device: torch.device, workers: int | None = None) -> dict[str, Any]:
-    """Processor, cores this process may use, threads, versions, and the GPU where `device` is one; of a study also its
-    `workers`, and the threads that each of several has."""
+    """Return processor, usable cores, threads, versions, and the GPU if `device` is one; for a study also `workers` and
+    their threads."""
     on_gpu = device.type == "cuda"
     share = threads_per_worker(workers) if workers is not None and workers > 1 else None
     try:
         processors = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
         processors = ""
-    named = re.search(r"^(?:model name|Model)[^:\n]*:(.*)$", processors, re.MULTILINE)
+    model = re.search(r"^(?:model name|Model)[^:\n]*:(.*)$", processors, re.MULTILINE)
     return {
-        "cpu": named[1].strip() if named else platform.processor() or platform.machine(),
+        "cpu": model[1].strip() if model else platform.processor() or platform.machine(),
         "cores": usable_cores(),
         "threads": threads(),
         "torch_threads": torch.get_num_threads(),
@@ -254,19 +253,19 @@ def machine(device: torch.device, workers: int | None = None) -> dict[str, Any]:
 
 
 def machine_words(machine: Mapping[str, Any], threads: str = "threads") -> str:
-    """The machine that a study's numbers were taken on. threads: the field that counts them where it had one worker."""
+    """Describe the machine of a study. threads: key of the thread count with one worker."""
     gpu = f"{machine['gpu']}, " if machine.get("gpu") else ""
     count = machine["threads_per_worker"] or machine[threads]
-    workers = f", {machine['workers']} at once" if machine["workers"] > 1 else ""
+    workers = f", {machine['workers']} in parallel" if machine["workers"] > 1 else ""
     cores = f"{machine['cpu']}, {machine['cores']} cores"
     return f"{gpu}{cores}, {counted(count, 'thread')}{workers}, torch {machine['torch']}"
 
 
 def threads_per_worker(workers: int) -> int:
-    """Each of `workers` gets its share of the cores, at least one thread."""
+    """Return the threads of each of `workers`: its share of the cores, at least one."""
     return max(1, usable_cores() // workers)
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

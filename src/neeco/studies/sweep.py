@@ -1,4 +1,4 @@
-"""`sweep`: configurations x seeds on one capture, each a job; one tidy table of scores, and what is read off it."""
+"""`sweep`: configurations x seeds on one capture, each a job; a tidy table of scores, and summary tables."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ SWEEP_FILE = "sweep.json"
 RESULTS_FILE = "results.csv"
 COLUMNS = ("configuration", "method", "seed", "split", "frames", *MEASURES, "error")
 SHARED = {"seed": "seeds", "iterations": "iterations", "minutes": "minutes", "transforms": "--transforms"}
-PRIMARY = "test"  # the split that published numbers are compared with, where there is one
+PRIMARY = "test"  # split that is compared with published numbers, if it exists
 Numbers = Mapping[str, Mapping[str, Any]]  # `study.spread` by configuration and measure, of one split
-Rows = Sequence[Mapping[str, Any]]  # of the tidy table: one for each configuration, seed and split, by COLUMNS
+Rows = Sequence[Mapping[str, Any]]  # rows of the tidy table: one per configuration, seed and split, by COLUMNS
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepPlan:
-    """A checked request, ready to work on."""
+    """A checked request, ready to run."""
 
     request: SweepRequest
     study: Study
@@ -51,8 +51,8 @@ class SweepPlan:
 
 
 def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) -> SweepPlan:
-    """Check everything that can be known before the work. source: the study's file, for messages. Raises NeecoError for
-    whatever cannot be trained or scored, and an output that holds something else."""
+    """Check a study before running it. source: the study's file, for messages. Raises NeecoError for configurations
+    that cannot be trained or scored, and an output with other content."""
     device = device_of(request.device)
     check_workers(request.workers, device)
     place = f"{source}: " if source else ""
@@ -71,13 +71,13 @@ def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) 
     capture = read_checked(request.capture, request.transforms)
     for name, config in configs.items():
         if need := unmet_need(config.method, capture):
-            raise NeecoError(f"{place}{name}: needs {need}, which {request.capture} has not; leave it out")
+            raise NeecoError(f"{place}{name}: needs {need}, missing in {request.capture}; remove this configuration")
     splits = held_out_splits(capture, request.splits)
     notes = []
     if not find_lpips(request.lpips_weights):
         notes.append(f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}")
     if study.seeds == 1:
-        notes.append("no ± is given: one seed has no standard deviation; give --seeds 2 or more")
+        notes.append("no standard deviations with one seed; give --seeds 2 or more")
     jobs = tuple(
         TrainingJob(
             name=name,
@@ -89,7 +89,7 @@ def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) 
             lpips_weights=request.lpips_weights,
             device=request.device,
         )
-        for seed in range(study.seeds)  # every configuration's first seed comes first: half of the runs show all
+        for seed in range(study.seeds)  # seeds in the outer loop, so that interim results include all configurations
         for name, config in configs.items()
     )
     same = {"schema": SCHEMA, "capture": str(request.capture.absolute()), "clock": jobs[0].clock}
@@ -105,8 +105,8 @@ def plan_sweep(request: SweepRequest, study: Study, source: Path | None = None) 
 
 
 def run_sweep(plan: SweepPlan, progress: Callable[[JobEvent], None] | None = None) -> Rows:
-    """Train and score every configuration on every seed, but what an earlier start finished; return the rows of the
-    tidy table. Writes sweep.json and, after each job, results.csv. A failed job has its reason in its rows."""
+    """Train and score every configuration on every seed, except jobs finished earlier; return the rows of the tidy
+    table. Writes sweep.json and, after each job, results.csv. The rows of a failed job have the reason."""
     output = plan.request.output
     with own_folder(output):
         files = {index: job.folder / JOB_FILE for index, job in enumerate(plan.jobs)}
@@ -120,7 +120,7 @@ def run_sweep(plan: SweepPlan, progress: Callable[[JobEvent], None] | None = Non
                 for split in plan.splits
             ]
             write_text(output / RESULTS_FILE, csv_text(COLUMNS, rows))
-            made = {  # how the results were made
+            made = {  # description of the study
                 "schema": SCHEMA,
                 "version": __version__,
                 "capture": str(plan.request.capture.absolute()),
@@ -141,13 +141,13 @@ def run_sweep(plan: SweepPlan, progress: Callable[[JobEvent], None] | None = Non
 
 
 def failures(rows: Rows) -> list[str]:
-    """Return `name, seed k: why` of every job that failed."""
+    """Return `name, seed k: reason` of every failed job."""
     failed = [f"{row['configuration']}, seed {row['seed']}: {row['error']}" for row in rows if row.get("error")]
     return list(dict.fromkeys(failed))
 
 
 def config_of(request: SweepRequest, study: Study, name: str, place: str, methods: Mapping[str, str]) -> TrainConfig:
-    """Return the settings of a configuration: those of the study, its own, then those of --set. place: of the study,
+    """Return the settings of a configuration: of the study, of the configuration, then of --set. place: of the study,
     for messages; methods: by configuration. Raises NeecoError naming the field of the study, or --set."""
     configuration, where = study.configurations[name], f"{place}configurations.{name}"
     key, length = study.length_of(name)
@@ -155,7 +155,7 @@ def config_of(request: SweepRequest, study: Study, name: str, place: str, method
     if key != "iterations":
         values |= {"minutes": length, "iterations": UNLIMITED}
     settings: list[str] = []
-    given_in: dict[str, str] = {}  # where a field is set last, for messages
+    origins: dict[str, str] = {}  # last origin of each field, for messages
     for origin, of_all, group in (
         (f"{place}settings: ", True, study.settings),
         (f"{where}.settings: ", False, configuration.settings),
@@ -164,19 +164,19 @@ def config_of(request: SweepRequest, study: Study, name: str, place: str, method
         for setting in group:
             field, _ = name_and_value(origin.removesuffix(": ").strip(), setting, "ssim_weight=0.2")
             if field in SHARED:
-                raise NeecoError(f"{origin}{field}: give {SHARED[field]}, which all runs share")
+                raise NeecoError(f"{origin}{field}: must be the same for all runs; use {SHARED[field]} instead")
             if of_all and not any(_has(method, field) for method in methods.values()):
                 method_names = ", ".join(dict.fromkeys(methods.values()))
-                raise NeecoError(f"{origin}{field}: no such field in the methods {method_names}")
+                raise NeecoError(f"{origin}{field}: no such field in the methods {method_names}; correct the name")
             if not of_all or _has(methods[name], field):
                 settings.append(setting)
-                given_in[field] = origin
+                origins[field] = origin
     try:
         return training_config(configuration.method, values, settings)
     except NeecoError as error:
         option, colon, problem = str(error).partition(":")
         field = option.removeprefix("--set ").removeprefix("--").replace("-", "_")
-        raise NeecoError(f"{given_in.get(field, f'{where}: ')}{field}{colon}{problem}") from None
+        raise NeecoError(f"{origins.get(field, f'{where}: ')}{field}{colon}{problem}") from None
 
 
 def _has(method: str, field: str) -> bool:
@@ -186,8 +186,8 @@ def _has(method: str, field: str) -> bool:
 
 
 def tables_of(plan: SweepPlan, rows: Rows) -> list[tuple[str, str, ResultTable]]:
-    """Return (name, split, numbers) of the study's tables: one with published numbers for the primary split alone, the
-    others for each split; at last ("", "", the cost of the runs)."""
+    """Return (name, split, numbers) of the study's tables: tables with published numbers for the primary split only,
+    others for each split; finally ("", "", the cost of the runs)."""
     study, splits = plan.study, plan.splits
     finished = {row["configuration"] for row in rows if not row.get("error")}
     reasons = {row["configuration"]: row["error"] for row in rows if row["configuration"] not in finished}
@@ -218,15 +218,15 @@ def tables_of(plan: SweepPlan, rows: Rows) -> list[tuple[str, str, ResultTable]]
 
 
 def direction(ours: float | None, published: float, even: float) -> str:
-    """Compare the signs of two differences: "yes", "no", "even" where ours is below `even`, UNKNOWN."""
+    """Compare the signs of two differences: "yes", "no", "even" if ours is below `even`, or UNKNOWN."""
     if ours is None:
         return UNKNOWN
     return "even" if abs(ours) < even else "yes" if (ours > 0) == (published > 0) else "no"
 
 
 def _differences(title: str, table: Table, numbers: Numbers, reasons: Mapping[str, str], even: float) -> ResultTable:
-    """Means with their differences to the reference; of a measure with published numbers also these, and whether both
-    differ in the same direction."""
+    """Return means with differences to the reference; for measures with published numbers also these, and whether both
+    differences have the same sign."""
     reference = str(table.reference)
     columns: list[Column] = []
     cells: dict[str, list[Cell]] = {name: [] for name in table.rows}
@@ -235,19 +235,19 @@ def _differences(title: str, table: Table, numbers: Numbers, reasons: Mapping[st
         titles = [f"{column.title}: published", "ours", "agrees"] if published else [column.title]
         columns += [Column(column.key, text) for text in titles]
         base = numbers[reference][column.key]["mean"]
-        limit = even if "psnr" in column.key else 0.0  # which is in dB
+        limit = even if "psnr" in column.key else 0.0  # `even` is in dB
         for name in table.rows:
             mean, std = (numbers[name][column.key][part] for part in ("mean", "std"))
             change = None if name == reference or mean is None or base is None else mean - base
             text = UNKNOWN if mean is None else column.written(mean)
             text += "" if std is None else f" ± {column.written(std)}"
             text += "" if change is None else f" ({change * column.scale:+.{column.digits}f})"
-            words = [text]
+            texts = [text]
             if published:
                 both = name != reference and {name, reference} <= published.keys()
                 agrees = direction(change, published[name] - published[reference], limit) if both else ""
-                words = [column.written(published[name]) if name in published else UNKNOWN, text, agrees]
-            cells[name] += map(Cell, words)
+                texts = [column.written(published[name]) if name in published else UNKNOWN, text, agrees]
+            cells[name] += map(Cell, texts)
     rows = tuple(
         Row((row.label or name,), tuple(cells[name]), reasons.get(name), reference=name == reference)
         for name, row in table.rows.items()
@@ -256,7 +256,7 @@ def _differences(title: str, table: Table, numbers: Numbers, reasons: Mapping[st
 
 
 def length_words(study: Study) -> str:
-    """Return the length of the runs and the number of seeds, in words."""
+    """Return the length of the runs and the number of seeds, as text."""
     lengths = dict.fromkeys(study.length_of(name) for name in study.configurations)
     each = " or ".join(f"{value:,g} {key.replace('cpu_', 'CPU ')}" for key, value in lengths)
     return f"{each} each, {counted(study.seeds, 'seed')}"

@@ -1,4 +1,4 @@
-"""Result tables of every study: CSV of numbers in full, and rounded tables for the terminal and pages."""
+"""Result tables of studies: CSV of unrounded numbers, and rounded tables for the terminal and pages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Better = Literal["high", "low", None]
 
 @dataclass(frozen=True)
 class Column:
-    """One number of a table: its key among the results, its title, how it is written, and which way is better."""
+    """One column of a table: its key in the results, title, format, and direction of improvement."""
 
     key: str
     title: str
@@ -21,18 +21,18 @@ class Column:
     scale: float = 1.0
 
     def written(self, value: float) -> str:
-        """`value` as the table shows it."""
+        """Return `value` formatted for the table."""
         return f"{value * self.scale:,.{self.digits}f}"
 
     @property
     def heading(self) -> str:
-        """The title with an arrow that says which way is better."""
+        """The title with an arrow in the direction of improvement."""
         return self.title + {"high": " ↑", "low": " ↓", None: ""}[self.better]
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One entry as text, ± its standard deviation where known, and whether it is the best of its column."""
+    """One entry as text, its standard deviation if known, and whether it is the best of its column."""
 
     text: str
     std: str = ""
@@ -49,12 +49,12 @@ class Row:
     keys: tuple[str, ...]
     cells: tuple[Cell, ...]
     failed: str | None = None
-    reference: bool = False  # what the others are measured against
+    reference: bool = False  # whether the others are compared with it
 
 
 @dataclass(frozen=True)
 class ResultTable:
-    """A titled table: `keys` heads the columns that say what a row is, the numbers' columns follow."""
+    """A table with a title: columns `keys` identify a row, columns of numbers follow."""
 
     title: str
     keys: tuple[str, ...]
@@ -65,9 +65,9 @@ class ResultTable:
 def summary_table(
     title: str, key: str, columns: Sequence[Column], rows: Sequence[tuple[str, Mapping[str, Any], str | None]]
 ) -> ResultTable:
-    """Mean ± standard deviation by row (its key, its numbers by column as `study.spread` gives them, the reason for
-    their absence) and column. Columns that no row has a number for are left out; means that are best as they are
-    written are marked, where there are several."""
+    """Return mean ± standard deviation by row (key, numbers by column from `study.spread`, reason of failure) and
+    column. Columns without any number are left out; the best means, as displayed, are marked if there are several
+    rows."""
     used, best = [], {}
     for column in columns:
         means = [numbers[column.key]["mean"] for _, numbers, _ in rows if _has(numbers, column)]
@@ -92,7 +92,7 @@ def _has(numbers: Mapping[str, Any], column: Column) -> bool:
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """CSV with a header line, unrounded; None and what a row lacks are empty, what the columns lack is left out."""
+    """Return CSV with a header line, unrounded; missing values are empty, other keys than the columns are ignored."""
     import pandas
 
     table = pandas.DataFrame(list(rows), columns=list(columns), dtype=object)

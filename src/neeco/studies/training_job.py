@@ -1,4 +1,4 @@
-"""One configuration trained with one seed and scored: a job of a sweep, which can be resumed."""
+"""One configuration trained with one seed and scored: a resumable job of a sweep."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from neeco.training.train import ProgressRow, train
 JOB_SCHEMA = "neeco-job/2"
 JOB_FILE = "job.json"  # the result of a finished job
 CURVE_FILE = "curve.jsonl"  # held-out PSNR over the training
-CHECKPOINTS = {"psnr_at_20": 0.2, "psnr_at_40": 0.4, "psnr_at_60": 0.6}  # of the run: the paper's 4k, 8k, 12k steps
+CHECKPOINTS = {"psnr_at_20": 0.2, "psnr_at_40": 0.4, "psnr_at_60": 0.6}  # shares of a run: the paper's 4k, 8k, 12k
 CLOCKS: dict[str, Callable[[], float]] = {"wall": time.monotonic, "processor": time.process_time}
 ANEW = f"{REMEDY}, or remove that run's folder"
 SPLIT_SCORES = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou", "mask_dice", "frames")
-# how files must look, for `require_like`
+# expected structure of files, for `require_like`
 RESULT = {"name": str, "method": str, "seed": int, "iterations": int, "seconds": (float, None), "fps": float}
 RESULT |= {"num_gaussians": (int, None), "phase_1_psnr": (float, None), "lpips_networks": [str]}
 RESULT |= {"splits": {str: dict.fromkeys((*SPLIT_SCORES, *CHECKPOINTS), (float, None))}}
@@ -47,23 +47,23 @@ CURVE_ROW = {"iteration": int, "seconds": float, "progress": float, "split": str
 
 @dataclass(frozen=True)
 class CurveSettings:
-    """Held-out PSNR over a training."""
+    """Settings of the curve of held-out PSNR over a training."""
 
-    shares: tuple[float, ...] = tuple(step / 10 for step in range(1, 11))  # shares of the run that have a point
-    frames: int = 4  # number of evenly spaced frames of each split: the whole split is scored at the end
-    late: float = 0.75  # share of phase 1 from which its training PSNR counts
+    shares: tuple[float, ...] = tuple(step / 10 for step in range(1, 11))  # shares of the run with a point
+    frames: int = 4  # number of evenly spaced frames per split; the complete split is scored at the end
+    late: float = 0.75  # share of phase 1 from which its training PSNR is averaged
 
 
 CURVE = CurveSettings()
-FIELD_CURVE = CurveSettings(shares=(0.2, 0.6, 1.0), frames=2)  # a field takes seconds for an image
+FIELD_CURVE = CurveSettings(shares=(0.2, 0.6, 1.0), frames=2)  # a field renders an image in seconds
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingJob(Job):
-    """One run to train and score. `config`: with its seed and its length, in iterations or in minutes on `clock`, which
-    is the time that passes ("wall") or CPU time of all threads of the process ("processor").
+    """One run to train and score. config: with seed and length, in iterations or in minutes of `clock`: elapsed time
+    ("wall") or CPU time of all threads of the process ("processor").
 
-    splits: those to score (None: all but `train`). `folder` becomes a run folder with the job's files in it.
+    splits: to score (None: all but `train`). `folder` becomes a run folder with the job's files.
     """
 
     name: str
@@ -78,32 +78,32 @@ class TrainingJob(Job):
         return f"{self.name}, seed {self.config.seed}"
 
     def identity(self) -> dict[str, Any]:
-        """Return what distinguishes it from the other jobs."""
+        """Return the description that distinguishes it from other jobs."""
         return {"name": self.name, "method": self.config.method, "seed": self.config.seed}
 
     def check(self) -> None:
-        """Raises NeecoError when the folder holds a run of other settings, another capture or another length."""
+        """Raise NeecoError if the folder has a run with other settings, capture or length."""
         if not (self.folder / "config.yaml").exists():
             return
         stored = read_config(self.folder)
         require_same(str(self.folder), [("capture", stored["capture"], str(self.capture.absolute()))], REMEDY)
         try:
-            begun, wanted = stored_config(self.folder, stored), self.config
+            begun, requested = stored_config(self.folder, stored), self.config
         except NeecoError as error:  # of another version
             raise NeecoError(f"{str(error).removesuffix('; train again')}; {REMEDY}") from None
-        if begun.method == wanted.method:
-            resolved = method_class(wanted.method).resolved(wanted.deformation, begun.deformation)
-            wanted = replace(wanted, deformation=resolved)
-        old, new = vars(begun), vars(wanted)
-        # minutes first: with these, iterations are without a limit
+        if begun.method == requested.method:
+            resolved = method_class(requested.method).resolved(requested.deformation, begun.deformation)
+            requested = replace(requested, deformation=resolved)
+        old, new = vars(begun), vars(requested)
+        # minutes first, because iterations are unlimited with them
         names = sorted(new, key=lambda name: name != "minutes")
         require_same(str(self.folder), ((name, old[name], new[name]) for name in names), REMEDY)
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
-        """Train, score, write `folder`/job.json last, and return what it holds; at once when it is there already.
+        """Train, score, write `folder`/job.json last, and return its content; only read it if it exists already.
 
-        A begun training goes on from its checkpoint. A finished one is only scored again when other splits or LPIPS
-        networks are requested. capture: the job's, where it is read and checked already. Raises NeecoError.
+        An interrupted training continues from its checkpoint. A finished one is only scored again for other splits or
+        LPIPS networks. capture: the job's capture, if already read and checked. Raises NeecoError.
         """
         report = progress or (lambda stage, share, text: None)
         self.check()
@@ -142,7 +142,7 @@ class TrainingJob(Job):
         return result
 
     def _train(self, capture: Capture, splits: Sequence[str], device: torch.device, report: JobProgress) -> None:
-        """Train or go on training, with the curve."""
+        """Train or continue training, and record the curve."""
         field = not method_class(self.config.method).has_gaussians
         curve = Curve(self.folder / CURVE_FILE, capture, splits, field=field)
 
@@ -165,19 +165,19 @@ class TrainingJob(Job):
 
 
 def read_result(file: Path) -> Result:
-    """Return what a finished job wrote. Raises NeecoError when the file is damaged."""
+    """Return the result of a finished job. Raises NeecoError if the file is damaged."""
     return dict(require_like(read_json(file), RESULT, str(file), ANEW))
 
 
 def read_rows(file: Path, like: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the rows of a run's curve.jsonl or metrics.jsonl; none where it ended before it wrote the first. Raises
-    NeecoError for a file that is damaged."""
+    """Return the rows of a run's curve.jsonl or metrics.jsonl; [] if it does not exist. Raises NeecoError for a damaged
+    file."""
     return read_json_lines(file, like, "one JSON object per line", ANEW) if file.exists() else []
 
 
 def phase_1_psnr(folder: Path) -> float | None:
-    """Mean training PSNR (dB) over the rows of metrics.jsonl in the last quarter of phase 1, its last row at least;
-    None when phase 1, or the whole run, was shorter than a row (50 steps)."""
+    """Return the mean training PSNR (dB) over the rows of metrics.jsonl in the last quarter of phase 1, at least its
+    last row; None if phase 1, or the run, was shorter than a row (50 steps)."""
     rows = read_rows(folder / "metrics.jsonl", {"iteration": int, "phase": int, "psnr": float})
     rows = [row for row in rows if row["phase"] == 1]
     late = [row["psnr"] for row in rows if row["iteration"] > CURVE.late * rows[-1]["iteration"]]
@@ -185,14 +185,14 @@ def phase_1_psnr(folder: Path) -> float | None:
 
 
 def psnr_at(curve: Sequence[Mapping[str, Any]], split: str, share: float) -> float | None:
-    """Held-out PSNR (dB) when `share` of the run was done; None where the curve has no row so near as 5 % of it."""
+    """Return the held-out PSNR (dB) at `share` of the run; None if the curve has no row within 5 % of it."""
     rows = [row for row in curve if row["split"] == split and abs(row["progress"] - share) < 0.05]
     return min(rows, key=lambda row: abs(row["progress"] - share))["psnr"] if rows else None
 
 
 class Curve:
-    """Held-out PSNR over a training, in curve.jsonl: of a few frames of every split, fewer where a `field` is rendered.
-    Seconds are those of the session, all starts together, without those of rendering the frames."""
+    """Held-out PSNR over a training, in curve.jsonl, for a few frames of every split, fewer for a `field`. Seconds are
+    the session's, summed over starts, without the rendering of these frames."""
 
     def __init__(self, file: Path, capture: Capture, splits: Sequence[str], *, field: bool = False) -> None:
         self.file = file
@@ -205,8 +205,8 @@ class Curve:
             self.frames[split] = [(frame, frame.load_image(), frame.load_mask()) for frame in chosen]
 
     def after_step(self, session: Session) -> None:
-        """Score the frames where a point of the curve is due. Rows of an earlier start that lie behind its checkpoint
-        belong to steps that are done again: they are dropped."""
+        """Score the frames if a point of the curve is due. Rows of an earlier start after its checkpoint are dropped,
+        because these steps are repeated."""
         if self.rows is None:
             self.rows = [row for row in read_rows(self.file, CURVE_ROW) if row["iteration"] < session.iteration]
             reached = max((row["progress"] for row in self.rows), default=0.0)
@@ -221,7 +221,7 @@ class Curve:
 
     @torch.no_grad()
     def score(self, scene: DrawableScene, split: str) -> float | None:
-        """Mean PSNR of a split, dB; None when it is no number. Random states are left as they were."""
+        """Return the mean PSNR of a split, dB; None if it is not finite. Random states are preserved."""
         with torch.random.fork_rng(devices=[]):
             frames = self.frames[split]
             values = [psnr(draw(scene, frame.state, frame.camera).image, image, mask) for frame, image, mask in frames]

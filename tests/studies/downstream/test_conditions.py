@@ -37,7 +37,7 @@ def test_a_condition_is_a_sum_of_words() -> None:
         ("Real", "'Real' is neither"),
         ("", "'' is neither"),
         ("real+", "'' is neither"),
-        *((name, "real or a set is needed") for name in ("real+real", "strong", "real+permuted", "kin+paste")),
+        *((name, "requires real or a set") for name in ("real+real", "strong", "real+permuted", "kin+paste")),
     ],
 )
 def test_conditions_that_say_nothing_are_refused(name: str, told: str) -> None:
@@ -58,9 +58,9 @@ def test_usual_conditions_are_baselines_and_each_set_alone_beside_labelled_frame
 def test_counts_of_labelled_frames_are_numbers_or_all() -> None:
     assert [labelled_count(word, 30) for word in ("0", "7", "30", "all")] == [0, 7, 30, 30]
     for word in ("-1", "half", "1.5", ""):
-        with pytest.raises(NeecoError, match=r"--num-real: .* neither a number of labelled frames nor all"):
+        with pytest.raises(NeecoError, match=r"--num-real: .* is invalid; give a number of labelled frames, or all"):
             labelled_count(word, 30)
-    with pytest.raises(NeecoError, match="31 labelled frames are asked for, the capture has 30; use all"):
+    with pytest.raises(NeecoError, match=r"must be at most 30, the labelled frames \(got 31\); use all"):
         labelled_count("31", 30)
 
 

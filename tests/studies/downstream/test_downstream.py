@@ -271,13 +271,13 @@ def test_interrupted_it_goes_on_to_the_same_numbers(stopped, spec, tmp_path):
 def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamRequest) -> None:
     def fails(event: JobEvent) -> None:
         if event.stage == "training" and failing in (event.index, "all"):
-            raise NeecoError("pixels: its loss is not finite at step 3;\n  begin anew")
+            raise NeecoError("pixels: loss is not finite at step 3;\n  begin anew")
 
     result = trained(replace(spec, num_real=("0", "6")), fails)
     failed = [index for index, job in enumerate(result["jobs"]) if "error" in job]
     assert failed == (list(range(6)) if failing == "all" else [failing])
     job = result["jobs"][failed[0]]
-    assert job["error"] == "pixels: its loss is not finite at step 3; begin anew"
+    assert job["error"] == "pixels: loss is not finite at step 3; begin anew"
     assert job["splits"] == {}
     assert len(failed_jobs(result)) == len(failed)
     reasons = {row.failed for table in tables_of(result) for row in table.rows}
@@ -325,7 +325,7 @@ def test_a_folder_that_is_anothers_is_refused(spec: DownstreamRequest, capture: 
         plan_downstream(replace(small, capture=capture))
     for text, reason in (
         ('{"schema": "else"}', "schema: begun with 'else'"),
-        ("[]", "not as neeco writes it; use a new folder"),
+        ("[]", "not in neeco's format; use a new folder"),
     ):
         (spec.output / "downstream.json").write_text(text)
         with refused(f"downstream.json: {reason}"):
@@ -341,20 +341,20 @@ def test_a_folder_that_is_anothers_is_refused(spec: DownstreamRequest, capture: 
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"models": ()}, "--models: none is given"),
+        ({"models": ()}, "--models: missing"),
         ({"splits": ("train",)}, "--splits: train: "),
         ({"capture": Path("/nowhere")}, "/nowhere"),
         (
             {"num_real": ("6",), "conditions": ("kin",)},
-            "--num-real: leaves nothing to train kin on; add 0 for sets alone",
+            "--num-real: condition kin has no training data; add 0 for sets alone",
         ),
         (
             {"num_real": ("0",), "conditions": ("real",)},
-            "--num-real: leaves nothing to train real on; add 0 for sets alone, a number for real",
+            "--num-real: condition real has no training data; add 0 for sets alone, a number for real",
         ),
         (
             {"num_real": ("6",), "conditions": ("real", "kin")},
-            "--num-real: leaves nothing to train kin on; add 0 for sets alone",
+            "--num-real: condition kin has no training data; add 0 for sets alone",
         ),
     ],
 )
@@ -367,12 +367,12 @@ def test_what_cannot_be_done_is_refused(spec: DownstreamRequest, change, told: s
 @pytest.mark.parametrize("name", ["real", "paste", "a+b", "../up"])
 def test_names_that_mean_something_or_stand_twice_are_refused(name, spec, capture):
     data = spec.sets[0].replace("kin", name, 1)
-    with refused(f"--sets {name}: reserved, not usable in file names, or given twice"):
+    with refused(f"--sets {name}: reserved, duplicate, or not a valid file name"):
         plan_downstream(replace(replace(spec, conditions=()), sets=(data,)))
     with refused("--sets kin: ", "choose another name"):
         plan_downstream(replace(spec, sets=spec.sets * 2))
-    for test in ("test", "a/b", ""):
-        with refused(f"--test {test}: ", "is a split's name or no file name", "choose another"):
+    for test, problem in (("test", "name of a split"), ("a/b", "not a valid file name"), ("", "not a valid file name")):
+        with refused(f"--test {test}: ", problem, "choose another"):
             plan_downstream(replace(spec, test=(f"{test}={capture}",)))
 
 
@@ -411,7 +411,7 @@ def test_labels_of_ones_own_are_taught_and_the_truth_is_tested(spec, tmp_path, r
 
 def test_a_model_that_lacks_something_or_sees_too_little_is_refused(spec) -> None:
     plan_downstream(replace(spec, models=("corners",)))
-    with refused("--models corners: its input of 24x16 px is too small; give a larger --size"):
+    with refused("--models corners: input of 24x16 px is too small; give a larger --size"):
         plan_downstream(replace(spec, models=("corners",), size=24))
     with refused("--models impatient: needs patience; pip install patience"):
         plan_downstream(replace(spec, models=("impatient",)))
@@ -427,7 +427,9 @@ def test_boxes_of_instruments_that_labels_do_not_tell_apart_are_refused(spec, ca
     two = replace(spec, capture=capture)
     plan_downstream(two)
     with refused(
-        "--models corners", "has several instruments, and labels do not tell them apart", "a model that predicts masks"
+        "--models corners",
+        "has several instruments, which the labels do not distinguish",
+        "a model that predicts masks",
     ):
         plan_downstream(replace(two, models=("corners",)))
 

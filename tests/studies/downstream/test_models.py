@@ -150,7 +150,7 @@ def test_a_loss_that_is_not_finite_is_told(tmp_path: Path) -> None:
         def loss(self, *given) -> Tensor:
             return super().loss(*given) * float("nan")
 
-    with pytest.raises(NeecoError, match="pixels: its loss is not finite at step 4"):
+    with pytest.raises(NeecoError, match="pixels: loss is not finite at step 4"):
         Diverging().fit(task_of(tmp_path))
     assert not (tmp_path / WEIGHTS_FILE).exists()
 
@@ -203,7 +203,7 @@ def test_a_unet_answers_at_its_inputs_size_for_any_channels() -> None:
 def test_models_are_found_by_their_names() -> None:
     assert list(find_models()) == ["dfine", "unet"]
     assert model_class("unet") is UNet
-    with pytest.raises(NeecoError, match=re.escape("--models: 'u-net' is unknown; choose of dfine, unet")):
+    with pytest.raises(NeecoError, match=re.escape("--models: 'u-net' is unknown; choose one of: dfine, unet")):
         model_class("u-net")
 
 

@@ -96,7 +96,7 @@ def test_of_annotated_frames_only_those_trained_on_are_learned_from(drawn: Path)
 
 
 def test_without_annotated_frames_of_split_train_or_their_splits_a_set_is_refused(drawn: Path) -> None:
-    with refused("--sets set", "has 0 images to learn from"):
+    with refused("--sets set", "has 0 training images"):
         loaded(annotated(drawn, ["test"] * 6))
     (drawn / "states.jsonl").write_text("[" * 100_000)
     with refused("states.jsonl: line 1: not valid JSON; annotate it again"):
@@ -124,14 +124,14 @@ def test_sets_that_cannot_be_read_are_refused(drawn: Path, tmp_path: Path) -> No
     (tmp_path / "empty" / "images").mkdir(parents=True)
     with refused("--sets set", "has 0 images", "neeco synthesize"):
         loaded(tmp_path / "empty")
-    with refused("--sets set", "has 6 images to learn from, not 7"):
+    with refused("--sets set", "has 6 training images, expected 7"):
         loaded(drawn, count=7)
     with refused("--sets set", "is not 60x50, as the capture's frames"):
         synthetic_samples(ImageSet("set", drawn), WHOLE, (60, 50))
     (drawn / "parts" / "000005.png").unlink()
     samples = synthetic_samples(ImageSet("set", drawn, 5), WHOLE, SIZE)
     assert [sample.name for sample in samples] == [f"{k:06d}" for k in range(5)]
-    with refused("--sets set", "000005.png", "every image needs its labels"):
+    with refused("--sets set", "000005.png", "every image needs labels"):
         loaded(drawn)
 
 
@@ -250,7 +250,7 @@ def test_black_and_white_labels_tell_no_parts(value: int, capture: Path, tmp_pat
 def test_labels_of_another_size_or_of_ids_that_mean_nothing_are_refused(capture: Path, tmp_path: Path) -> None:
     save_grey(tmp_path / "labels" / "001.png", np.full((20, 24), 255))
     (sample,) = recorded_samples(read_capture(capture), "train", "instrument", tmp_path / "labels")
-    with refused("001.png", "label the frames as recorded"):
+    with refused("001.png", "label the frames at recorded size"):
         sample.load()
     save_grey(capture / "truth" / "masks" / "002.png", np.full((40, 48), 7))
     samples = recorded_samples(read_capture(capture), "train", "instrument")

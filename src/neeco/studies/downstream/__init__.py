@@ -1,5 +1,5 @@
-"""Models trained on recorded and on synthetic images, tested on recorded frames; the request for it, which imports
-nothing heavy."""
+"""Models trained on recorded and on synthetic images, tested on recorded frames; here the request, without heavy
+imports."""
 
 from __future__ import annotations
 
@@ -21,64 +21,64 @@ if TYPE_CHECKING:
 class DownstreamRequest:
     """Train detectors and segmenters on recorded and on synthetic images, and test them on recorded frames.
 
-    Each model is trained from scratch in every condition, with as many steps, on the same labelled frames of a fold;
-    tests are frames of the other splits, and of other captures. Conditions are sums of words: `real`, names of sets,
-    `paste` (the labelled instruments over other backgrounds), `strong` (augmentation of everything), `permuted` (sets
-    with labels of other images, a control). The same command continues interrupted work; with more models, sets,
-    conditions or folds it adds them. Needs the extra `downstream`.
+    Each model is trained from scratch in every condition, with the same number of steps, on the same labelled frames of
+    a fold; test frames are from the other splits, and from other captures. Conditions are sums of: `real`, names of
+    sets, `paste` (labelled instruments over other backgrounds), `strong` (augmentation of all images), `permuted` (sets
+    with labels of other images, a control). The same command continues interrupted work; additional models, sets,
+    conditions or folds are added. Needs the extra `downstream`.
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
-    """Capture folder, with true masks of the frames to test on."""
+    """Capture folder, with true masks of the test frames."""
     output: Path
-    """Folder to write; absent, empty, or of this experiment begun earlier."""
+    """Folder to write; absent, empty, or of this experiment started earlier."""
     sets: tuple[str, ...] = ()
-    """NAME=DATASET, folders that `neeco synthesize` wrote; NAME=DATASET:COUNT takes its first COUNT images."""
+    """NAME=DATASET, folders written by `neeco synthesize`; NAME=DATASET:COUNT uses the first COUNT images."""
     models: tuple[str, ...] = ("unet",)
     """unet (a residual U-Net, masks), dfine (a small D-FINE, boxes)."""
     test: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """NAME=CAPTURE or CAPTURE, another recording with masks of the same kind of instrument to test on; repeatable."""
     num_real: tuple[str, ...] = ()
-    """How many recorded training frames are labelled: numbers or all; 0: sets alone. Default: 0 5 10 20 50 all."""
+    """Numbers of labelled recorded training frames, or all; 0: sets alone. Default: 0 5 10 20 50 all."""
     folds: int = 5
-    """Each takes other labelled frames and another seed; intervals are over folds and frames."""
+    """Number of folds, each with different labelled frames and seed; intervals are over folds and frames."""
     conditions: tuple[str, ...] = ()
     """Training data. Default: real, real+strong, real+paste, SET, SET+strong, SET+real, SET+real+permuted."""
     backgrounds: Path | None = None
-    """Folder of images without an instrument to paste over. Default: the labelled frames, instruments filled in."""
+    """Folder of images without instruments to paste over. Default: the labelled frames, instruments inpainted."""
     labels: Path | None = None
-    """Folder of masks named as the frames, for the recorded training frames. Default: the capture's truth."""
+    """Folder of masks of the recorded training frames, named as these. Default: the capture's ground truth."""
     classes: Literal["instrument", "parts"] = "instrument"
     """One class, or shaft, wrist and jaws."""
     splits: tuple[str, ...] = ()
     """Splits to test on. Default: all but train that have true masks."""
     steps: int | None = None
-    """Optimisation steps of every training. Default: the model's own."""
+    """Optimisation steps of every training. Default: the model's."""
     size: int | None = None
-    """Longer side in pixels of a model's input images; scores are at full size. Default: the model's own."""
+    """Longer side of a model's input images in pixels; scores are at full resolution. Default: the model's."""
     batch: int | None = None
-    """Images in a step. Default: the model's own."""
+    """Images per step. Default: the model's."""
     workers: int = 1
-    """Trainings at once, which share the GPUs; RAY_ADDRESS names a Ray cluster (needs the extra `cluster`)."""
+    """Parallel trainings, which share the GPUs; RAY_ADDRESS names a Ray cluster (needs the extra `cluster`)."""
     transforms: str = "transforms.json"
-    """Which transforms file of the capture to read."""
+    """Transforms file of the capture to read."""
     device: Device = "auto"
-    kept_fold: ClassVar[int] = 0  # whose weights and predictions are kept
+    kept_fold: ClassVar[int] = 0  # fold whose weights and predictions are stored
     default_counts: ClassVar[tuple[int, ...]] = (5, 10, 20, 50)  # of labelled frames trained on, besides all
-    write_every_s: ClassVar[float] = 30.0  # least s between two writings of the results so far, which are large
+    write_every_s: ClassVar[float] = 30.0  # minimum s between writing interim results, which are large
     parts_steps: ClassVar[float] = 2.5  # ratio of the steps for parts to the steps for one class
 
     @cached_property
     def image_sets(self) -> tuple[ImageSet, ...]:
-        """The sets. Raises NeecoError for words that cannot be understood."""
+        """The image sets. Raises NeecoError for invalid arguments."""
         from neeco.studies.downstream.samples import ImageSet
 
         return tuple(map(ImageSet.of, self.sets))
 
     @cached_property
     def tests(self) -> dict[str, Path]:
-        """Other captures by name; one without a name goes by that of its folder. Raises NeecoError for a name that
-        stands twice or cannot be that of a file."""
+        """Other captures by name, by default the folder's name. Raises NeecoError for a duplicate name, or one that
+        cannot be a file name."""
         tests: dict[str, Path] = {}
         for word in self.test:
             name, equals, place = word.partition("=")
@@ -86,14 +86,14 @@ class DownstreamRequest:
                 name, place = Path(word).resolve().name, word
             if name in ("", *tests) or {*name} & {"/", "\\"}:
                 raise NeecoError(
-                    f"--test {name}: is a split's name or no file name; choose another: --test NAME={place}"
+                    f"--test {name}: duplicate, or not a valid file name; choose another: --test NAME={place}"
                 )
             tests[name] = Path(place)
         return tests
 
     @property
     def all_tests(self) -> list[str]:
-        """Names of what is tested on: splits of the own capture, and other captures."""
+        """Names of all tests: splits of the capture, and other captures."""
         return [*self.splits, *self.tests]
 
     def job_folder(self, model: str, condition: str, real: int, fold: int) -> Path:

@@ -67,7 +67,7 @@ SCHEMA = "neeco-downstream/3"
 FILE, TABLE = "downstream.json", "downstream.csv"
 JOB_SCHEMA = "neeco-downstream-job/3"
 JOB_FILE = "job.json"
-PREFIX = "frame_"  # of the names of frames in files of predictions
+PREFIX = "frame_"  # of frame names in files of predictions
 
 
 def steps_of(request: DownstreamRequest, kind: type[TorchModel]) -> int:
@@ -81,8 +81,8 @@ def input_of(request: DownstreamRequest, kind: type[TorchModel], frame: tuple[in
 
 
 def held_out_samples(request: DownstreamRequest, capture: Capture, test: str) -> tuple[RecordedSample, ...]:
-    """Return the frames of a test: all with truth of the other capture of that name, else of a split of the own one.
-    Raises NeecoError."""
+    """Return the frames of a test: all frames with ground truth of the other capture of that name, else of a split of
+    `capture`. Raises NeecoError."""
     if test in request.tests:
         return recorded_samples(_read(request.tests[test], "transforms.json"), None, request.classes)
     return recorded_samples(capture, test, request.classes)
@@ -90,17 +90,17 @@ def held_out_samples(request: DownstreamRequest, capture: Capture, test: str) ->
 
 @dataclass(frozen=True, kw_only=True)
 class DownstreamJob(Job):
-    """One training. real: how many recorded frames are labelled."""
+    """One training. real: number of labelled recorded frames."""
 
     request: DownstreamRequest
     model: str
     condition: Condition
-    real: int  # 0 where the condition has none
+    real: int  # 0 if the condition has none
     fold: int
 
     @property
     def title(self) -> str:
-        """Model, condition, labelled frames and fold, as a person reads them."""
+        """Model, condition, labelled frames and fold, for display."""
         labelled = f", {self.real} labelled" if self.real else ""
         return f"{self.model}, {self.condition.name}{labelled}, fold {self.fold}"
 
@@ -110,7 +110,7 @@ class DownstreamJob(Job):
         return [data for data in self.request.image_sets if data.name in self.condition.sets]
 
     def identity(self) -> dict[str, Any]:
-        """Return the description that a folder must match to be this job's, with the keys of job.json."""
+        """Return the description that identifies this job's folder, with the keys of job.json."""
         request, kind = self.request, model_class(self.model)
         backgrounds = request.backgrounds if PASTE in self.condition else None
         return {
@@ -130,8 +130,8 @@ class DownstreamJob(Job):
         }
 
     def check(self) -> dict[str, Any] | None:
-        """Return the result of an earlier start; None where there is none of all tests. Raises NeecoError when the
-        folder holds another job's result, or a test of another capture by this name."""
+        """Return the result of an earlier start; None unless it has all tests. Raises NeecoError if the folder has
+        another job's result, or a test of this name on another capture."""
         file = self.folder / JOB_FILE
         if not file.exists():
             return None
@@ -144,12 +144,12 @@ class DownstreamJob(Job):
         return dict(stored) if set(self.request.all_tests) <= set(stored["splits"]) else None
 
     def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
-        """Train, test, write `folder`/job.json last, and return what it holds; at once when it is there already."""
+        """Train, test, write `folder`/job.json last, and return its content; only read it if it exists already."""
         if (earlier := self.check()) is not None:
             return earlier
         report = progress or (lambda stage, share, text: None)
         report("training", 0.0, "")
-        cv2.setNumThreads(torch.get_num_threads())  # else every worker takes all cores
+        cv2.setNumThreads(torch.get_num_threads())  # otherwise every worker uses all cores
         capture = capture or _read(self.capture, self.request.transforms)
         started = time.monotonic()
         task = replace(self.task(capture), progress=lambda share, text: report("training", share, text))
@@ -170,14 +170,14 @@ class DownstreamJob(Job):
         return result
 
     def labelled(self, capture: Capture) -> list[RecordedSample]:
-        """The labelled frames."""
+        """Return the labelled frames."""
         if REAL not in self.condition:
             return []
         recorded = recorded_samples(capture, "train", self.request.classes, self.request.labels)
         return [recorded[index] for index in labelled_frames(len(recorded), self.real, self.fold)]
 
     def task(self, capture: Capture) -> TrainingTask:
-        """Return the training task. Its images depend on the fold, their order on nothing else."""
+        """Return the training task. Images and their order depend only on the fold."""
         request, kind, labelled = self.request, model_class(self.model), self.labelled(capture)
         size = frame_size(labelled or recorded_samples(capture, request.splits[0], request.classes))
         names = class_names(capture, request.classes)
@@ -200,7 +200,7 @@ class DownstreamJob(Job):
         )
 
     def _test(self, predict: Predict, test: str, capture: Capture) -> dict[str, Any]:
-        """Scores on one split or capture; the predictions of one fold are stored for pictures."""
+        """Return the scores on one split or capture; the predictions of `kept_fold` are stored for figures."""
         names = class_names(capture, self.request.classes)
         samples = held_out_samples(self.request, capture, test)
         truth = [CACHE.load(sample) for sample in samples]
@@ -222,8 +222,8 @@ class DownstreamJob(Job):
 
 
 def write_predictions(job: Path, test: str, names: Sequence[str], predictions: Sequence[Prediction]) -> None:
-    """Write a job's predictions for a test by the frames' names: masks uint8 [H, W], or boxes [n, 6] (x0, y0, x1, y1,
-    class, score)."""
+    """Write a job's predictions for a test by frame name: masks uint8 [H, W], or boxes [n, 6] (x0, y0, x1, y1, class,
+    score)."""
     arrays = {
         PREFIX + name: np.column_stack([prediction.boxes, prediction.classes, prediction.scores])
         if isinstance(prediction, Detections)
@@ -237,7 +237,7 @@ def write_predictions(job: Path, test: str, names: Sequence[str], predictions: S
 
 
 def read_predictions(job: Path, test: str) -> dict[str, Prediction]:
-    """Return what `write_predictions` wrote; nothing where there is no file."""
+    """Return the predictions written by `write_predictions`; {} if there is no file."""
     path = job / "predictions" / f"{test}.npz"
     if not path.is_file():
         return {}
@@ -251,7 +251,7 @@ def read_predictions(job: Path, test: str) -> dict[str, Prediction]:
 
 @lru_cache(maxsize=8)
 def _read(path: Path, transforms: str) -> Capture:
-    """A capture, once for all jobs of this process."""
+    """Read a capture, cached for all jobs of this process."""
     return read_capture(path, transforms)
 
 
@@ -259,7 +259,7 @@ def _read(path: Path, transforms: str) -> Capture:
 class DownstreamPlan:
     """A checked request, ready to run."""
 
-    request: DownstreamRequest  # with the splits that are tested
+    request: DownstreamRequest  # with the test splits
     capture: Capture
     jobs: tuple[DownstreamJob, ...]
     images: Mapping[str, int]  # of each set
@@ -268,17 +268,17 @@ class DownstreamPlan:
 
 
 def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
-    """Check everything that can be checked before training. Raises NeecoError for an invalid request."""
+    """Check a request before training. Raises NeecoError if it is invalid."""
     for option in ("folds", "steps", "size", "batch"):
         if (value := getattr(request, option)) is not None and value < 1:
             raise NeecoError(f"--{option} must be at least 1 (got {value})")
     check_workers(request.workers, device_of(request.device, drawing=False), share_gpus=True)
     if not request.models:
-        raise NeecoError("--models: none is given; name at least one")
+        raise NeecoError("--models: missing; give at least one")
     names = [data.name for data in request.image_sets]
     for name in names:
         if name in ("", *RESERVED) or {*name} & set("+/\\") or names.count(name) > 1:
-            raise NeecoError(f"--sets {name}: reserved, not usable in file names, or given twice; choose another name")
+            raise NeecoError(f"--sets {name}: reserved, duplicate, or not a valid file name; choose another name")
     if request.backgrounds is not None:
         background_files(request.backgrounds)
     words = dict.fromkeys(request.conditions or default_conditions(names))
@@ -291,7 +291,7 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
     images = {data.name: len(synthetic_samples(data, classes, size)) for data in request.image_sets}
     for name, path in request.tests.items():
         if name in capture.splits:
-            raise NeecoError(f"--test {name}: is a split's name or no file name; choose another: --test NAME={path}")
+            raise NeecoError(f"--test {name}: is the name of a split; choose another: --test NAME={path}")
         other = read_checked(path, "transforms.json")
         if class_names(other, request.classes) != classes:
             raise NeecoError(f"--test {name}: {path} has other parts than {capture.root}; use --classes instrument")
@@ -302,9 +302,9 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
         labelled_count(word, 10**9)
     if any(REAL in condition for condition in conditions) and set(request.num_real or "all") != {"0"}:
         labelled = len(recorded_samples(capture, "train", request.classes, request.labels))
-        usual = (str(count) for count in request.default_counts if count < labelled)
-        wanted = request.num_real or ("0", *usual, "all")
-        counts = sorted({labelled_count(word, labelled) for word in wanted})
+        defaults = (str(count) for count in request.default_counts if count < labelled)
+        requested = request.num_real or ("0", *defaults, "all")
+        counts = sorted({labelled_count(word, labelled) for word in requested})
     jobs = tuple(
         DownstreamJob(
             capture=request.capture,
@@ -316,7 +316,7 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
             real=real,
             fold=fold,
         )
-        for fold in range(request.folds)  # the first fold of everything comes first: results halfway are of all
+        for fold in range(request.folds)  # folds in the outer loop, so that interim results include all conditions
         for model in request.models
         for condition in conditions
         for real in counts
@@ -324,10 +324,10 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
     )
     trained = {job.condition.name for job in jobs}
     if missing := [item.name for item in conditions if item.name not in trained and (request.conditions or not jobs)]:
-        problem = f"leaves nothing to train {missing[0]} on"
+        problem = f"condition {missing[0]} has no training data"
         raise NeecoError(f"--num-real: {problem}; add 0 for sets alone, a number for real")
     entries = [entry.name for entry in request.output.iterdir()] if request.output.is_dir() else []
-    if [name for name in entries if not name.startswith(".")] != ["jobs"]:  # not just before its first result
+    if [name for name in entries if not name.startswith(".")] != ["jobs"]:  # else interrupted before the first result
         same = {"schema": SCHEMA, "capture": str(request.capture.absolute())}
         check_output(request.output, FILE, "a downstream experiment", **same)
     for job in jobs:
@@ -338,35 +338,35 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
 
 
 def _splits(capture: Capture, requested: Sequence[str]) -> tuple[str, ...]:
-    """The splits to test on. Raises NeecoError."""
+    """Return the test splits. Raises NeecoError."""
     labelled = {frame.split for frame in capture.frames if truth_file(capture.root, frame.name)}
     usable = [split for split in capture.splits if split != "train" and split in labelled]
     for split in requested or ("",):
         if split not in usable and (split or not usable):
             truth = f"has true masks of {', '.join(usable)}" if usable else "has no true mask outside of split train"
-            raise NeecoError(f"--splits: {split or 'none is given'}: {capture.root} {truth}; choose what to test on")
+            raise NeecoError(f"--splits: {split or 'missing'}: {capture.root} {truth}; choose a split with true masks")
     return tuple(requested or usable)
 
 
 def _check_models(request: DownstreamRequest, capture: Capture, frame: tuple[int, int]) -> None:
-    """Raises NeecoError for models that cannot be trained here, or not on these images."""
+    """Raise NeecoError for models that cannot be trained on this machine, or on these images."""
     for name in request.models:
         kind = model_class(name)
         if missing := kind.missing_requirement():
             raise NeecoError(f"--models {name}: {missing}")
         width, height = input_of(request, kind, frame)
         if kind.is_too_small((width, height)):
-            raise NeecoError(f"--models {name}: its input of {width}x{height} px is too small; give a larger --size")
+            raise NeecoError(f"--models {name}: input of {width}x{height} px is too small; give a larger --size")
         several = [str(data.path) for data in request.image_sets if data.instruments() > 1]
         several += [str(capture.root)] if len(capture.instruments) > 1 else []
         if kind.predicts == "boxes" and several:
-            problem = f"{several[0]}: has several instruments, and labels do not tell them apart"
+            problem = f"{several[0]}: has several instruments, which the labels do not distinguish"
             raise NeecoError(f"--models {name}: {problem}; use a model that predicts masks")
 
 
 def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | None = None) -> dict[str, Any]:
-    """Train and test every model in every condition on every fold, but what an earlier start finished; writes
-    downstream.csv and downstream.json, and returns what the latter holds. A failed job is reported in its place."""
+    """Train and test every model in every condition on every fold, except jobs finished earlier. Write downstream.csv
+    and downstream.json, and return the content of the latter. A failed job is reported in its place."""
     file, jobs = plan.request.output / FILE, plan.jobs
     with own_folder(plan.request.output):
         finished = {index: stored for index, job in enumerate(jobs) if (stored := job.check()) is not None}
@@ -398,7 +398,7 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
     predicts = {name: kind.predicts for name, kind in kinds.items()}
     notes = []
     if request.folds < 3:
-        notes.append("intervals of fewer than three folds hardly cover other seeds; give --folds 5 before concluding")
+        notes.append("with fewer than three folds, intervals underestimate the variance of seeds; use --folds 5")
     if request.labels is not None:
         notes.append(f"labels of recorded training frames: {request.labels}; tests are scored by the capture's truth")
     made: dict[str, Any] = {

@@ -37,25 +37,25 @@ class TrainingTask:
     batch: int
     seed: int
     device: torch.device
-    folder: Path  # the job's, for what training writes
-    keep_weights: bool = True  # write those that it ends with to the folder
+    folder: Path  # output folder of the job
+    keep_weights: bool = True  # whether to write the final weights to the folder
     progress: Callable[[float, str], None] = lambda share, text: None
 
 
 class TorchModel(ABC):
-    """A detector or segmenter: its attributes, which are known before anything is imported, a module, a loss and its
-    predictions; `fit` is the same for all.
+    """A detector or segmenter: attributes, which are available before heavy imports, a module, a loss and predictions;
+    `fit` is shared.
 
     AdamW, the same number of steps in every condition; the learning rate rises over the first steps and falls to 0 as
-    a cosine (Loshchilov and Hutter, "SGDR", 2017). The weights after the last step are the model: nothing is chosen, so
-    that no label is spent on a choice.
+    a cosine (Loshchilov and Hutter, "SGDR", 2017). The weights after the last step are the model, without model
+    selection, which would need a labelled validation set.
     """
 
     model: ClassVar[str]
     predicts: ClassVar[Literal["masks", "boxes"]]
-    image_size: ClassVar[int]  # length in px of the longer side of its input images unless --size is given
+    image_size: ClassVar[int]  # px, longer side of its input images unless --size is given
     multiple: ClassVar[int]  # both sides are multiples of it
-    steps: ClassVar[int]  # that suffice for a few hundred images
+    steps: ClassVar[int]  # sufficient for a few hundred images
     batch: ClassVar[int]
     learning_rate: ClassVar[float]
     weight_decay: ClassVar[float] = 1e-4
@@ -66,7 +66,7 @@ class TorchModel(ABC):
 
     @classmethod
     def missing_requirement(cls) -> str | None:
-        """Return what this machine lacks to train it, with the remedy; None when it can be trained."""
+        """Return the requirement that this machine lacks, with the remedy; None if the model can be trained."""
         return None
 
     @classmethod
@@ -76,7 +76,7 @@ class TorchModel(ABC):
 
     @abstractmethod
     def build(self, classes: int) -> nn.Module:
-        """The untrained module, from torch's random numbers."""
+        """Return the untrained module, initialised with torch's random numbers."""
 
     @abstractmethod
     def loss(self, module: Any, batch: Batch) -> Tensor:
@@ -87,10 +87,10 @@ class TorchModel(ABC):
         """Return the predictions of images [B, 3, h, w]; sizes: (height, width) of each prediction."""
 
     def fit(self, task: TrainingTask) -> Predict:
-        """Train it; writes the kept weights to the folder's weights.safetensors. Raises NeecoError where it diverges.
+        """Train the model; write the weights to the folder's weights.safetensors. Raises NeecoError if it diverges.
 
-        The same task gives the same model on the CPU. Torch's random numbers start at the task's seed, and continue
-        afterwards as if this had not run.
+        Deterministic on the CPU. Torch's random numbers start at the task's seed, and the previous state is restored
+        afterwards.
         """
         with torch.random.fork_rng():
             torch.manual_seed(task.seed)
@@ -121,10 +121,10 @@ class TorchModel(ABC):
             nn.utils.clip_grad_norm_(module.parameters(), self.gradient_clip)
             optimizer.step()
             schedule.step()
-            if step % self.report_every == 0 or step == task.steps:  # a GPU waits here for its numbers
+            if step % self.report_every == 0 or step == task.steps:  # synchronises with the GPU
                 value = loss.item()
                 if not math.isfinite(value):
-                    raise NeecoError(f"{self.model}: its loss is not finite at step {step}; train with more images")
+                    raise NeecoError(f"{self.model}: loss is not finite at step {step}; train with more images")
                 task.progress(step / task.steps, f"step {step}  loss {value:.3f}")
 
     def _rate(self, step: int, steps: int) -> float:
@@ -135,33 +135,33 @@ class TorchModel(ABC):
     def _predict(self, module: nn.Module, images: Sequence[np.ndarray], task: TrainingTask) -> list[Prediction]:
         predictions: list[Prediction] = []
         for start in range(0, len(images), self.prediction_batch):
-            some = images[start : start + self.prediction_batch]
-            shrunk = np.stack([cv2.resize(image, task.size, interpolation=cv2.INTER_AREA) for image in some])
-            batch = torch.from_numpy(shrunk).permute(0, 3, 1, 2).to(task.device, torch.float32) / 255
+            chunk = images[start : start + self.prediction_batch]
+            inputs = np.stack([cv2.resize(image, task.size, interpolation=cv2.INTER_AREA) for image in chunk])
+            batch = torch.from_numpy(inputs).permute(0, 3, 1, 2).to(task.device, torch.float32) / 255
             batch = batch.contiguous(memory_format=torch.channels_last)
-            predictions += self.predictions(module, batch, [(image.shape[0], image.shape[1]) for image in some])
+            predictions += self.predictions(module, batch, [(image.shape[0], image.shape[1]) for image in chunk])
         return predictions
 
 
 @cache
 def find_models() -> dict[str, type[TorchModel]]:
-    """Return every class with a `model` name of its own, by that name: those of `models/`, and those of entry points in
-    `neeco.models`. Raises NeecoError when two share a name, or one cannot be loaded."""
+    """Return all model classes by their `model` name, of `models/` and of entry points in `neeco.models`. Raises
+    NeecoError if two share a name, or one cannot be loaded."""
     return plugins(TorchModel, "model", "neeco.studies.downstream.models", "neeco.models")  # type: ignore[type-abstract]
 
 
 def model_class(name: str) -> type[TorchModel]:
-    """The model of that name. Raises NeecoError when there is none."""
+    """Return the model of that name. Raises NeecoError if there is none."""
     models = find_models()
     if name not in models:
         available = ", ".join(models)
-        raise NeecoError(f"--models: {name!r} is unknown; choose of {available}, or install the package that has it")
+        raise NeecoError(f"--models: {name!r} is unknown; choose one of: {available}, or install its package")
     return models[name]
 
 
 def input_size(frame: tuple[int, int], longer_side: int, multiple: int) -> tuple[int, int]:
-    """Return the input (width, height) of a model for frames of this size: at most `longer_side`, both multiples of
-    `multiple`, the nearest to the frame's shape."""
+    """Return the input (width, height) of a model for frames of this size: at most `longer_side`, multiples of
+    `multiple`, with nearly the frame's aspect ratio."""
     scale = min(1.0, max(multiple, longer_side - longer_side % multiple) / max(frame))
     width, height = (max(multiple, multiple * round(edge * scale / multiple)) for edge in frame)
     return width, height

@@ -1,5 +1,5 @@
-"""Results of a downstream study, the document of downstream.json: scores of predictions (masks per frame, boxes over a
-split), their intervals over folds and frames, findings and tables."""
+"""Results of a downstream study, stored in downstream.json: scores of predictions (masks per frame, boxes per split),
+intervals over folds and frames, findings and tables."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from neeco.studies.tables import UNKNOWN, Cell, Column, ResultTable, Row, csv_te
 
 MASK_SCORES = ("iou", "dice", "precision", "recall", "boundary_f")
 BOX_SCORES = ("ap", "ap50", "ap75")
-MAIN = {"masks": "iou", "boxes": "ap"}  # the score that models are compared by
+MAIN = {"masks": "iou", "boxes": "ap"}  # main score, for comparing models
 TITLES = {"iou": "IoU", "dice": "Dice", "boundary_f": "boundary F", "ap": "AP50-95", "ap50": "AP50", "ap75": "AP75"}
 HELPS, HURTS, NONE_SHOWN, ONE_FOLD = "helps", "hurts", "no difference shown", "one fold gives no verdict"
 
@@ -42,14 +42,14 @@ INTERVALS = IntervalSettings()
 
 @dataclass(frozen=True)
 class Detections:
-    """The detections in one image, best first."""
+    """The detections in one image, in order of decreasing score."""
 
     boxes: np.ndarray  # [n, 4] x0, y0, x1, y1 px
     classes: np.ndarray  # [n] int64, from 1
     scores: np.ndarray  # [n] in [0, 1]
 
     def of_class(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes [m, 4] and scores [m] of one class."""
+        """Return boxes [m, 4] and scores [m] of one class."""
         return self.boxes[self.classes == number], self.scores[self.classes == number]
 
 
@@ -57,9 +57,9 @@ Prediction = np.ndarray | Detections  # classes of pixels uint8 [H, W], 0 tissue
 
 
 def mask_scores(predicted: np.ndarray, truth: Example, classes: Sequence[str]) -> dict[str, float]:
-    """Scores of one frame: of a single class by name of the score; of several as `CLASS.score`, and their means.
+    """Return the scores of one frame by name; for several classes their means, and `CLASS.score`.
 
-    predicted: uint8 [H, W]. NaN where neither side shows the class.
+    predicted: uint8 [H, W]. NaN if the class is neither predicted nor labelled.
     """
     valid = truth.valid if truth.valid is not None else np.ones(predicted.shape, bool)
     scores = []
@@ -75,7 +75,7 @@ def mask_scores(predicted: np.ndarray, truth: Example, classes: Sequence[str]) -
 
 
 def mean_scores(frames: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """The mean of every score over those frames that have it; None where none has."""
+    """Return the mean of every score over the frames that have it; None if none has."""
     names = dict.fromkeys(name for frame in frames for name in frame)
     means = {name: mean_of([frame.get(name) for frame in frames]) for name in names}
     return {name: None if math.isnan(value) else value for name, value in means.items()}
@@ -84,8 +84,8 @@ def mean_scores(frames: Sequence[Mapping[str, float]]) -> dict[str, float | None
 def box_scores(
     predictions: Sequence[Detections], truth: Sequence[Example], classes: Sequence[str]
 ) -> dict[str, float | None]:
-    """AP of boxes as COCO's, mean over IoU .5 to .95, at .5 and at .75; of several classes their mean, and `CLASS.ap`.
-    None where the truth has no box."""
+    """Return COCO's box AP: mean over IoU 0.5 to 0.95, at 0.5 and at 0.75; for several classes the mean, and
+    `CLASS.ap`. None if the ground truth has no box."""
     labelled = [example.boxes() for example in truth]
     per_class = {}
     for number, name in enumerate(classes, 1):
@@ -100,7 +100,7 @@ def box_scores(
 
 
 def box_iou(detections: Detections, truth: Example) -> float:
-    """Mean IoU of every true box with the most confident box of its class; NaN where the truth has none."""
+    """Return the mean IoU of every true box with the most confident box of its class; NaN without true boxes."""
     values = []
     for box, number in zip(*truth.boxes(), strict=True):
         boxes, scores = detections.of_class(number)
@@ -111,8 +111,8 @@ def box_iou(detections: Detections, truth: Example) -> float:
     return mean_of(values)
 
 
-def _coco_ap(found: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.ndarray]) -> list[float]:
-    """AP over IoU .5 to .95, at .5 and at .75, by pycocotools."""
+def _coco_ap(detected: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.ndarray]) -> list[float]:
+    """Return the AP over IoU 0.5 to 0.95, at 0.5 and at 0.75, by pycocotools."""
     from pycocotools.coco import COCO
     from pycocotools.cocoeval import COCOeval
 
@@ -124,7 +124,7 @@ def _coco_ap(found: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.n
     labelled = [box_of(image, box) for image, boxes in enumerate(true, 1) for box in boxes]
     detections = [
         box_of(image, box) | {"score": float(score)}
-        for image, (boxes, scores) in enumerate(found, 1)
+        for image, (boxes, scores) in enumerate(detected, 1)
         for box, score in zip(boxes, scores, strict=True)
     ]
     if not detections:
@@ -143,7 +143,7 @@ def _coco_ap(found: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.n
 
 
 class Arm(NamedTuple):
-    """A model in a condition with so many labelled frames."""
+    """A model in a condition with a number of labelled frames."""
 
     model: str
     condition: str
@@ -151,7 +151,7 @@ class Arm(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A mean over folds with the ends of its interval, which are None where there is one value only."""
+    """A mean over folds with the ends of its interval, which are None for a single value."""
 
     folds: int
     mean: float
@@ -162,7 +162,7 @@ class Estimate(NamedTuple):
 class Scores:
     """Scores of a study's finished jobs by arm, test and metric, with intervals of means and differences.
 
-    All arms use the same resampled seeds and frames, so that a difference of two is a paired one.
+    All arms use the same resampled seeds and frames, so that differences are paired.
     """
 
     def __init__(self, jobs: Sequence[Document]) -> None:
@@ -179,8 +179,8 @@ class Scores:
         return {fold: score for fold, score in sorted(scores.items()) if score is not None}
 
     def estimate(self, arm: Arm, test: str, metric: str, against: Arm | None = None) -> Estimate | None:
-        """Return the mean of an arm's score over folds, or of its difference to another's over the folds that both
-        finished; None where there is no such fold."""
+        """Return the mean of an arm's score over folds, or of its difference to another arm over their common folds;
+        None if there is no such fold."""
         values = [self.by_fold(one, test, metric) for one in ((arm,) if against is None else (arm, against))]
         folds = tuple(fold for fold in values[0] if fold in values[-1])
         if not folds:
@@ -196,7 +196,7 @@ class Scores:
         return Estimate(len(folds), mean, float(low), float(high))
 
     def _means(self, arm: Arm, test: str, metric: str, folds: tuple[int, ...]) -> np.ndarray:
-        """[R]: means over resampled seeds and frames; [0] of one seed without scores of frames."""
+        """Return means over resampled seeds and frames [R]; [0] for one seed without scores per frame."""
         key = arm, test, metric, folds
         if key not in self._resampled:
             rows = []
@@ -204,7 +204,7 @@ class Scores:
                 scores = self.jobs[arm][fold]["splits"][test]
                 frames = [frame.get(metric) for frame in scores.get("per_frame", ())]
                 rows.append(frames if any(value is not None for value in frames) else [scores[metric]])
-            values = np.array(rows, np.float64)  # [seeds, frames]; None is nan: a frame without the class
+            values = np.array(rows, np.float64)  # [seeds, frames]; None becomes NaN: a frame without the class
             seeds, frames_drawn = seed_weights(len(folds)), block_weights(values.shape[1])
             valid = ~np.isnan(values)
             total, count = (((seeds @ part) * frames_drawn).sum(1) for part in (np.nan_to_num(values), valid))
@@ -214,15 +214,15 @@ class Scores:
 
 @cache
 def seed_weights(seeds: int) -> np.ndarray:
-    """Return [R, seeds]: resampling counts of each seed, one draw fewer than seeds: as many draws would underestimate
-    the variance of few (Rao and Wu, "Resampling inference with complex survey data", 1988)."""
+    """Return resampling counts of each seed [R, seeds], with one draw fewer than seeds, because as many draws would
+    underestimate the variance of few (Rao and Wu, "Resampling inference with complex survey data", 1988)."""
     times, rng = max(seeds - 1, 1), np.random.default_rng(1)
     return rng.multinomial(times, np.full(seeds, 1 / seeds), INTERVALS.resamples).astype(np.float64)
 
 
 @cache
 def block_weights(frames: int) -> np.ndarray:
-    """Return [R, frames]: resampling counts of each frame, in circular blocks of neighbours (Politis and Romano, "A
+    """Return resampling counts of each frame [R, frames], in circular blocks of neighbours (Politis and Romano, "A
     circular block-resampling procedure", 1992)."""
     length = -(-frames // INTERVALS.blocks)
     starts = np.random.default_rng(2).integers(frames, size=(INTERVALS.resamples, -(-frames // length)))
@@ -235,12 +235,12 @@ def block_weights(frames: int) -> np.ndarray:
 
 
 def mean_or_none(values: Mapping[int, float]) -> float | None:
-    """Return the mean over folds; None where no fold has the score."""
+    """Return the mean over folds; None if no fold has the score."""
     return float(np.mean(list(values.values()))) if values else None
 
 
 def words_of(condition: str) -> set[str]:
-    """The words of a condition, in whatever order they stand."""
+    """Return the terms of a condition, without their order."""
     return set(condition.split("+"))
 
 
@@ -259,16 +259,16 @@ def failed_jobs(experiment: Document) -> list[str]:
 
 
 def metrics_of(jobs: Sequence[Document], predicts: str) -> list[str]:
-    """Return the scores of these jobs, the main one first; with several classes followed by each one's."""
+    """Return the score names of these jobs, the main one first; for several classes followed by the class scores."""
     metrics = {key for job in jobs for split in job["splits"].values() for key in split}
     classes = sorted(key for key in metrics if key.endswith(f".{MAIN[predicts]}"))
     return [*(MASK_SCORES if predicts == "masks" else BOX_SCORES), *classes]
 
 
 def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequence[str]) -> list[dict[str, Any]]:
-    """A row per arm and test: means of scores over `folds`, the 95 % interval of the main one as "low" and "high", and
-    its "difference" to the arm "against" over the folds that both finished, with an interval and a "verdict". models:
-    what each predicts, by name."""
+    """Return a row per arm and test: means of scores over `folds`, the 95 % interval of the main one as "low" and
+    "high", and its "difference" to the arm "against" over common folds, with an interval and a "verdict". models: kind
+    of prediction by name."""
     rows, scores = [], Scores(jobs)
     for arm in dict.fromkeys(Arm(job["model"], job["condition"], job["real"]) for job in jobs):
         main = MAIN[models[arm.model]]
@@ -288,21 +288,21 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
 
 
 def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
-    """Return the arm compared with `arm` on a test: the better of labelled frames alone and strongly augmented, with as
-    many labelled frames (sets alone: the most); for strong augmentation none; for permuted labels correct ones."""
+    """Return the reference of `arm` on a test: the better of labelled frames alone and strongly augmented, with the
+    same number of labelled frames (sets alone: the maximum); for permuted labels the correct ones."""
     words, baselines = words_of(arm.condition), [words_of(name) for name in BASELINES]
     other_arms = [other for other in scores.jobs if other.model == arm.model and other != arm]
-    wanted, real = baselines, arm.real
+    references, real = baselines, arm.real
     if PERMUTED in words:
-        wanted = [words - {PERMUTED}]
+        references = [words - {PERMUTED}]
     elif words in baselines:
-        wanted = baselines[: baselines.index(words)]
+        references = baselines[: baselines.index(words)]
     elif REAL not in words:
         real = max((other.real for other in other_arms if words_of(other.condition) in baselines), default=0)
     rivals = [
         (mean, other)
         for other in other_arms
-        if words_of(other.condition) in wanted
+        if words_of(other.condition) in references
         and other.real == real
         and (mean := mean_or_none(scores.by_fold(other, test, metric))) is not None
     ]
@@ -310,26 +310,26 @@ def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
 
 
 def verdict(folds: int, low: float | None, high: float | None) -> str:
-    """Return the verdict on a difference over this many folds from its interval; with one fold, from frames alone."""
+    """Return the verdict on a difference over this number of folds by its interval; none for one fold."""
     if low is None or high is None or folds < 2:
         return ONE_FOLD
     return HELPS if low > 0 else HURTS if high < 0 else NONE_SHOWN
 
 
 def rows_of(experiment: Document, model: Document, test: str) -> list[Document]:
-    """The summary of a model on a test, by the number of labelled frames."""
+    """Return the summary of a model on a test, in order of the number of labelled frames."""
     rows = [row for row in experiment["summary"] if (row["model"], row["test"]) == (model["name"], test)]
     return sorted(rows, key=lambda row: row["real"])
 
 
 def is_synthetic(row: Document, experiment: Document) -> bool:
-    """Return whether a row's condition has a set with its own labels."""
+    """Return whether a row's condition has a set with its correct labels."""
     words = words_of(row["condition"])
     return PERMUTED not in words and any(entry["name"] in words for entry in experiment["sets"])
 
 
 def findings(experiment: Document) -> list[str]:
-    """Return the findings: a sentence for every model, test and condition with synthetic images that is compared."""
+    """Return a sentence for every model, test and condition with synthetic images that has a reference."""
     sentences = []
     for model, test in product(experiment["models"], experiment["tests"]):
         for row in rows_of(experiment, model, test):
@@ -342,13 +342,13 @@ def findings(experiment: Document) -> list[str]:
 
 
 def _difference(row: Document) -> str:
-    """`+0.021, +0.003 to +0.040`."""
+    """Format a difference as `+0.021, +0.003 to +0.040`."""
     ends = "" if row["difference_low"] is None else f", {row['difference_low']:+.3f} to {row['difference_high']:+.3f}"
     return f"{row['difference']:+.3f}{ends}"
 
 
 def table_of(experiment: Document, model: Document, test: str) -> ResultTable:
-    """All scores of a model on a test, means over folds; the main one with its interval and difference."""
+    """Return all scores of a model on a test, means over folds; the main one with interval and difference."""
     rows, metrics = rows_of(experiment, model, test), metrics_of(experiment["jobs"], model["predicts"])
     main = metrics[0]
     best = max((row[main] for row in rows if row[main] is not None), default=None)
@@ -370,17 +370,17 @@ def table_of(experiment: Document, model: Document, test: str) -> ResultTable:
 
 
 def _title(metric: str) -> str:
-    """Return a score's title; of one class `jaws IoU`."""
+    """Return a score's title, for one class as `jaws IoU`."""
     name, _, score = metric.rpartition(".")
     return f"{name} {TITLES.get(score, score)}".strip()
 
 
 def tables_of(experiment: Document) -> list[ResultTable]:
-    """The table of every model and test."""
+    """Return the tables of all models and tests."""
     return [table_of(experiment, *pair) for pair in product(experiment["models"], experiment["tests"])]
 
 
 def summary_text(experiment: Document) -> str:
-    """CSV with a line per arm and test, unrounded."""
+    """Return CSV with a line per arm and test, unrounded."""
     rows = experiment["summary"]
     return csv_text(list(dict.fromkeys(key for row in rows for key in row)), rows)

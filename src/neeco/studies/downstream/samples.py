@@ -1,4 +1,4 @@
-"""Labelled images to train on and to test on: recorded frames, and data sets of synthetic images."""
+"""Labelled images for training and test: recorded frames, and data sets of synthetic images."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, truth_f
 from neeco.evaluation.mask_metrics import pairs_of
 
 ClassNames = Literal["instrument", "parts"]
-WHOLE = ("instrument",)  # the classes where an instrument is one
+WHOLE = ("instrument",)  # classes without parts
 DATASET_FILE, STATES_FILE, IMAGE_FOLDER = "dataset.json", "states.jsonl", "images"
 ANEW = "synthesize the set again"
 V = TypeVar("V")
@@ -39,7 +39,7 @@ class Example:
 
     @property
     def bytes(self) -> int:
-        """Its size in memory."""
+        """Size in memory, bytes."""
         return sum(array.nbytes for array in vars(self).values() if array is not None)
 
     @property
@@ -48,14 +48,14 @@ class Example:
         return np.unique(self.classes[self.classes > 0]).astype(np.int64)
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
-        """[n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) about each class, and the classes [n]."""
+        """Return bounding boxes [n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) of each class, and the classes [n]."""
         places = [place for place in find_objects(self.classes) if place is not None]
         boxes = [(x.start, y.start, x.stop, y.stop) for y, x in places]
         return np.array(boxes, np.float64).reshape(-1, 4), self.shown
 
     def outlines(self) -> list[tuple[int, np.ndarray]]:
-        """Each class with the corners [n, 2] (x, y, shares of the image's sides; float32) of the pixels at its border:
-        what a box is about, wherever the image is moved."""
+        """Return each class with the corners [n, 2] (x, y, relative to the image's sides; float32) of its border
+        pixels, from which boxes are computed after augmentation."""
         height, width = self.classes.shape
         outlines = []
         for number in self.shown.tolist():
@@ -67,20 +67,20 @@ class Example:
 
 
 def class_names(capture: Capture, classes: ClassNames) -> tuple[str, ...]:
-    """Return the classes of a model: the instrument, or the parts of the capture's truth. Raises NeecoError."""
+    """Return the classes of a model: the instrument, or the parts of the capture's ground truth. Raises NeecoError."""
     if classes == "instrument":
         return WHOLE
     return tuple(dict.fromkeys(_paired(truth_names(capture.root)).values()))
 
 
 def _paired(names: Mapping[int, str]) -> dict[int, str]:
-    """Part by id, with one name for both of a pair: an image does not show which jaw is called left."""
+    """Return the part by id, with one name for both parts of a pair: images do not show which jaw is the left one."""
     pairs = {part: pair for pair, both in pairs_of(names.values()).items() for part in both}
     return {number: pairs.get(part, part) for number, part in names.items()}
 
 
 def class_table(parts: Mapping[int, str], classes: Sequence[str]) -> bytes:
-    """The class, from 1, of each of the 256 ids of a label image, whose parts these are; 0: none."""
+    """Return the class, from 1, of each of the 256 ids of a label image with these parts; 0: none."""
     table = bytearray(256)
     for number, part in _paired(parts).items():
         name = WHOLE[0] if classes == WHOLE else part
@@ -89,7 +89,7 @@ def class_table(parts: Mapping[int, str], classes: Sequence[str]) -> bytes:
 
 
 def _classes_of(ids: np.ndarray, table: bytes, file: Path, remedy: str) -> np.ndarray:
-    """The classes of label ids [H, W]. Raises NeecoError for an id without: it would be learned as tissue."""
+    """Return the classes of label ids [H, W]. Raises NeecoError for an id without a class (else learned as tissue)."""
     classes = np.frombuffer(table, np.uint8)[ids]
     unknown = ids[(classes == 0) & (ids > 0)]
     if len(unknown):
@@ -98,8 +98,8 @@ def _classes_of(ids: np.ndarray, table: bytes, file: Path, remedy: str) -> np.nd
 
 
 class Sample(Protocol):
-    """An image with labels that is read on demand. name: in messages and tables; key: equal for samples with the same
-    content. `load` raises NeecoError."""
+    """An image with labels that is read on demand. name: for messages and tables; key: equal for the same content.
+    `load` raises NeecoError."""
 
     @property
     def name(self) -> str: ...
@@ -116,7 +116,7 @@ class Cache:
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], V]) -> V:
-        """The value of `key`, made where it is not kept; it has its size in `bytes`."""
+        """Return the value of `key`, computed by `make` if it is not cached; its size is its attribute `bytes`."""
         if key not in self._kept:
             self._kept[key] = make()
             self.used += self._kept[key].bytes
@@ -127,7 +127,7 @@ class Cache:
         return value
 
     def load(self, sample: Sample) -> Example:
-        """The sample's example."""
+        """Return the sample's example."""
         return self.get(sample.key, sample.load)
 
 
@@ -151,12 +151,12 @@ class RecordedSample:
         return self.frame.image_path, self.masks.files[self.name], self.table
 
     def load(self) -> Example:
-        """Raises NeecoError where the labels differ from the image in size, or have an id without a class."""
+        """Raises NeecoError if labels and image differ in size, or an id has no class."""
         ids, file = self.masks.load(self.name), self.masks.files[self.name]
         pixels, mask = self.frame.load_image_bytes().numpy(), self.frame.load_mask()
         if ids.shape != pixels.shape[:2]:
-            raise NeecoError(f"{file}: is of another size than its frame; label the frames as recorded")
-        remedy = "correct the mask, or leave its frame out"
+            raise NeecoError(f"{file}: differs in size from its frame; label the frames at recorded size")
+        remedy = "correct the mask, or remove its frame"
         return Example(pixels, _classes_of(ids, self.table, file, remedy), None if mask is None else mask.numpy())
 
 
@@ -177,13 +177,13 @@ class SyntheticSample:
         return self.image, self.labels, self.table
 
     def load(self) -> Example:
-        """Raises NeecoError where a file is of another size, or has an id without a class."""
+        """Raises NeecoError if labels and image differ in size, or an id has no class."""
         ids = read_labels(self.labels, image_size(self.image)).numpy()
         return Example(read_image_bytes(self.image), _classes_of(ids, self.table, self.labels, ANEW))
 
 
 def permuted(samples: Sequence[SyntheticSample]) -> tuple[SyntheticSample, ...]:
-    """Return the images with each other's labels, by a fixed cyclic permutation in random order."""
+    """Return the images with labels of other images, by a fixed cyclic permutation in random order."""
     order = np.random.default_rng(0).permutation(len(samples))
     source = dict(zip(order.tolist(), np.roll(order, 1).tolist(), strict=True))
     return tuple(replace(sample, labels=samples[source[index]].labels) for index, sample in enumerate(samples))
@@ -191,7 +191,7 @@ def permuted(samples: Sequence[SyntheticSample]) -> tuple[SyntheticSample, ...]:
 
 @dataclass(frozen=True)
 class ImageSet:
-    """A folder of synthetic images to train on. `count`: use so many of them, None for all."""
+    """A folder of synthetic images for training. count: number of images used, None for all."""
 
     name: str
     path: Path
@@ -199,7 +199,7 @@ class ImageSet:
 
     @classmethod
     def of(cls, word: str) -> ImageSet:
-        """Return that of NAME=DATASET or NAME=DATASET:COUNT; a folder whose name ends so is the folder. Raises
+        """Parse NAME=DATASET or NAME=DATASET:COUNT; an existing folder of the full name has precedence. Raises
         NeecoError."""
         name, place = name_and_value("--sets", word, "kinematic=dataset")
         folder, colon, count = place.rpartition(":")
@@ -210,7 +210,7 @@ class ImageSet:
         return cls(name, Path(folder), int(count))
 
     def file(self, *names: str) -> Path:
-        """A file or folder of it. Raises NeecoError where a link leads out of it."""
+        """Return the path of a file or folder in the set. Raises NeecoError if a link leaves the set."""
         return require_inside(self.path.joinpath(*names), self.path)
 
     def info(self) -> Any:
@@ -230,7 +230,7 @@ class ImageSet:
         return len({entry.get("instrument") for entry in ids if entry["id"]})
 
     def described(self) -> dict[str, Any]:
-        """Return its identity; `sha256` of its dataset.json changes when the set is made again."""
+        """Return its identity; the `sha256` of its dataset.json changes when the set is written again."""
         file = self.file(DATASET_FILE)
         digest = hashlib.sha256(read_bytes(file, "a data set")).hexdigest() if file.is_file() else None
         return {"name": self.name, "path": str(self.path.absolute()), "count": self.count, "sha256": digest}
@@ -239,8 +239,8 @@ class ImageSet:
 def recorded_samples(
     capture: Capture, split: str | None, classes: ClassNames, labels: Path | None = None
 ) -> tuple[RecordedSample, ...]:
-    """The labelled frames of a split (None: of all), by the capture's truth or a folder of masks named as the frames.
-    Raises NeecoError where there is none at all, or where parts are requested and the labels have none."""
+    """Return the labelled frames of a split (None: all), with the capture's ground truth or a folder of masks named as
+    the frames. Raises NeecoError if there is none, or if parts are requested and the labels have none."""
     masks = None if labels is None else open_masks(labels, option=f"{labels / PARTS_FILE}:")
     chosen = capture.frames if split is None else capture.split(split)
     if masks is None and any(truth_file(capture.root, frame.name) for frame in chosen):
@@ -249,26 +249,25 @@ def recorded_samples(
     if masks is None or not frames:
         place = f"{capture.root}: {split or 'all frames'}" if labels is None else f"--labels {labels}"
         raise NeecoError(f"{place}: no frame has a label; give --labels FOLDER with masks named as the frames")
-    wanted = class_names(capture, classes)
-    if classes == "parts" and not set(_paired(masks.names or {}).values()) & set(wanted):
+    class_list = class_names(capture, classes)
+    if classes == "parts" and not set(_paired(masks.names or {}).values()) & set(class_list):
         raise NeecoError(f"--classes parts: the labels in {masks.path} have no parts; use --classes instrument")
-    # where only some frames' truth has parts, every id is a piece of the instrument
-    table = class_table(masks.names or dict.fromkeys(range(1, 256), WHOLE[0]), wanted)
+    # if only some frames' ground truth has parts, every id belongs to the instrument
+    table = class_table(masks.names or dict.fromkeys(range(1, 256), WHOLE[0]), class_list)
     return tuple(RecordedSample(frame, masks, table) for frame in frames)
 
 
 def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:
-    """(width, height) of recorded frames. Raises NeecoError where they differ."""
+    """Return (width, height) of recorded frames. Raises NeecoError if they differ."""
     sizes = {(sample.frame.camera.width, sample.frame.camera.height) for sample in samples}
     if len(sizes) > 1:
-        raise NeecoError(f"{samples[0].frame.image_path.parent}: frames of several sizes; make captures of one size")
+        raise NeecoError(f"{samples[0].frame.image_path.parent}: frames differ in size; use captures of one size")
     return next(iter(sizes))
 
 
 def synthetic_samples(data: ImageSet, classes: Sequence[str], size: tuple[int, int]) -> tuple[SyntheticSample, ...]:
-    """The images of a data set in their order, each with its labels; the first `count` of them. Of a set that `neeco
-    annotate` wrote only the frames of split train are used. size: (width, height) that all must have. Raises
-    NeecoError."""
+    """Return the first `count` images of a data set with their labels. Of a set written by `neeco annotate` only the
+    frames of split train are used. size: required (width, height). Raises NeecoError."""
     folder, info = data.file(IMAGE_FOLDER), data.info()
     images = image_files(folder) if folder.is_dir() else ()
     if info is not None and "annotates" in info["settings"]:
@@ -277,8 +276,8 @@ def synthetic_samples(data: ImageSet, classes: Sequence[str], size: tuple[int, i
         learned = {Path(row["image"]).name for row in rows if row["recorded_split"] == "train"}
         images = tuple(image for image in images if image.name in learned)
     if len(images) < (data.count or 1):
-        wanted = "one" if data.count is None else str(data.count)
-        problem = f"{folder}: has {len(images)} images to learn from, not {wanted}; give what `neeco synthesize` wrote"
+        required = "at least one" if data.count is None else str(data.count)
+        problem = f"{folder}: has {len(images)} training images, expected {required}; give a `neeco synthesize` output"
         raise NeecoError(f"--sets {data.name}: {problem}")
     table = class_table({1: WHOLE[0], 255: WHOLE[0]}, classes)  # 255: black and white masks
     if info is not None:
@@ -290,10 +289,12 @@ def synthetic_samples(data: ImageSet, classes: Sequence[str], size: tuple[int, i
     for image in images[: data.count]:
         labels = data.file("masks" if info is None else "parts", f"{image.stem}.png")
         if not labels.is_file():
-            raise NeecoError(f"--sets {data.name}: {labels}: no such file; every image needs its labels")
+            raise NeecoError(f"--sets {data.name}: {labels}: no such file; every image needs labels")
         if image_size(require_inside(image, data.path)) != size:
-            wanted = f"{size[0]}x{size[1]}, as the capture's frames"
-            raise NeecoError(f"--sets {data.name}: {image}: is not {wanted}; synthesize it from a run of this capture")
+            expected = f"{size[0]}x{size[1]}, as the capture's frames"
+            raise NeecoError(
+                f"--sets {data.name}: {image}: is not {expected}; synthesize it from a run of this capture"
+            )
         samples.append(SyntheticSample(image, labels, table))
-    samples[0].load()  # raises before the work where its ids have no class
+    samples[0].load()  # raises early if its ids have no class
     return tuple(samples)

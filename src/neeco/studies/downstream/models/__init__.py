@@ -1,1 +1,1 @@
-"""Detectors and segmenters to train: one model, one file. A public module's class with a `model` name is one."""
+"""Detectors and segmenters, one file each. Every class with a `model` name in a public module is registered."""

@@ -1,5 +1,5 @@
 """`dfine`: a small D-FINE (Peng et al., "D-FINE: redefine regression task in DETRs as fine-grained distribution
-refinement", ICLR 2025) as transformers has it."""
+refinement", ICLR 2025), as implemented in transformers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neeco.studies.downstream.model import TorchModel
 from neeco.studies.downstream.results import Detections, Prediction
 from neeco.studies.downstream.training_data import Batch
 
-STRIDES = (16, 32)  # px, of the backbone's last two stages, which it detects on
+STRIDES = (16, 32)  # px, strides of the backbone's last two stages, the detection levels
 
 
 class DFine(TorchModel):
@@ -27,11 +27,11 @@ class DFine(TorchModel):
     image_size = 160
     multiple = 32
     steps = 3200
-    batch = 2  # of as many images it learns more in more, smaller steps
+    batch = 2  # small, because more steps on the same number of images learn more
     learning_rate = 8e-4
     stages = (64, 256, 512, 1024)  # channels of the backbone's stages
     width = 128  # channels of encoder and decoder
-    queries = 20  # boxes per image: few instruments are in one
+    queries = 20  # boxes per image
 
     @classmethod
     def missing_requirement(cls) -> str | None:
@@ -40,7 +40,7 @@ class DFine(TorchModel):
 
     @classmethod
     def is_too_small(cls, size: tuple[int, int]) -> bool:
-        """Its queries start at the cells of two grids."""
+        """Queries are initialised at the cells of the two levels, which must be at least as many."""
         return sum((size[0] // stride) * (size[1] // stride) for stride in STRIDES) < cls.queries
 
     def build(self, classes: int) -> nn.Module:
@@ -87,7 +87,7 @@ class DFine(TorchModel):
 
     def loss(self, module: Any, batch: Batch) -> Tensor:
         device = batch.images.device
-        labels = [  # as transformers takes them
+        labels = [  # in the format of transformers
             {
                 "class_labels": torch.from_numpy(classes - 1).to(device),
                 "boxes": torch.from_numpy(boxes.astype(np.float32)).to(device),

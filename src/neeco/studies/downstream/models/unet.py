@@ -17,9 +17,9 @@ from neeco.studies.downstream.training_data import Batch
 
 
 class ResidualUnit(nn.Module):
-    """A convolution, normalised and rectified, added to the input (projected where its shape changes).
+    """A residual convolution with batch normalisation and ReLU; the input is projected if its shape changes.
 
-    last: the convolution alone, as the network's output needs it.
+    last: without normalisation and ReLU, for the network's output.
     """
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, last: bool = False) -> None:
@@ -67,10 +67,10 @@ class UNet(TorchModel):
     predicts = "masks"
     image_size = 160
     multiple = 16
-    steps = 1000  # training steps; strong augmentation needs as many, without it 400 are enough
+    steps = 1000  # training steps, needed with strong augmentation; 400 are sufficient without it
     batch = 8
     learning_rate = 3e-3
-    channels = (16, 32, 64, 128, 256)  # of the levels, each but the last half as large as the one before
+    channels = (16, 32, 64, 128, 256)  # channels per level; every level but the last halves the resolution
 
     def build(self, classes: int) -> nn.Module:
         return ResidualUNet(classes + 1, self.channels)
