@@ -57,11 +57,23 @@ def registered() -> Iterator[Callable[[type], type]]:
 
 
 @pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder of installed packages of this process, empty."""
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of installed packages of this process, empty; plug-ins are looked for anew."""
+    from neeco.ingest.readers import recording_formats
+    from neeco.scene.method_registry import methods
+    from neeco.studies.downstream.model import find_models
+    from neeco.synthesis.dataset import writers
+
     (tmp_path / "site").mkdir()
     monkeypatch.syspath_prepend(tmp_path / "site")
-    return tmp_path / "site"
+    before, cached = set(sys.modules), (recording_formats, methods, find_models, writers)
+    for found in cached:
+        found.cache_clear()
+    yield tmp_path / "site"
+    for found in cached:
+        found.cache_clear()
+    for name in {name for name in sys.modules if name.startswith("neeco_")} - before:
+        del sys.modules[name]
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[World, Path, Pat
     small = replace(world, size=(64, 48), frames=12, coverage=1.0, automatic=False, touch=touch)
     folder = tmp_path_factory.mktemp("worlds")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(draws, "RESOLUTION", 150)
+        patch.setattr(draws, "RESOLUTION", 90)
         patch.setattr(world_capture, "TEST", 4)
         patch.setattr(world_capture, "BEYOND", 4)
         write_world(small, folder / "touched")

@@ -57,10 +57,7 @@ def test_a_reader_that_is_gone_ends_a_command_by_141() -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device is always full here")
 def test_a_full_disk_behind_stdout_is_one_line() -> None:
-    assert run("> /dev/full") == (
-        1,
-        "neeco: error: output: No space left on device; check that path and the disk\n",
-    )
+    assert run("> /dev/full") == (1, "neeco: error: output: No space left on device; check that path and the disk\n")
 
 
 def test_letters_that_a_terminal_cannot_show_are_escaped(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -112,23 +112,8 @@ def test_compare_names_what_computed(verb: Call, word: str, capture: str) -> Non
 @slowly
 def test_downstream(verb: Call, capture: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neeco.studies.downstream.models.unet.UNet.channels", (4, 4, 8, 8, 8))
-    small = [
-        "--steps",
-        "2",
-        "--batch",
-        "2",
-        "--size",
-        "48",
-        "--folds",
-        "1",
-        "--num-real",
-        "all",
-        "--conditions",
-        "real",
-        "real+strong",
-        "real+paste",
-    ]
-    verb("downstream", capture, *small, "--output", "out")
+    small = "--steps 2 --batch 2 --size 48 --folds 1 --num-real all --conditions real real+strong real+paste"
+    verb("downstream", capture, *small.split(), "--output", "out")
     jobs = json.loads(Path("out/downstream.json").read_text())["jobs"]
     assert not [job["error"] for job in jobs if "error" in job]
 

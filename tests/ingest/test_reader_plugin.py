@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +17,6 @@ from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.recording.file import read_recording
 
 pytest.importorskip("av")
-
-
-@pytest.fixture(autouse=True)
-def formats() -> Iterator[None]:
-    """Formats are looked for anew."""
-    recording_formats.cache_clear()
-    yield
-    recording_formats.cache_clear()
-    sys.modules.pop("neeco_poselines", None)
 
 
 def write_pose_lines(table: Path) -> Path:

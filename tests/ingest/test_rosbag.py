@@ -12,12 +12,7 @@ from bag_world import KINDS, BagWriter, known, refusal
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers import (
-    Kind,
-    VideoSource,
-    _bagfile,
-    read_table,
-)
+from neeco.ingest.readers import Kind, VideoSource, _bagfile, read_table
 from neeco.ingest.readers.columns import BASE, CAMERA, JointColumns, PoseColumns
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog, read_pose_log, read_reading_log

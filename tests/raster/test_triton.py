@@ -33,23 +33,10 @@ def test_the_interpreter_computes_what_the_reference_defines() -> None:
     """In a process of its own: whoever imported triton before has chosen the compiler for the whole process."""
     if tuple(map(int, importlib.metadata.version("triton").split(".")[:2])) < (3, 7):
         pytest.skip("older interpreters get floor() wrong or do not know this numpy")
-    result = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pytest",
-            *(str(Path(__file__).parent / checks) for checks in CHECKS),
-            "-m",
-            "",
-            "-p",
-            "no:cacheprovider",
-            "-p",
-            "no:xdist",
-        ],
-        env={**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-    )
+    command = [sys.executable, "-m", "pytest", "-m", "", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    files = [str(Path(__file__).parent / checks) for checks in CHECKS]
+    variables = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}
+    result = subprocess.run([*command, *files], env=variables, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
 
 
@@ -123,13 +110,7 @@ def test_every_kernel_compiles_without_a_gpu(capability, scene, deterministic, c
         torch.stack(drawn).sum().backward()
     finally:
         torch.use_deterministic_algorithms(False)
-    names = {
-        "project_kernel",
-        "list_kernel",
-        "composite_kernel",
-        "composite_backward_kernel",
-        "project_backward_kernel",
-    }
+    names = {f"{name}_kernel" for name in ("project", "list", "composite", "composite_backward", "project_backward")}
     assert set(compiled) == names | ({"sum_slots_kernel"} if deterministic else set())
     for name, kernel in compiled.items():
         assert f".target sm_{capability}" in kernel.asm["ptx"]

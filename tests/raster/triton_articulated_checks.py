@@ -28,10 +28,7 @@ def by_triton(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(posing, "_kernel", lambda given: Posing if given[0].dtype == torch.float32 else None)
 
 
-@pytest.mark.parametrize(
-    ("joints", "roll"),
-    [((None,), 2.1), ((1,), 0.0), ((None, 3, 0), 2.1)],
-)
+@pytest.mark.parametrize(("joints", "roll"), [((None,), 2.1), ((1,), 0.0), ((None, 3, 0), 2.1)])
 def test_the_kernels_are_their_definition(joints: tuple[int | None, ...], roll: float) -> None:
     counts = tuple(9 + 5 * k for k in range(len(joints)))
     assert_same_as_definition(make_world(counts, tuple(map(hinges, joints)), seed=len(joints), roll=roll))

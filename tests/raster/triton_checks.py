@@ -57,7 +57,7 @@ def test_deterministic_gradients_match_the_reference(deterministic: None, sh_cou
 
 
 def test_deterministic_gradients_of_a_gaussian_across_many_tiles(deterministic: None) -> None:
-    scene = scene_of(3, 1, 0, seed=2, width=100, height=60, size=20.0, opacity=0.5)
+    scene = scene_of(3, 1, 0, seed=2, width=60, height=40, size=12.0, opacity=0.5)
     scene.tensors["means"][:, :2] = 0
     same(scene)
 

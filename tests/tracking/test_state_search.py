@@ -190,9 +190,7 @@ def test_an_image_that_no_state_explains_is_left_out(tmp_path: Path) -> None:
 
 
 def judged_by(
-    search: StateSearch,
-    explained: Callable[[State, State, StateFit], StateFit | None],
-    outside: bool = False,
+    search: StateSearch, explained: Callable[[State, State, StateFit], StateFit | None], outside: bool = False
 ) -> Verdict:
     """What becomes of frame 5, judged again, if fits with a prior about a state, from a start, are as `explained`;
     outside: its recorded state shows no instrument."""

@@ -295,13 +295,7 @@ def test_frames_are_chosen_by_another_trust_without_tracking_again(tracked_run, 
 
     def chosen(min_trust: float) -> int:
         again = track_footage(
-            tracked_run,
-            withheld(footage),
-            output,
-            start="first",
-            min_trust=min_trust,
-            resume=True,
-            on_progress=never,
+            tracked_run, withheld(footage), output, start="first", min_trust=min_trust, resume=True, on_progress=never
         )
         return again.written
 

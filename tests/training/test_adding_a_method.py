@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import pytest
 import torch
 from capture_files import write_capture
 
-import neeco.methods
 from neeco.base.errors import NeecoError
 from neeco.base.settings import plain
 from neeco.capture.images import write_image
@@ -23,7 +20,6 @@ from neeco.capture.writer import write_capture as write_folder
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.raster import Camera, Gaussians, rasterize
 from neeco.scene.io import load_scene
-from neeco.scene.method_registry import methods
 from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train
@@ -33,16 +29,10 @@ PERIOD = 2.0  # s
 
 
 @pytest.fixture(autouse=True)
-def breathing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The page's only block of Python as a file of a folder that stands for `methods/`."""
+def breathing(methods_folder: Path) -> None:
+    """The page's only block of Python as a file of `methods/`."""
     (code,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-    (tmp_path / "methods").mkdir()
-    (tmp_path / "methods" / "breathing_tissue.py").write_text(code, encoding="utf-8")
-    monkeypatch.setattr(neeco.methods, "__path__", [*neeco.methods.__path__, str(tmp_path / "methods")])
-    methods.cache_clear()
-    yield
-    methods.cache_clear()
-    del sys.modules["neeco.methods.breathing_tissue"]
+    (methods_folder / "breathing_tissue.py").write_text(code, encoding="utf-8")
 
 
 def test_it_trains_and_comes_back_from_disk_as_it_was(tmp_path: Path) -> None:

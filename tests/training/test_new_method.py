@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from capture_files import write_capture
 
-import neeco.methods
 from neeco.base.errors import NeecoError
 from neeco.scene.io import load_scene
 from neeco.scene.method_registry import methods
@@ -73,16 +71,9 @@ Noted.__module__, Noted.method = __name__, "noted"
 
 
 @pytest.fixture(autouse=True)
-def drift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The class, as found in a new file of a folder that stands for `methods/`."""
-    folder = tmp_path / "methods"
-    folder.mkdir()
-    (folder / "drift.py").write_text(FILE)
-    monkeypatch.setattr(neeco.methods, "__path__", [*neeco.methods.__path__, str(folder)])
-    methods.cache_clear()
-    yield
-    methods.cache_clear()
-    del sys.modules["neeco.methods.drift"]
+def drift(methods_folder: Path) -> None:
+    """The class in a new file."""
+    (methods_folder / "drift.py").write_text(FILE)
 
 
 def test_methods_are_found_in_their_files_the_default_one_first() -> None:
@@ -92,14 +83,10 @@ def test_methods_are_found_in_their_files_the_default_one_first() -> None:
     ]
 
 
-def test_two_files_of_one_method_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "methods" / "drifting.py").write_text(FILE)
-    methods.cache_clear()
-    try:
-        with pytest.raises(NeecoError, match=r"drifting: method 'drift' is also in neeco.methods.drift"):
-            methods()
-    finally:
-        del sys.modules["neeco.methods.drifting"]
+def test_two_files_of_one_method_are_refused(methods_folder: Path) -> None:
+    (methods_folder / "drifting.py").write_text(FILE)
+    with pytest.raises(NeecoError, match=r"drifting: method 'drift' is also in neeco.methods.drift"):
+        methods()
 
 
 def test_a_new_method_that_needs_instruments_says_so(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,23 +20,8 @@ from neeco.capture import read_capture
 from neeco.capture.images import write_labels
 from neeco.cli import main
 from neeco.scene.method_registry import methods
-from neeco.studies.downstream.model import find_models
-from neeco.synthesis.dataset import writers
 from neeco.training.run import load_run
 from neeco.viewer.views import picture, views_of
-
-
-@pytest.fixture(autouse=True)
-def looked_for_anew() -> Iterator[None]:
-    """What is installed."""
-    found = (methods, writers, find_models)
-    for cached in found:
-        cached.cache_clear()
-    yield
-    for cached in found:
-        cached.cache_clear()
-    for name in ("neeco_rigid", "neeco_boxlist", "neeco_pixelwise"):
-        sys.modules.pop(name, None)
 
 
 def test_an_installed_method_trains_evaluates_renders_synthesizes_and_is_viewed(site: Path, tmp_path: Path) -> None:

@@ -26,8 +26,7 @@ def in_phase_2(config: ScheduleConfig | None = None, began: int = 2000) -> Sched
 
 
 @pytest.mark.parametrize(
-    ("part", "first", "second"),
-    [("on", SPARSE, DENSE), ("inverse", DENSE, SPARSE), ("off", PLAIN, PLAIN)],
+    ("part", "first", "second"), [("on", SPARSE, DENSE), ("inverse", DENSE, SPARSE), ("off", PLAIN, PLAIN)]
 )
 @pytest.mark.parametrize(
     ("name", "constant"),

@@ -13,13 +13,7 @@ from viewer_world import LIMITS, grasper_scene
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.synthesis.samplers import shafts_of
 from neeco.synthesis.states import Shaft
-from neeco.viewer.controls import (
-    Controls,
-    InstrumentControls,
-    controlled_state,
-    interpolated_state,
-    slider_ranges,
-)
+from neeco.viewer.controls import Controls, InstrumentControls, controlled_state, interpolated_state, slider_ranges
 
 NAME = "grasper"
 TILTED = Shaft(np.array([1.0, 2.0, 3.0]), np.array([0.6, 0.0, 0.8]), True)
