@@ -114,7 +114,7 @@ def test_an_input_changed_before_the_backward_pass_is_noticed() -> None:
 
 def test_what_does_not_fit_is_named() -> None:
     means, quats, scales = torch.zeros(4, 3), torch.ones(4, 4), torch.zeros(4, 3)
-    with pytest.raises(NeecoError, match=r"pose_bodies: counts: \(3,\) of 1 bodies do not share out 4 Gaussians"):
+    with pytest.raises(NeecoError, match=r"pose_bodies: counts: \(3,\) of 1 bodies must sum to 4 Gaussians"):
         pose_bodies(means, quats, scales, None, (3,), (None,))
     with pytest.raises(NeecoError, match=r"pose_bodies: shapes \(4, 3\), \(4, 3\), \(4, 3\)"):
         pose_bodies(means, scales, scales, None, (4,), (None,))

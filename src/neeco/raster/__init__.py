@@ -1,4 +1,4 @@
-"""Rendering Gaussians: `rasterize(gaussians, camera)`, differentiable, on the CPU, on CUDA or, slowly, any device."""
+"""Differentiable Gaussian rendering: `rasterize(gaussians, camera)`, on the CPU, on CUDA or, slowly, on any device."""
 
 from neeco.geometry.camera import Camera
 from neeco.raster.native import kernels

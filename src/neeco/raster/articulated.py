@@ -1,4 +1,4 @@
-"""Posing of articulated bodies: Gaussians on links that joints move, by the definition in torch and by kernels.
+"""Posing of articulated bodies: Gaussians on jointed links, by the definition in torch and by kernels.
 
 A body is a range of rows that move together and by the same joints; instruments are unknown here. A Gaussian's link
 weights blend the joints' values (angles, distances), not transforms as in linear blend skinning.
@@ -21,7 +21,7 @@ from neeco.raster.native import all_run_native, native
 from neeco.raster.triton.ready import runs_triton
 
 MIN_MOVING_SHARE = 1e-6
-MAX_JOINTS, MAX_LINKS = 31, 32  # of a body, limits of the kernels
+MAX_JOINTS, MAX_LINKS = 31, 32  # limits of the kernels, per body
 Rows = tuple[Tensor, Tensor, Tensor, Tensor]  # means [N, 3], quats [N, 4], scales [N, 3], sh_frames [N, 4]
 
 
@@ -160,7 +160,7 @@ def _pose_body(at_rest: Rows, logits: Tensor | None, body: ArticulatedBody) -> R
 
 
 def _kernel(tensors: Sequence[Tensor]) -> Any:
-    """Return the kernel class that poses such tensors; None: the definition."""
+    """Return the kernel class for these tensors; None: the definition."""
     if all_run_native(*tensors):
         return native().Posing
     if all(runs_triton(t) for t in tensors):
@@ -218,7 +218,7 @@ def _check(
         shapes = ", ".join(str(tuple(t.shape)) for t in (means, quats, log_scales))
         raise NeecoError(f"pose_bodies: shapes {shapes}; expected [N, 3], [N, 4] and [N, 3]")
     if len(counts) != len(bodies) or sum(counts) != n or min(counts, default=0) < 0:
-        raise NeecoError(f"pose_bodies: counts: {tuple(counts)} of {len(bodies)} bodies do not share out {n} Gaussians")
+        raise NeecoError(f"pose_bodies: counts: {tuple(counts)} of {len(bodies)} bodies must sum to {n} Gaussians")
     for body in bodies:
         if body is not None and (len(body.origins) > MAX_JOINTS or body.link_count > MAX_LINKS):
             size = f"{len(body.origins)} joints and {body.link_count} links"

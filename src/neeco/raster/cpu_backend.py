@@ -1,4 +1,4 @@
-"""The cpu backend: neeco's own C++ kernels, float32, several threads, the same bits every time."""
+"""The cpu backend: neeco's C++ kernels, float32, multithreaded, deterministic."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ def rasterize_cpu(
     background: Tensor | None,
     alone: Sequence[Tensor] = (),
 ) -> Rendering:
-    """`rasterize` with neeco's own C++ kernels. Inputs are taken as float32 on the CPU."""
+    """`rasterize` with neeco's C++ kernels. Inputs are used as float32 on the CPU."""
     inputs = differentiable(gaussians, camera, channels, background)
     tensors = [None if t is None else _prepared(t) for t in inputs]
     frames = None if gaussians.sh_frames is None else _prepared(gaussians.sh_frames.detach())
     wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     offsets = torch.zeros(len(gaussians), 2, requires_grad=wanted)
-    if not wanted:  # autograd takes a tenth of a small rendering's time
+    if not wanted:  # autograd takes a tenth of the time of a small rendering
         drawing, images = _draw(frames, camera, tensors, keep=False)
         return Rendering(*images, offsets, alone=_alone(drawing, alone, images[1], images[2]))
     layers: tuple[Layer, ...] = ()
-    if alone:  # drawn again: nobody asks for these with gradients where time matters
+    if alone:  # rendered again: with gradients these are never time-critical
         with torch.no_grad():
             layers = rasterize_cpu(gaussians, camera, channels, background, alone).alone
     color, alpha, depth, composited, radii = _Rasterize.apply(offsets, frames, camera, wanted, *tensors)
@@ -40,7 +40,7 @@ def rasterize_cpu(
 
 
 def _alone(drawing: Any, sets: Sequence[Tensor], alpha: Tensor, depth: Tensor) -> tuple[Layer, ...]:
-    """Some of the Gaussians of a drawing without the others, [N] bool each; alpha, depth [H, W]: of all."""
+    """Return layers of subsets of a drawing's Gaussians, [N] bool each; alpha, depth [H, W]: of all Gaussians."""
     layers = tuple(Layer(torch.empty_like(alpha), torch.empty_like(depth)) for _ in sets)
     for chosen, layer in zip(sets, layers, strict=True):
         drawing.alone(chosen.contiguous(), alpha, depth, layer.alpha, layer.depth)

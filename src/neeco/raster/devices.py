@@ -16,12 +16,12 @@ from neeco.raster.triton.ready import missing, require_triton
 
 
 def device_of(word: str, drawing: bool = True) -> torch.device:
-    """Return the device of `--device`: cpu, cuda, cuda:N, or auto: a CUDA device where there is one, else the CPU.
+    """Return the device of `--device`: cpu, cuda, cuda:N, or auto: a CUDA device if there is one, else the CPU.
 
     drawing: it renders, which on CUDA needs triton; else PyTorch is sufficient. `auto` skips a card that
     PyTorch or Triton cannot use, with a warning.
 
-    Raises NeecoError for another word, or a device that is not there or cannot be used.
+    Raises NeecoError for another value, or a device that does not exist or cannot be used.
     """
     name, colon, number = word.partition(":")
     if name not in ("auto", "cpu", "cuda") or (colon and (name != "cuda" or not number.isdecimal())):
@@ -59,7 +59,7 @@ def device_failure(error: BaseException) -> str | None:
             f"--device: the GPU's memory is full{details}: close what else uses it, take smaller budgets of Gaussians "
             "(--max-tissue-gaussians, --max-instrument-gaussians), smaller images or fewer frames, or --device cpu"
         )
-    # since PyTorch 2.8; before, a RuntimeError of the same words
+    # since PyTorch 2.8; before, a RuntimeError with the same message
     accelerator_error = getattr(torch, "AcceleratorError", ())
     gpu_messages = ("CUDA error:", "cuDNN error:", "Triton Error [CUDA]:")
     if isinstance(error, accelerator_error) or message.startswith(gpu_messages):
@@ -88,7 +88,7 @@ def _no_cuda() -> str:
     try:
         torch.cuda.init()
         message = "no further message"
-    except (RuntimeError, AssertionError) as error:  # a driver that is missing, too old or without a card
+    except (RuntimeError, AssertionError) as error:  # missing or outdated driver, or no GPU
         message = _first_line(error).rstrip(".")
     return f"{message}; check `nvidia-smi` and CUDA_VISIBLE_DEVICES, install or update NVIDIA's driver"
 
@@ -98,8 +98,8 @@ def _first_line(error: BaseException) -> str:
 
 
 def _not_built_for(device: torch.device) -> str | None:
-    """Return the reason why this PyTorch has no kernels for the card; None: it has. Binaries (sm_XY) run on cards of
-    the same major and no lower minor number, intermediate code (compute_XY) on all that are no older."""
+    """Return the reason why this PyTorch has no kernels for the GPU; None if it has. Binaries (sm_XY) run on GPUs with
+    the same major and at least this minor version, intermediate code (compute_XY) on all newer GPUs."""
     card = torch.cuda.get_device_capability(device)
     names = torch.cuda.get_arch_list()
     parsed = [match for name in names if (match := re.fullmatch(r"(sm|compute)_(\d+)(\d)[a-z]?", name))]
@@ -155,14 +155,14 @@ def tf32_products(device: torch.device) -> Iterator[None]:
 
 @cache
 def processor_has(*features: str) -> bool:
-    """Whether the processor has one of these instruction sets, by PyTorch's names; false where PyTorch is too old."""
+    """Return whether the CPU has one of these instruction sets, by PyTorch's names; False for an old PyTorch."""
     capabilities: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
     return any(bool(capabilities.get(feature)) for feature in features)
 
 
 def fast_bfloat16() -> bool:
-    """Whether the processor multiplies in bfloat16 several times faster than in float32. Measured: 3 times with AMX on
-    an Intel Xeon, 4 times with AVX-512 BF16 alone on an AMD EPYC, which was a third slower on the Xeon."""
+    """Return whether the CPU multiplies several times faster in bfloat16 than in float32. Measured: 3 times with AMX on
+    an Intel Xeon, 4 times with AVX-512 BF16 alone on an AMD EPYC, but a third slower with it on the Xeon."""
     capabilities: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
     by_amd = str(capabilities.get("cpu_name", "")).startswith("AMD")
     return processor_has("amx_bf16") or (by_amd and processor_has("avx512_bf16"))

@@ -18,7 +18,7 @@ _family: ContextVar[Family] = ContextVar("family of kernels", default="native")
 
 
 def native() -> Any:
-    """Return the module `neeco._native`. Raises NeecoError when it was not built."""
+    """Return the module `neeco._native`. Raises NeecoError if it was not built."""
     try:
         return importlib.import_module("neeco._native")
     except ImportError as error:
@@ -42,19 +42,19 @@ def kernels(family: Family) -> Iterator[None]:
 
 
 def runs_native(tensor: Tensor) -> bool:
-    """Whether the native kernels process `tensor`: it is on the CPU, outside `kernels("torch")`."""
+    """Return whether the native kernels process `tensor`: on the CPU, outside `kernels("torch")`."""
     return tensor.device.type == "cpu" and _family.get() == "native"
 
 
 def all_run_native(*tensors: Tensor) -> bool:
-    """Whether the native kernels, which take float32 alone, process `tensors`."""
+    """Return whether the native kernels, which support only float32, process `tensors`."""
     return all(runs_native(tensor) and tensor.dtype == torch.float32 for tensor in tensors)
 
 
 def set_threads(count: int) -> None:
     """Use `count` threads in every CPU kernel; 0: the cores this process may use, at most OMP_NUM_THREADS."""
     if count < 0:
-        raise NeecoError(f"threads: {count}: must be 0 (automatic) or more")
+        raise NeecoError(f"threads: must be at least 0 (0: automatic) (got {count})")
     native().set_thread_count(count)
 
 
@@ -79,7 +79,7 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 def synchronise(device: torch.device) -> None:
-    """Wait until `device` has finished its queue, before a clock is read."""
+    """Wait until `device` has finished its queue, for time measurements."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 

@@ -43,14 +43,14 @@ def adam_step(
     betas: tuple[float, float] = BETAS,
     eps: float = EPS,
 ) -> None:
-    """One step of Adam (Kingma and Ba 2015), in place, without autograd: `adam_steps` of one tensor, whose gradient may
-    be of another float type."""
+    """Apply one step of Adam (Kingma and Ba 2015), in place, without autograd: `adam_steps` for one tensor, whose
+    gradient may have another float type."""
     adam_steps([Update(param, grad.detach().to(param.dtype), exp_avg, exp_avg_sq, lr, step)], betas, eps)
 
 
 @torch.no_grad()
 def adam_steps(updates: Sequence[Update], betas: tuple[float, float] = BETAS, eps: float = EPS) -> None:
-    """A step of Adam for each of several tensors, in place, without autograd.
+    """Apply a step of Adam to each of several tensors, in place, without autograd.
 
     float32 on the CPU takes the native kernel, float32 on a CUDA device one Triton launch for all tensors (not tested
     on a GPU), everything else plain torch. Both kernels need contiguous tensors and are deterministic, the native one
@@ -108,12 +108,12 @@ def adam_update(
 
 def _check(update: Update) -> None:
     if update.step < 1:
-        raise NeecoError(f"adam_step: step: {update.step}; counts from 1")
+        raise NeecoError(f"adam_step: step: must be at least 1 (got {update.step})")
     parameter = update.parameter
     for name in ("gradient", "exp_avg", "exp_avg_sq"):
         other: Tensor = getattr(update, name)
         if (other.dtype, other.shape, other.device) != (parameter.dtype, parameter.shape, parameter.device):
-            raise NeecoError(f"adam_step: {name}: {_kind(other)}; expected {_kind(parameter)}, as the parameter")
+            raise NeecoError(f"adam_step: {name}: is {_kind(other)}; expected {_kind(parameter)}, as the parameter")
 
 
 def _kind(tensor: Tensor) -> str:
@@ -137,7 +137,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self, learned: Iterable[tuple[str, Tensor, float]]) -> None:
-        """Update parameters, given with their names and learning rates, in place by their gradients, and clear those.
+        """Update parameters, given with names and learning rates, in place by their gradients, and clear the gradients.
         Parameters without a gradient are skipped."""
         updates = []
         for name, parameter, rate in learned:
@@ -161,7 +161,7 @@ class Adam:
                     moments[name][fresh] = 0
 
     def forget(self, name: str) -> None:
-        """Zero one tensor's moments."""
+        """Reset one tensor's moments to zero."""
         for moments in (self.first, self.second):
             if name in moments:
                 moments[name].zero_()

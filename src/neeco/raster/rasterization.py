@@ -52,12 +52,12 @@ def rasterize(
     Gradients reach means, quats, scales, opacities, sh, headlight, channels, background and
     `camera.world_from_camera`, whose inverse is taken as [R^T | -R^T t].
 
-    Raises NeecoError where shapes do not fit, or the backend is not available.
+    Raises NeecoError for mismatched shapes, or an unavailable backend.
     """
     if background is None:
         background = gaussians.background
     _check(gaussians, camera, channels, background)
-    if channels is not None and channels.shape[1] == 0:  # kernels take no empty channels
+    if channels is not None and channels.shape[1] == 0:  # kernels do not support empty channels
         rendering = rasterize(gaussians, camera, background=background, alone=alone, backend=backend)
         return replace(rendering, channels=rendering.color.new_zeros((camera.height, camera.width, 0)))
     if camera.is_resampled:
@@ -101,7 +101,7 @@ def _rasterize_by(
 
 @torch.no_grad()
 def _alone(chosen: Gaussians, camera: Camera, backend: str) -> Layer:
-    """The chosen Gaussians without the others; colours, which take time, are left out."""
+    """Return alpha and depth of the chosen Gaussians alone; colours are not computed."""
     rendering = rasterize(replace(chosen, sh=chosen.sh[:, :1], headlight=None), camera, backend=backend)
     return Layer(rendering.alpha, rendering.depth)
 
@@ -114,7 +114,7 @@ def _rasterize_resized(
     backend: str,
     camera: Camera,
 ) -> Rendering:
-    """`rasterize` for a pinhole of the learned size or a larger one; shadows are as soft as they were learned."""
+    """`rasterize` for a pinhole of at least the learned size; shadows are as soft as they were learned."""
     draw = partial(rasterize, backend=backend)
     pinhole = replace(camera, learned_fx=None)
     gaussians = shadowed(gaussians, of_learned_size(camera), partial(depth_maps, backend=backend))

@@ -16,9 +16,9 @@ from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster.types import Gaussians, Headlight, Rendering
 
 LOW_PASS = 0.3  # px^2 added to projected covariances
-MIN_ALPHA = 1 / 255  # smaller ones are not rendered
+MIN_ALPHA = 1 / 255  # smaller alphas are not rendered
 MAX_ALPHA = 0.999
-MIN_TRANSMITTANCE = 1e-4  # transmittance below which a pixel is full
+MIN_TRANSMITTANCE = 1e-4  # transmittance below which a pixel is saturated
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Projection:
 def rasterize_reference(
     gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
 ) -> Rendering:
-    """`rasterize` as a formula, on the device of the means. Memory grows with Gaussians x pixels."""
+    """`rasterize` as its definition, on the device of the means. Memory is proportional to Gaussians x pixels."""
     means = gaussians.means
     offsets = torch.zeros(len(gaussians), 2, dtype=means.dtype, device=means.device)
     offsets.requires_grad_(torch.is_grad_enabled())

@@ -22,7 +22,7 @@ from neeco.raster.reference import LOW_PASS
 from neeco.raster.types import Gaussians, Layer, Rendering
 
 ORIGIN = torch.eye(4)  # one tensor, so that cameras there are equal when their intrinsics are
-OUTSIDE = 2.0  # in the coordinates of `grid_sample`, beyond the image
+OUTSIDE = 2.0  # a `grid_sample` coordinate outside the image
 
 Draw = Callable[[Camera], Rendering]
 
@@ -69,7 +69,7 @@ def learned_scale(camera: Camera) -> float:
 
 
 def of_rendered_size(camera: Camera) -> Camera:
-    """Return the camera of the pixels that are rendered: of the learned size where its own is smaller."""
+    """Return the camera to render, at least of the learned size."""
     return of_learned_size(camera) if learned_scale(camera) < 1 else camera
 
 
@@ -90,7 +90,7 @@ def widened(gaussians: Gaussians, camera: Camera) -> Gaussians:
 
 
 def of_learned_size(camera: Camera) -> Camera:
-    """Return the camera with approximately the learned number of pixels, to be rendered as it is."""
+    """Return the camera with approximately the learned number of pixels, to be rendered directly."""
     scale = learned_scale(camera)
     resized = camera.resized(*(max(1, round(size / scale)) for size in _size(camera)))
     return replace(resized, learned_fx=None)
@@ -132,7 +132,7 @@ def _covered(many: int, few: int) -> tuple[Tensor, Tensor]:
     start = torch.arange(few, dtype=torch.float64)[:, None] * ratio
     pixels = start.floor() + torch.arange(math.ceil(ratio) + 1)
     shares = (torch.minimum(pixels + 1, start + ratio) - torch.maximum(pixels, start)).clamp_min(0) / ratio
-    used = (shares > 1e-9).any(0)  # the last column often is not
+    used = (shares > 1e-9).any(0)  # the last column is often unused
     return pixels[:, used].clamp_max(many - 1).long(), shares[:, used].float()
 
 

@@ -25,20 +25,20 @@ from neeco.raster.types import Gaussians, Layer, Shadow
 
 @dataclass(frozen=True, kw_only=True)
 class ShadowSettings:
-    """Resolution of shadow maps, and what counts in them."""
+    """Resolution and thresholds of shadow maps."""
 
     map_scale: float = 0.5  # resolution of the map relative to the image
-    map_margin: float = 0.15  # of the image's size, to each side: casters may be outside the image
-    min_light: float = 0.01  # share of the light that reaches any Gaussian
-    min_opacity: float = 1e-4  # of the blurred map: less casts no shadow
-    min_depth: float = 1e-6  # mm, and smallest opacity that depths are divided by
+    map_margin: float = 0.15  # margin on each side, relative to the image's size: casters may be outside the image
+    min_light: float = 0.01  # minimum share of the light that reaches any Gaussian
+    min_opacity: float = 1e-4  # opacity of the blurred map below which there is no shadow
+    min_depth: float = 1e-6  # mm; also the minimum opacity by which depths are divided
     min_distance: float = 1e-3  # mm
-    max_taps: int = 6  # pixels to each side of the window's middle, where it is cut off
+    max_taps: int = 6  # half width of the window in pixels
     min_window_sd: float = 0.3  # px
 
 
 SHADOWS = ShadowSettings()
-GAMMA = 2.2  # of stored images, approximately
+GAMMA = 2.2  # approximate gamma of stored images
 
 Draw = Callable[[Gaussians, Sequence[Camera]], Sequence[Layer]]  # as `depth_maps`
 
@@ -63,7 +63,7 @@ def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw, casters: Gaussian
 def _left_by(
     shadow: Shadow, gaussians: Gaussians, camera: Camera, draw: Draw, others: Gaussians | None
 ) -> Tensor | None:
-    """Return the factor [N] of the Gaussians' stored colours in the shadow; None: no casters, receivers or lamps."""
+    """Return the shadow's factor [N] on the Gaussians' stored colours; None without casters, receivers or lamps."""
     casters, lit = shadow.casters, shadow.strengths.detach() > 0
     every, some, *shines = torch.stack([casters.all(), casters.any(), *lit]).tolist()  # read from the device once
     some = some if others is None else len(others) > 0
@@ -137,7 +137,7 @@ def blocked_reference(
         least = SHADOWS.min_depth
         before = (sums / weight.clamp_min(least)).clamp_min(least)  # [N] mm, depth of the casters there
         hit = (weight > SHADOWS.min_opacity) & (points[:, 2] - offset[2] > before) & ~among.casters
-    few = hit.nonzero()[:, 0]  # gradients are needed for these alone
+    few = hit.nonzero()[:, 0]  # only these need gradients
     points, before = points[few], before[few]
     pixels = torch.stack(project(points - offset, *focus, nearest=SHADOWS.min_distance), 1)
     pixels = pixels + _parallax(offset, pixels.detach(), before, at_light)

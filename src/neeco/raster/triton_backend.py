@@ -1,4 +1,4 @@
-"""The triton backend: float32, rendered and differentiated by neeco's own Triton kernels (`triton/`)."""
+"""The triton backend: float32, rendered and differentiated by neeco's Triton kernels (`triton/`)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TILE_PX = 16
 def rasterize_triton(
     gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
 ) -> Rendering:
-    """`rasterize` with Triton kernels on the device of the means. Inputs are taken as float32.
+    """`rasterize` with Triton kernels on the device of the means. Inputs are used as float32.
 
     The image has the same bits every time; gradients do where `torch.use_deterministic_algorithms(True)` asks for it.
     """
@@ -63,7 +63,7 @@ class _Rasterize(torch.autograd.Function):
             # saved so that autograd detects a modified input before the backward pass
             ctx.save_for_backward(images.alpha, images.depth, *tensors)
             ctx.camera = camera
-            # what the backward pass needs and is no input or output of autograd
+            # intermediate results for the backward pass
             ctx.state = projected, lists, tiles, images.left, images.full_at
         return images.color, images.alpha, images.depth, images.channels, projected.radii
 

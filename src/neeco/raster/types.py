@@ -15,10 +15,10 @@ Held = TypeVar("Held", bound="Movable")
 
 @dataclass(frozen=True)
 class Movable:
-    """Tensors, and groups of them, that move to a device together."""
+    """Base class of groups of tensors that are moved to a device together."""
 
     def to(self: Held, device: torch.device | str) -> Held:
-        """Return the same on `device`."""
+        """Return a copy on `device`."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return replace(self, **{name: value.to(device) for name, value in values.items() if value is not None})
 
@@ -57,7 +57,7 @@ class Headlight(Movable):
 
 
 def _rows(chosen: Tensor) -> Tensor | slice:
-    """Return the indices of what is chosen (bool [N]); on the CPU neighbours, as all instruments are, as a slice."""
+    """Return the indices of True in `chosen` [N]; on the CPU as a slice if they are contiguous, as instruments are."""
     rows = chosen.nonzero()[:, 0]  # waits for the device once
     if chosen.device.type == "cpu" and len(rows) and int(rows[-1] - rows[0]) == len(rows) - 1:
         return slice(int(rows[0]), int(rows[-1]) + 1)
@@ -99,7 +99,7 @@ class Gaussians(Movable):
 def differentiable(
     gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
 ) -> list[Tensor | None]:
-    """Return the tensors that gradients of a rendering reach, in the order of neeco's own backends; None: absent."""
+    """Return the differentiable tensors of a rendering, in the order of neeco's backends; None: absent."""
     light = gaussians.headlight
     return [
         gaussians.means,
@@ -118,7 +118,7 @@ def differentiable(
 
 @dataclass(frozen=True)
 class Layer:
-    """Some of the Gaussians of a rendering, rendered without the others; no gradient."""
+    """A subset of the Gaussians, rendered without the others; no gradient."""
 
     alpha: Tensor  # [H, W]
     depth: Tensor  # [H, W] mm, as that of a rendering
@@ -135,7 +135,7 @@ class Rendering:
     radii: Tensor  # [N] px, 3-sigma-like extent of the ellipse, 0 where not rendered; no gradient
     center_offsets: Tensor  # [N, 2] px, zeros added to the projected centres; `.grad` after backward: d loss / d centre
     _: KW_ONLY
-    alone: tuple[Layer, ...] = ()  # of the Gaussians that were asked for alone
+    alone: tuple[Layer, ...] = ()  # of the requested subsets
 
     @property
     def visible(self) -> Tensor:

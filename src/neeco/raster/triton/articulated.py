@@ -16,7 +16,7 @@ SPIN_END, GATE_START, GATE_WIDTH, LONGEST = tl.constexpr(18), tl.constexpr(19), 
 BODY, VALUES = (
     tl.constexpr(22),
     tl.constexpr(6),
-)  # of a body without joints; per joint: origin, axis, link values
+)  # for a body without joints; per joint: origin, axis, link values
 
 
 @triton.jit
@@ -61,8 +61,8 @@ def turn(pivot, axis, angle, x, y, z, qw, qx, qy, qz):
 
 @triton.jit
 def pose_row(pose):
-    """The pose's rotation as a row of Shepperd's symmetric matrix: which one, its four numbers, the signed length that
-    makes them a unit quaternion with w >= 0."""
+    """Return the pose's rotation as a row of Shepperd's symmetric matrix: its index, its four numbers, and the signed
+    length that normalises them to a unit quaternion with w >= 0."""
     m00, m01, m02 = tl.load(pose), tl.load(pose + 1), tl.load(pose + 2)
     m10, m11, m12 = tl.load(pose + 4), tl.load(pose + 5), tl.load(pose + 6)
     m20, m21, m22 = tl.load(pose + 8), tl.load(pose + 9), tl.load(pose + 10)
@@ -100,7 +100,7 @@ def along_shaft(numbers, x, y, z):
 
 @triton.jit
 def softmax_of(logits, g, inside, LINKS: tl.constexpr, LOGITS: tl.constexpr):
-    """The greatest logit and the sum of all exponentials less by it."""
+    """Return the maximum logit and the sum of exponentials relative to it (log-sum-exp)."""
     greatest = tl.load(logits + g * LOGITS, inside, other=0.0)
     for link in tl.static_range(1, LINKS):
         greatest = tl.maximum(greatest, tl.load(logits + g * LOGITS + link, inside, other=0.0))
@@ -226,8 +226,8 @@ def put_sum(at, value, inside):
 def turn_backward(
     pivot, axis, angle, sums_pivot, sums_axis, inside, x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy, hz
 ):
-    """Points and quaternions back to before the turn, their gradients g and h too, and dL/d angle; sums of dL/d pivot
-    and dL/d axis are written."""
+    """Return points and quaternions, and their gradients g and h, before the rotation, and dL/d angle; sums of dL/d
+    pivot and dL/d axis are written."""
     px, py, pz = three(pivot)
     nx, ny, nz = three(axis)
     s, c = tl.sin(0.5 * angle), tl.cos(0.5 * angle)
@@ -324,7 +324,7 @@ def pose_backward_kernel(
                 at = to_logits + g * LOGITS + link  # zero before the first joint
                 to_share = to_amount * tl.load(own_numbers + VALUES + link - 1) * gate
                 tl.store(at, tl.load(at, inside, other=0.0) + to_share, inside)
-            tl.debug_barrier()  # what was written is read again
+            tl.debug_barrier()  # stores must be visible to later loads
         if JOINTS > 0:
             for link in tl.static_range(LINKS):
                 at = to_logits + g * LOGITS + link
@@ -409,7 +409,7 @@ class Posing:
         self.bodies = list(zip(starts, counts, numbers, how, strict=True))
 
     def forward(self, means: Tensor, quats: Tensor, scales: Tensor, frames: Tensor) -> None:
-        """Write what is posed."""
+        """Write the posed Gaussians."""
         with working_on(means.device):
             for start, count, numbers, how in self.bodies:
                 if count:
@@ -429,7 +429,7 @@ class Posing:
         to_logits: Tensor | None,
         to_numbers: Sequence[Tensor | None],
     ) -> None:
-        """Write gradients of what was given, zeros before, from those of means, quats and scales."""
+        """Write gradients of the inputs, which must be zero-initialised, from those of means, quats and scales."""
         with working_on(means.device):
             for (start, count, numbers, how), to in zip(self.bodies, to_numbers, strict=True):
                 if not count:

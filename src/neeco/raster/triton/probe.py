@@ -1,4 +1,4 @@
-"""The smallest kernel, to see whether any runs."""
+"""A minimal kernel, to test whether kernels run."""
 
 import torch
 import triton
@@ -11,6 +11,6 @@ def probe_kernel(out):
 
 
 def launch(device: torch.device) -> None:
-    """Compiles and starts it on a CUDA device."""
+    """Compile the kernel and run it on a CUDA device."""
     with torch.cuda.device(device):
         probe_kernel[(1,)](torch.empty(1, device=device), num_warps=1, enable_fp_fusion=True)

@@ -16,17 +16,17 @@ OLDEST = (7, 0)  # compute capability that Triton compiles for
 
 
 def installed() -> bool:
-    """Whether the package `triton` is installed; every CUDA build of PyTorch for Linux has it."""
+    """Return whether the package `triton` is installed, as with every CUDA build of PyTorch for Linux."""
     return importlib.util.find_spec("triton") is not None
 
 
 def interpreted() -> bool:
-    """Whether Triton's interpreter replaces its compiler: then kernels run on CPU tensors, slowly."""
+    """Return whether Triton's interpreter replaces its compiler; kernels then run slowly, on CPU tensors."""
     return os.environ.get("TRITON_INTERPRET", "0").lower() in ("1", "true", "on", "yes", "y")
 
 
 def missing(device: torch.device) -> str | None:
-    """Return what Triton lacks on `device`, as far as is known without trying, and the remedy; None: nothing."""
+    """Return the missing requirement of Triton on `device`, without a trial run, and the remedy; None: none."""
     if not installed():
         return f"package triton is missing; on Linux {install_hint('triton')}, or render on the CPU"
     if interpreted():
@@ -42,7 +42,7 @@ def missing(device: torch.device) -> str | None:
 
 @cache
 def require_triton(device: torch.device) -> None:
-    """Raises NeecoError, one line, unless Triton's kernels run on `device`."""
+    """Raise NeecoError unless Triton's kernels run on `device`."""
     if refusal := missing(device):
         raise NeecoError(f"backend: triton: {refusal}")
     if interpreted():
@@ -51,7 +51,7 @@ def require_triton(device: torch.device) -> None:
 
     try:
         launch(device)
-    except Exception as error:  # whatever driver, compiler or assembler say
+    except Exception as error:  # of driver, compiler or assembler
         message = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise NeecoError(
             f"backend: triton: cannot start a kernel on {device}: {message}; check `nvidia-smi` and that a C compiler "
@@ -61,7 +61,7 @@ def require_triton(device: torch.device) -> None:
 
 @cache
 def starts_on(device: torch.device) -> bool:
-    """Whether `require_triton` accepts `device`."""
+    """Return whether `require_triton` accepts `device`."""
     try:
         require_triton(device)
     except NeecoError:
@@ -70,10 +70,10 @@ def starts_on(device: torch.device) -> bool:
 
 
 def runs_triton(tensor: Tensor) -> bool:
-    """Whether Triton's kernels process `tensor`: float32 on a CUDA device on which they start."""
+    """Return whether Triton's kernels process `tensor`: float32 on a CUDA device on which they run."""
     return tensor.is_cuda and tensor.dtype == torch.float32 and starts_on(tensor.device)
 
 
 def working_on(device: torch.device) -> AbstractContextManager[None]:
-    """Until the end of the block, kernels are launched on `device`: Triton launches on the current CUDA device."""
+    """Make `device` the current CUDA device, on which Triton launches kernels, within the block."""
     return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
