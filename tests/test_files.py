@@ -270,14 +270,14 @@ GOOD = {"name": "x", "splits": {"test": {"psnr": None}, "seen": {"psnr": 3}}, "r
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"name": 3}, "f: name: is not as neeco writes it; mend it"),
-        ({"name": "\ud800"}, "f: name: is not as neeco writes it"),
+        ({"name": 3}, "f: name: is not in neeco's format; mend it"),
+        ({"name": "\ud800"}, "f: name: is not in neeco's format"),
         ({"splits": {"\ud800": {}}}, "f: splits: holds a name that is no text"),
         ({"splits": {"test": {}}}, "f: splits: test: psnr is missing; mend it"),
-        ({"splits": {"test": {"psnr": float("nan")}}}, "f: splits: test: psnr: is not as"),
-        ({"splits": []}, "f: splits: is not as"),
-        ({"rows": [1, True]}, r"f: rows\[1\]: is not as"),
-        ({"rows": None}, "f: rows: is not as"),
+        ({"splits": {"test": {"psnr": float("nan")}}}, "f: splits: test: psnr: is not in neeco's"),
+        ({"splits": []}, "f: splits: is not in neeco's"),
+        ({"rows": [1, True]}, r"f: rows\[1\]: is not in neeco's"),
+        ({"rows": None}, "f: rows: is not in neeco's"),
     ],
 )
 def test_what_is_built_otherwise_is_told_by_its_place(change: dict[str, object], told: str) -> None:

@@ -111,7 +111,7 @@ def test_a_scene_without_labels_has_no_mask_numbers(world, tmp_path):
     evaluation = evaluated(make_run(world, tmp_path, labelled=False), ["test"])
     assert evaluation["given"]["test"]["mask_iou"] is None
     assert evaluation["given"]["test"]["psnr_instrument"] is not None
-    assert any("carries no labels" in note for note in evaluation["notes"])
+    assert any("has no labels" in note for note in evaluation["notes"])
 
 
 def test_ignored_pixels_do_not_count(world, tmp_path):

@@ -78,8 +78,8 @@ def test_a_file_may_say_a_number_a_range_or_for_which_share(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "names no effect; give some of shutter_s"),
-        ("- gamma", "names no effect"),
+        ("", "has no effects; choose one or more of shutter_s"),
+        ("- gamma", "has no effects"),
         ("gamma: [1, 2", r"line 1: not valid YAML \(expected"),
         ("gamma: " + "9" * 400, r"gamma: 9+ is out of range"),
         ("gamma: [1, 2, &a [*a]]", "its aliases expand to too many values"),

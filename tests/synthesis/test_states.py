@@ -260,5 +260,5 @@ def test_views_of_a_still_scope_stay_near_what_it_saw():
     for state in scene.recorded.states[:10]:
         place = sampler.views(state, rng).world_from_camera[:3, 3].numpy()
         assert np.linalg.norm(places - place, axis=1).min() < 5
-    with pytest.raises(NeecoError, match="--views orbit: the scope stood still"):
+    with pytest.raises(NeecoError, match="--views orbit: the scope was still"):
         make_sampler(scene, "interpolate", 0.2, "orbit", 1)

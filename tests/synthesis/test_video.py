@@ -67,7 +67,7 @@ def test_a_missing_package_is_named(run: FakeRun, tmp_path: Path, uninstalled) -
     ("words", "said"),
     [
         ([], "render: give exactly one of --output FOLDER and --video FILE.mp4"),
-        (["--output", "a", "--video", "b.mp4"], "one of the two"),
+        (["--output", "a", "--video", "b.mp4"], "exactly one of"),
         (["--video", "film.avi"], "--video: film.avi: wrong file name extension"),
         (["--output", "a", "--frames", "9"], "--frames: applies to --video only"),
         (["--video", "b.mp4", "--frames", "1"], "--frames must be 2 to 1,000,000 (got 1)"),

@@ -136,7 +136,7 @@ def test_a_run_of_another_version_is_refused_by_file_and_field(finished, tmp_pat
 
     for line in ("capture: [1]", "seed: x", "transforms: {}"):
         (run / "config.yaml").write_text(with_line(line))
-        with pytest.raises(NeecoError, match=rf"config.yaml: {line.partition(':')[0]}: is not as neeco writes it"):
+        with pytest.raises(NeecoError, match=rf"config.yaml: {line.partition(':')[0]}: is not in neeco's format"):
             load_run(run)
 
     for line in ("minutes: -0.0", "iterations: 0", "batch_size: 0", "seed: -1"):

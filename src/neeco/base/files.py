@@ -440,7 +440,7 @@ def read_begun(
     require_inside(file, output)
     begun = read_json(file) if read is None else read(output)
     if not isinstance(begun, dict):
-        raise NeecoError(f"{file}: not as neeco writes it; use a new folder")
+        raise NeecoError(f"{file}: not in neeco's format; use a new folder")
     return begun
 
 
@@ -487,7 +487,7 @@ def require_like(value: Any, like: Any, place: str, remedy: str) -> Any:
         if value is not None:
             require_like(value, like[0], place, remedy)
     elif not _is_a(value, like):
-        raise NeecoError(f"{place}: is not as neeco writes it; {remedy}")
+        raise NeecoError(f"{place}: is not in neeco's format; {remedy}")
     return value
 
 

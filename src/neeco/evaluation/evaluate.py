@@ -315,7 +315,7 @@ def _scene_notes(scene: DrawableScene, networks: Mapping[str, Lpips], names: Map
     if missing:
         notes.append(f"{', '.join(missing)}: not computed, no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}")
     if not scene.label_names:
-        notes.append("mask_iou, part_iou: null, the scene carries no labels")
+        notes.append("mask_iou, part_iou: null, the scene has no labels")
         return notes
     parts = {part for _, part in scene.label_names}
     unnamed = sorted(parts - set(names.values()))
@@ -339,7 +339,7 @@ def _split_notes(numbers: dict[str, Any]) -> list[str]:
     if masked < frames:
         notes.append(f"psnr_instrument, mask_iou: over the {masked} of {frames} frames that have a mask")
     if all(value is None or math.isnan(value) for value in numbers["part_iou"].values()):
-        notes.append("part_iou: null, the masks do not tell parts or the scene has none")
+        notes.append("part_iou: null, the masks do not distinguish parts, or the scene has none")
     if math.isnan(numbers["psnr_uncovered"]):
-        notes.append("psnr_uncovered: null, the training frames saw all its tissue")
+        notes.append("psnr_uncovered: null, all tissue was observed in training frames")
     return notes

@@ -123,7 +123,7 @@ def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str
         raise NeecoError(f"{path}: no such folder; give a folder of masks")
     pictures = {file.stem: file for file in visible_entries(path) if file.suffix.lower() == ".png" and file.is_file()}
     if not pictures:
-        raise NeecoError(f"{path}: has no PNG file; give the folder that holds the masks themselves")
+        raise NeecoError(f"{path}: contains no PNG files; give the folder of the masks")
     for suffix in (PARTS_SUFFIX, MASK_SUFFIX, ""):
         files = {name.removesuffix(suffix): file for name, file in pictures.items() if name.endswith(suffix)}
         if files:

@@ -77,7 +77,7 @@ def score_masks(
     for part in dict.fromkeys(theirs.values()):
         if part not in ours.values():
             rows[part] = dict.fromkeys((*SCORES, "images"))
-            notes.append(f"{part}: null, the prediction has no such part; it counts as not found in Challenge IoU")
+            notes.append(f"{part}: null, the prediction has no such part; it counts as not detected in Challenge IoU")
     instrument = _means(whole, "instrument", "instrument")
     if unnamed := [part for part, row in {"instrument": instrument, **rows}.items() if row["images"] == 0]:
         notes.append(f"{', '.join(unnamed)}: null, no image shows it")

@@ -81,7 +81,7 @@ def check_finite(total: float, iteration: int, where: str = "") -> None:
     if not math.isfinite(total):
         raise NeecoError(
             f"training: the loss became {total} at iteration {iteration}{where}; run `neeco check` on the capture, or "
-            "train anew with another --seed (the last checkpoint is kept)"
+            "train again with another --seed (the last checkpoint is kept)"
         )
 
 

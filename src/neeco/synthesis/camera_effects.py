@@ -116,7 +116,7 @@ def read_effects(path: Path) -> CameraEffects:
     text = read_text(path, "a YAML file of camera effects; docs/synthesis.md shows one")
     lines = parse_yaml(path, text, "repair it")
     if not isinstance(lines, dict) or not lines:
-        raise NeecoError(f"{path}: names no effect; give some of {', '.join(EFFECTS)}")
+        raise NeecoError(f"{path}: has no effects; choose one or more of {', '.join(EFFECTS)}")
     soft = lines.pop(SOFT_MASKS, "mid")
     if soft not in ("mid", "mean"):
         raise NeecoError(f"{path}: {SOFT_MASKS}: {soft!r} is neither mid nor mean")

@@ -297,7 +297,7 @@ def writer(name: str) -> type[Writer]:
     """Return the writer of the format `name`. Raises NeecoError when there is none."""
     if name not in writers():
         available = ", ".join(writers())
-        raise NeecoError(f"--formats: {name!r} is unknown; choose of {available}, or install the package that has it")
+        raise NeecoError(f"--formats: {name!r} is unknown; choose one of: {available}, or install its package")
     return writers()[name]
 
 

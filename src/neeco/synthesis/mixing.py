@@ -75,7 +75,7 @@ class Mixture:
         if not names:
             raise NeecoError("--instruments: none of the runs has an instrument; train on captures that record them")
         if any(not scene.recorded.states for scene in (tissue, *instrument_scenes)):
-            raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
+            raise NeecoError("--tissue: a run stores no recorded frames; train it again with this version")
         gains: list[tuple[float, float, float]] = []
         for scene in instrument_scenes:  # gain 1 without an instrument to compare with, or for the same run
             gain = torch.ones(3)

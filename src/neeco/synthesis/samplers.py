@@ -88,7 +88,7 @@ class RecordedViews:
 
     def __init__(self, cameras: Sequence[Camera], states: Sequence[State] = ()) -> None:
         if not cameras:
-            raise NeecoError("views: the scene remembers no recorded camera; train it again with this version")
+            raise NeecoError("views: the scene stores no recorded cameras; train it again with this version")
         self.cameras = cameras
         self._frames = SimilarFrames(states, len(cameras), joints=False)
 
@@ -178,7 +178,7 @@ def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views,
         view_sampler = PerturbedViews(recorded, *((SAMPLING.still_degrees, SAMPLING.still_mm) if still else ()))
     if views == "orbit":
         if still:
-            raise NeecoError("--views orbit: the scope stood still, which shows no side; use recorded or perturbed")
+            raise NeecoError("--views orbit: the scope was still, which shows only one side; use recorded or perturbed")
         chosen = evenly_spaced(len(scene.recorded.cameras), SAMPLING.n_surface_views, floor=True)
         with torch.no_grad():
             seen = [(scene.at(scene.recorded.states[k]), scene.recorded.cameras[k]) for k in chosen]

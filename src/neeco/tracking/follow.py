@@ -72,7 +72,7 @@ class Step:
         try:
             return _converter().structure(stored, cls)
         except (BaseValidationError, TypeError, ValueError, KeyError):
-            raise NeecoError(f"{place}: is not as neeco writes it; remove the output folder and track again") from None
+            raise NeecoError(f"{place}: is not in neeco's format; remove the output folder and track again") from None
 
 
 @cache

@@ -48,7 +48,7 @@ class TrackedParameters(StateParameters):
         if not scene.instruments:
             raise NeecoError("track: the run has no instrument; train on a capture that records one")
         if not scene.recorded.states:
-            raise NeecoError("track: the run remembers no recorded frame; train it again with this version")
+            raise NeecoError("track: the run stores no recorded frames; train it again with this version")
         instruments = []
         for instrument, articulation in zip(scene.instruments, deformation.articulations, strict=True):
             shaft, names = articulation.shaft(), tuple(instrument.joints)

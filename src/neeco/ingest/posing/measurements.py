@@ -171,7 +171,7 @@ def read_measurements(capture: Capture) -> dict[str, Measurements]:
         except (KeyError, IndexError, ValueError):
             whole = False
         if not whole:
-            raise NeecoError(f"{path}: {name}: is not as neeco writes it; {again}")
+            raise NeecoError(f"{path}: {name}: is not in neeco's format; {again}")
         measurements[name] = measured
     return measurements
 
