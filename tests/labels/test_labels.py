@@ -3,7 +3,7 @@ from copy import copy
 import numpy as np
 import pytest
 import torch
-from rod_world import Rod
+from rod_world import Rod, make_scene
 
 from neeco.base.errors import NeecoError
 from neeco.geometry.camera import Camera
@@ -185,8 +185,8 @@ class Still(Rod):
         return Deltas(*(torch.zeros(len(canonical), columns) for columns in (3, 4, 3)))
 
 
-def test_a_scene_that_does_not_move_cannot_be_labelled_by_threshold(scene):
-    scene = copy(scene)
+def test_a_scene_that_does_not_move_cannot_be_labelled_by_threshold():
+    scene = make_scene()
     scene.deformation = Still(30)
     with pytest.raises(NeecoError, match="moves nothing"):
         find_thresholds(scene)
