@@ -6,6 +6,7 @@ import copy
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture import check_capture
 from neeco.capture.checks import read_checked
+from neeco.capture.checks.evidence import Candidate
 from neeco.capture.checks.pictures import read_pictures
-from neeco.capture.checks.verdicts import ImageVerdicts
+from neeco.capture.checks.verdicts import ImageVerdicts, instrument_candidates, likeliest
 from neeco.capture.documents import ProblemReport
 from neeco.capture.kinematics import KinematicTree, Link
 from neeco.capture.readers import parse_capture
@@ -201,6 +203,35 @@ def shuffle(document: Document) -> None:
 def test_poses_in_the_axes_of_a_robots_endoscope_are_named(sample):
     (line,) = told(sample, in_ecm_axes)
     assert line.startswith("frames[*].instruments[*].pose: poses of 'maryland' were converted to the world with the")
+
+
+class AgreesWith:
+    """Images that agree with instruments at some places, and not with those recorded elsewhere."""
+
+    def __init__(self, places: np.ndarray) -> None:
+        self.places = places
+
+    def quick(self, candidate: Candidate) -> float:
+        return self.compare(candidate)[2]
+
+    def compare(self, candidate: Candidate) -> tuple[float, float, float]:
+        agrees = np.allclose(np.asarray(candidate.poses)[:, :3, 3], self.places)
+        return (5.0, 16.0, 0.5) if agrees else (1.0, 0.0, 0.1)
+
+
+def test_one_mistake_that_has_two_descriptions_is_told():
+    """In a still camera's world, a half turn of the world's axes and an endoscope's own axes give the same poses."""
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(np.linspace([0.1, 0.2, 0.3], [0.6, -0.4, 0.9], 6)).as_matrix()
+    poses[:, :3, 3] = np.random.default_rng(0).uniform([-20, -15, 60], [20, 15, 90], (6, 3))
+    cameras = np.tile(np.eye(4), (6, 1, 1))
+    candidates = list(instrument_candidates(poses, cameras, "psm1"))
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0]) @ poses
+    told = likeliest(candidates, AgreesWith(turned[:, :3, 3]))
+    assert told is not None
+    assert np.allclose(told.poses, turned)
+    other = replace(told, message="another mistake", poses=turned @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+    assert likeliest([other, *candidates], AgreesWith(turned[:, :3, 3])) is None
 
 
 def test_states_that_nothing_explains_contradict_the_images_and_no_cause_is_named(sample):

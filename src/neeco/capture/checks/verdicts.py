@@ -191,8 +191,12 @@ def likeliest(candidates: Sequence[Candidate], evidence: ColorEvidence | MotionE
         for candidate, factor, _, agreement in compared
         if factor > SETTINGS.pose.factor and agreement > SETTINGS.rival * most
     ]
-    equivalent = [one for one in rivals if one is best or (one.kind == best.kind and one.kind != "pose")]
-    return best if len(equivalent) == len(rivals) or best not in equivalent else None
+
+    def equals_best(one: Candidate) -> bool:  # in a still camera's world several descriptions are the same poses
+        same_kind = one.kind == best.kind
+        return same_kind and (one.kind != "pose" or np.allclose(np.asarray(one.poses), np.asarray(best.poses)))
+
+    return best if best not in rivals or all(map(equals_best, rivals)) else None
 
 
 def _pose_candidates(poses: np.ndarray, name: str, factors: Sequence[float] = ()) -> Iterator[Candidate]:
@@ -250,12 +254,11 @@ def resampled(
     words = f"on a clock that runs {rate:.3g} times as fast"
     if rate == 1:
         words = f"{abs(steps)} frame{'s' * (abs(steps) > 1)} {'earlier' if steps > 0 else 'later'}"
-    small = abs(steps) <= min(SETTINGS.small_shift, len(poses) // 5)
     return Candidate(
         "shift" if rate == 1 else "rate",
         f"states of {name} fit the images better {words}",
         "correct their times (clock offset or rate, dropped frames, or another first frame)",
-        SETTINGS.shift if small else SETTINGS.pose,
+        SETTINGS.shift if abs(steps) <= min(SETTINGS.small_shift, len(poses) // 5) else SETTINGS.pose,
         poses=poses[source],
         available=(source == shifted) & (recording[source] == recording[rows]),
         steps=steps,
@@ -287,5 +290,4 @@ def offset_candidates(poses: np.ndarray, rows: np.ndarray) -> Iterator[Candidate
             at = (rows + steps).clip(0, len(poses) - 1)
             words = f"{abs(steps)} frame{'s' * (abs(steps) > 1)} {'earlier' if steps < 0 else 'later'}"
             message, remedy = f"the images fit the cameras of {words}", f"list each with the frame that is {words}"
-            exists = at == rows + steps
-            yield Candidate("order", message, remedy, SETTINGS.offset, poses=poses[at], available=exists)
+            yield Candidate("order", message, remedy, SETTINGS.offset, poses=poses[at], available=at == rows + steps)

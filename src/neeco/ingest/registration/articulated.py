@@ -93,7 +93,9 @@ class ArticulatedSettings:
     # maximum standard deviation of a head's turns before a still camera, of an unknown base: with more, the base may
     # be mirrored
     max_swing_rad: float = 0.2
-    swinging_scatter: float = 1.6  # factor on standard deviations: its shape makes up for slow errors of logs
+    # factors on standard deviations, before a moving and a still camera: its shape compensates slow errors of logs, and
+    # before a still camera also a wrong size
+    swinging_scatter: tuple[float, float] = (1.6, 2.2)
     head_mm: float = 12.0  # distance from the tip to the tube's end
     head_sd_mm: float = 6.0  # standard deviation of the head's length
     bend_sd_rad: float = 0.4  # standard deviation of its mean turns
@@ -106,7 +108,6 @@ class ArticulatedSettings:
     end_steps_mm: tuple[float, ...] = (-6.0, 6.0)  # shifts of the tube's end along it
     clock_steps_s: tuple[float, ...] = (-0.04, 0.04)  # changes of a clock that is not known
     max_changes: int = 6  # maximum number of times that each of these is made, as long as it improves the fit
-    size_sd: float = 0.04  # standard deviation of the logarithm of the size: wrists and jaws blur the tip
     along_sd_mm: float = 3.0  # standard deviation along the shaft, which a tube hardly determines
     gap_mm: float = 3.0  # length between tube and head
     gap_sd_mm: float = 2.0  # standard deviation of that length
@@ -295,17 +296,12 @@ def _tube_in_world(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[np
     return poses[:, :3, :3] @ end + poses[:, :3, 3], poses[:, :3, :3] @ fit.model.shaft_axis(fit.parameters)
 
 
-def _trocar(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
-    """The point [3] mm, world, nearest to all lines of the tube."""
-    return nearest_point(*_tube_in_world(problem, fit), ridge=1e-3)
-
-
 def _resized(problem: ArticulatedProblem, factor: float, fit: ArticulatedFit) -> ArticulatedFit:
-    """The fit scaled about a still camera, with the robot's motion as it is."""
+    """The fit scaled about a still camera, as is the trocar, with the robot's motion as it is."""
     camera = np.linalg.inv(problem.camera_from_world[0])[:3, 3]
-    ends, _ = _tube_in_world(problem, fit)
+    ends, directions = _tube_in_world(problem, fit)
     base, parameters = fit.world_from_base.copy(), fit.parameters.copy()
-    base[:3, 3] += (factor - 1) * (_trocar(problem, fit) - camera)
+    base[:3, 3] += (factor - 1) * (nearest_point(ends, directions, ridge=1e-3) - camera)
     moved = replace(fit, world_from_base=base)
     off = camera + factor * (ends - camera) - _tube_in_world(problem, moved)[0]
     turns = (base @ poses_at_clock(problem.poses, fit.clock))[:, :3, :3]
@@ -396,7 +392,7 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
 def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], tree: KinematicTree | None) -> BaseRegistration:
     prior, full = problem.prior, covariance(problem, with_errors := with_pose_errors(problem, fits[0]))
     best = fits[0] if tree is None else with_errors  # errors of poses beside swings make up for too much
-    scatter = LINKED.swinging_scatter if tree is None else LINKED.scatter
+    scatter = LINKED.swinging_scatter[problem.still] if tree is None else LINKED.scatter
     spread = scatter**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
         weight = float(np.exp(-0.5 * (other.cost - fits[0].cost) / scatter**2))
@@ -409,9 +405,6 @@ def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], tree: Kinem
     in_view = in_view + np.diag(floor**2)
     if tree is None:
         in_view[3:, 3:] += LINKED.along_sd_mm**2 * np.outer(shaft, shaft)
-    if tree is None and problem.still:
-        away = problem.camera_from_world[0] @ np.append(_trocar(problem, best), 1.0)
-        in_view[3:, 3:] += LINKED.size_sd**2 * np.outer(away[:3], away[:3])
     spread, open_directions = with_prior(in_view, prior, shaft)
     stated: dict[str, Any] = {}
     if prior.sd_mm is not None:
