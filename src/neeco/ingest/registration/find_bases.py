@@ -25,7 +25,7 @@ from neeco.ingest.registration.articulated import LoggedMotion, find_base
 from neeco.ingest.registration.base import BASES, BaseRegistration
 from neeco.ingest.registration.hand_eye import HAND_EYE, Registration
 from neeco.ingest.registration.logged import Prior
-from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, ClockOffset
+from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, VIDEOS_OWN, ClockOffset
 from neeco.ingest.timing.episodes import Episode, Episodes
 
 
@@ -44,7 +44,7 @@ class FindBasesSettings:
 
 PLACING = FindBasesSettings()
 
-KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
+KNOWN, FOUND = (GIVEN, SCOPE_MOTION, VIDEOS_OWN), "found with the base"  # sources of clocks
 
 
 def check_reference_frames(data: Episodes, *, moving: bool) -> None:

@@ -40,7 +40,7 @@ class ClockSearchSettings:
 
 CLOCK = ClockSearchSettings()
 GIVEN, SCOPE_MOTION, INSTRUMENT_MOTION = "given", "scope motion", "instrument motion"  # sources of clocks
-ASSUMED = "assumed equal to the video's"
+ASSUMED, VIDEOS_OWN = "assumed equal to the video's", "the images' own"
 
 
 @dataclass(frozen=True)

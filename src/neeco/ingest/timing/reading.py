@@ -16,7 +16,7 @@ from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_r
 from neeco.ingest.recording.base import STATED
 from neeco.ingest.recording.compatibility import check_recordings, episode_names, refusal
 from neeco.ingest.recording.model import STILL, Recording
-from neeco.ingest.timing.clock_search import CLOCK, GIVEN, ClockOffset
+from neeco.ingest.timing.clock_search import CLOCK, GIVEN, VIDEOS_OWN, ClockOffset
 from neeco.ingest.timing.episodes import EPISODES, Episode, Episodes, Notes, assumed_clock
 
 
@@ -100,7 +100,7 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
         notes.add(note, episode)
     clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
     if VIDEO_CLOCK in recording.clocks:
-        clocks.setdefault(VIDEO_CLOCK, ClockOffset(0.0, 0.0, "the images' own"))
+        clocks.setdefault(VIDEO_CLOCK, ClockOffset(0.0, 0.0, VIDEOS_OWN))
     # joints' clocks that nothing gives are the video's: images determine them to some 20 ms at best; trackers' clocks,
     # and those of joints on one of them, are found later, from motion
     found_later = {log.clock for log in (*poses.values(), *([scope] if scope else []))}
