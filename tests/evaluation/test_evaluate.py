@@ -204,7 +204,7 @@ def test_numbers_that_could_not_be_written_are_told_before_scoring(trained, tmp_
 def test_numbers_are_also_written_where_asked(trained, tmp_path):
     assert main(["evaluate", str(trained), "--json", str(tmp_path / "new" / "scores.json")]) == 0
     assert (tmp_path / "new" / "scores.json").read_text() == (trained / "evaluation.json").read_text()
-    assert "images it never saw. " in (trained / "report.html").read_text()
+    assert "images not used in training. " in (trained / "report.html").read_text()
 
 
 def test_the_device_is_waited_for_before_a_clock_is_read(world, tmp_path, monkeypatch):

@@ -29,8 +29,8 @@ def test_a_base_8_mm_and_5_degrees_off_is_found_with_its_clock():
     found = _find(world, (given, *ROUGH))
     beside, _, degrees = errors(found.world_from_base, world.poses_at(0.0))
     assert errors(given, world.poses_at(0.0))[1] > 7
-    assert beside < 0.8
-    assert degrees < 1.2  # the log is 3.5 s long and the instrument tilts by 9 degrees
+    assert beside < 1.3
+    assert degrees < 1.6  # the log is 3.5 s long and the instrument tilts by 9 degrees
     assert abs(found.clock_s - TRUE_CLOCK_S) < min(0.013, 2 * found.clock_sd_s)
     assert found.overlap > 0.8 > found.overlap_before + 0.1
     # a rigid shape hardly shows how far in it is: that stays uncertain by mm, unlike the motion that it does show

@@ -96,6 +96,7 @@ class ArticulatedSettings:
     # factors on standard deviations, before a moving and a still camera: its shape compensates slow errors of logs, and
     # before a still camera also a wrong size
     swinging_scatter: tuple[float, float] = (1.6, 2.2)
+    usual_residual_px: float = 0.5  # residual up to which these hold; they grow in proportion to larger ones
     head_mm: float = 12.0  # distance from the tip to the tube's end
     head_sd_mm: float = 6.0  # standard deviation of the head's length
     bend_sd_rad: float = 0.4  # standard deviation of its mean turns
@@ -255,6 +256,9 @@ def _fits(problem: ArticulatedProblem, starts: list[ArticulatedFit]) -> list[Art
         sized = [_resized(few, factor, fit) for factor in LINKED.start_sizes]
         coarse += [fit_articulated(few, start, LINKED_FIT.widths_px[:2], 10) for start in sized]
     chosen = [fit.in_frames(problem) for fit in _distinct(problem, coarse)[: LINKED.n_refined]]
+    if chosen and not rough:
+        factor = max(1.0, chosen[0].residual_px / LINKED.usual_residual_px)
+        chosen = [replace(fit, scatter=factor * LINKED.swinging_scatter[problem.still]) for fit in chosen]
     fits = [fit_articulated(problem, fit, LINKED_FIT.widths_px[1:]) for fit in chosen]
     if fits and not rough:
         best = min(fits, key=lambda fit: fit.cost)
@@ -391,8 +395,9 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
 
 def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], tree: KinematicTree | None) -> BaseRegistration:
     prior, full = problem.prior, covariance(problem, with_errors := with_pose_errors(problem, fits[0]))
-    best = fits[0] if tree is None else with_errors  # errors of poses beside swings make up for too much
-    scatter = LINKED.swinging_scatter[problem.still] if tree is None else LINKED.scatter
+    swinging = tree is None and bool((fits[0].swings[:, :2].std(0) > LINKED.max_swing_rad).any())
+    best = fits[0] if swinging else with_errors  # errors of poses beside swings make up for too much
+    scatter = fits[0].scatter if tree is None else LINKED.scatter
     spread = scatter**2 * full[:6, :6]
     for other in fits[1:]:  # as likely as its cost says
         weight = float(np.exp(-0.5 * (other.cost - fits[0].cost) / scatter**2))

@@ -120,6 +120,7 @@ class ArticulatedFit:
     clock: float = 0.0
     swings: np.ndarray  # [F, 3 or 0] rad and mm, added to the values of the first joints: turns and slide of a head
     pose_errors: np.ndarray  # [F, 6 or 0] rad, mm: turns about the root and shifts, world; 0: not fitted
+    scatter: float = 1.0  # factor on standard deviations that the masks give, by which a base's prior counts more
     cost: float = np.inf  # robust loss of the residuals and the priors' squares
     residual_px: float = np.inf  # median
 
@@ -294,6 +295,7 @@ def prior_residuals(problem: ArticulatedProblem, fit: ArticulatedFit) -> tuple[n
     [BASE + P + F K]; 0 of parameters that are not fitted."""
     model = fit.model
     off, sds = problem.prior.offsets(problem.middle, fit.world_from_base, fit.clock)
+    sds[:6] /= fit.scatter
     off, sds = np.append(off, fit.parameters - model.means), np.append(sds, model.sds)
     off, sds = np.append(off, fit.of_frames), np.append(sds, np.tile(fit.frame_sds, len(fit.of_frames)))
     scale = np.divide(1, sds, out=np.zeros(len(sds)), where=sds > 0)
