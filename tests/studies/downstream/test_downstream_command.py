@@ -103,7 +103,7 @@ def test_a_failing_training_is_told_and_is_exit_1(words, drawn: Path, tmp_path: 
         (["--size", "0"], "--size must be at least 1 (got 0)"),
         (["--batch", "-1"], "--batch must be at least 1 (got -1)"),
         (["--test", "nowhere"], "nowhere"),
-        (["--backgrounds", "nowhere"], "--backgrounds nowhere: has no image"),
+        (["--backgrounds", "nowhere"], "--backgrounds nowhere: contains no images"),
         (["--splits", "tset"], "--splits: tset: "),
         (["--labels", "nowhere"], "nowhere: no such folder; give a folder of masks"),
         (["--device", "tpu"], "--device: 'tpu' is unknown"),

@@ -76,5 +76,5 @@ def test_a_still_cameras_background_is_the_median_of_frames_that_show_it(labelle
 def test_a_folder_without_images_is_refused(labelled, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for name in ("nowhere", "empty"):
-        with pytest.raises(NeecoError, match=rf"--backgrounds .*{name}: has no image"):
+        with pytest.raises(NeecoError, match=rf"--backgrounds .*{name}: contains no images"):
             pasted_samples(labelled, tmp_path / name, 0)

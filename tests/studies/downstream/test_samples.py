@@ -119,10 +119,10 @@ def test_of_a_set_of_others_masks_are_enough(value: int, tmp_path: Path) -> None
 
 
 def test_sets_that_cannot_be_read_are_refused(drawn: Path, tmp_path: Path) -> None:
-    with refused("--sets set", "has 0 images", "neeco synthesize"):
+    with refused("--sets set", "has 0 training images", "neeco synthesize"):
         loaded(tmp_path / "nowhere")
     (tmp_path / "empty" / "images").mkdir(parents=True)
-    with refused("--sets set", "has 0 images", "neeco synthesize"):
+    with refused("--sets set", "has 0 training images", "neeco synthesize"):
         loaded(tmp_path / "empty")
     with refused("--sets set", "has 6 training images, expected 7"):
         loaded(drawn, count=7)

@@ -90,8 +90,7 @@ class ArticulatedSettings:
     # minimum ratio of the cost with poses of other moments, about a stated base and about an unknown one: of right ones
     # 5 to 120, of another moment's 2 to 3 where a base is stated
     swinging_exchanged: tuple[float, float] = (4.0, 8.0)
-    # maximum standard deviation of a head's turns before a still camera, of an unknown base: with more, the base may
-    # be mirrored
+    # maximum standard deviation of a head's turns, of an unknown base before a still camera, and with errors of poses
     max_swing_rad: float = 0.2
     # factors on standard deviations, before a moving and a still camera: its shape compensates slow errors of logs, and
     # before a still camera also a wrong size
@@ -320,8 +319,7 @@ def known_starts(problem: ArticulatedProblem, model: ArticulatedModel) -> list[A
     """The base as stated, and shifted along the shaft or turned about it: there it is the least certain."""
     base = problem.prior.world_from_base
     shaft = unit((base[:3, :3] @ problem.poses[MIDDLE][:, :3, :3] @ model.axis).mean(0))
-    steps = [np.zeros(6)]
-    steps += [np.append(np.zeros(3), along * shaft) for along in LINKED.along_mm]
+    steps = [np.append(np.zeros(3), along * shaft) for along in (0.0, *LINKED.along_mm)]
     steps += [np.append(roll * shaft, np.zeros(3)) for roll in LINKED.rolls_rad]
     return [ArticulatedFit.start(model, moved_base(base, problem.pivot(base), step)) for step in steps]
 
@@ -394,20 +392,22 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
 
 
 def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], tree: KinematicTree | None) -> BaseRegistration:
-    prior, full = problem.prior, covariance(problem, with_errors := with_pose_errors(problem, fits[0]))
+    prior, alike = problem.prior, fits
     swinging = tree is None and bool((fits[0].swings[:, :2].std(0) > LINKED.max_swing_rad).any())
-    best = fits[0] if swinging else with_errors  # errors of poses beside swings make up for too much
+    if tree is None and not swinging and prior.sd_mm is None:  # beside swings these would make up for too much
+        alike = sorted((with_pose_errors(problem, fit) for fit in fits[: LINKED.n_refined]), key=lambda fit: fit.cost)
+    full = covariance(problem, with_errors := with_pose_errors(problem, alike[0]))
+    best = fits[0] if swinging else with_errors
     scatter = fits[0].scatter if tree is None else LINKED.scatter
     spread = scatter**2 * full[:6, :6]
-    for other in fits[1:]:  # as likely as its cost says
-        weight = float(np.exp(-0.5 * (other.cost - fits[0].cost) / scatter**2))
+    for other in alike[1:]:  # as likely as its cost says
+        weight = float(np.exp(-0.5 * (other.cost - alike[0].cost) / scatter**2))
         off = step_between(best.world_from_base, other.world_from_base, problem.middle)
         spread = spread + weight / (1 + weight) * np.outer(off, off)
-    in_view = in_camera(spread, problem.camera_from_world[0])
     floor = np.array([np.radians(LINKED.floor_deg)] * 3 + [LINKED.floor_mm, LINKED.floor_mm, LINKED.floor_depth_mm])
     poses = problem.camera_from_world[0] @ best.world_from_base @ poses_at_clock(problem.poses, best.clock)
     shaft = unit((poses[:, :3, :3] @ best.model.shaft_axis(best.parameters)).mean(0))
-    in_view = in_view + np.diag(floor**2)
+    in_view = in_camera(spread, problem.camera_from_world[0]) + np.diag(floor**2)
     if tree is None:
         in_view[3:, 3:] += LINKED.along_sd_mm**2 * np.outer(shaft, shaft)
     spread, open_directions = with_prior(in_view, prior, shaft)
