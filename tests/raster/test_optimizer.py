@@ -57,7 +57,7 @@ def test_plain_torch_is_the_formula(shape: tuple[int, ...], lr: float, betas: tu
 def test_a_step_needs_no_numbers_of_a_device() -> None:
     tensors = torch.zeros(4, 5, 3, device="meta")
     adam_step(*tensors, lr=0.1, step=1)
-    with pytest.raises(NeecoError, match=r"exp_avg: float32 .* on cpu; expected float32 .* on meta"):
+    with pytest.raises(NeecoError, match=r"exp_avg: is float32 .* on cpu; expected float32 .* on meta"):
         adam_step(tensors[0], tensors[1], torch.zeros(5, 3), tensors[3], lr=0.1, step=1)
 
 

@@ -165,7 +165,10 @@ def test_states_written_are_states_read(tmp_path, scene, state):
         (lambda line: line.update(time=10**400), "time: is a huge integer, not a finite number"),
         (lambda line: line["instruments"][0]["pose"][0].__setitem__(3, 10**400), r"instruments\[0\].pose"),
         (lambda line: line["instruments"][0].update(name=["rod"]), r"instruments\[0\].name: \['rod'\] is not"),
-        (lambda line: line["instruments"].append(line["instruments"][0]), r"instruments\[1\].name: 'rod' is listed twice"),
+        (
+            lambda line: line["instruments"].append(line["instruments"][0]),
+            r"instruments\[1\].name: 'rod' is listed twice",
+        ),
     ],
 )
 def test_a_bad_state_is_refused_with_its_line_and_field(tmp_path, scene, state, change, field):
