@@ -7,7 +7,7 @@
     python benchmarks/worlds.py table --commits OLD . --worlds 40 --seed S --work DIR   # what is there so far
 
 `draw` renders a capture of 192x144 to 320x256, 12 to 120 training frames, with truth/ and world.json; what is drawn
-from which distribution is in `rendered/draws.py`. 6 to 25 s of CPU time.
+from which distribution is in `rendered/draws.py`. 6 to 25 s of CPU time; touched worlds of 120 frames take minutes.
 
 With --touched the instrument presses, slides on, grasps or pulls the tissue (`rendered/touch.py`), which gives way;
 the world is that of the seed otherwise, but for the noise of trackers and structure from motion, which is drawn anew.
