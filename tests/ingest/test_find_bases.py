@@ -77,7 +77,7 @@ def test_a_rough_base_is_found_with_its_clock_and_told_in_a_note():
     world = make_world(44)
     data = _data(world, StatedBase(disturbed(8, 5, 1, world), 5.0, 3.0))
     placed, _ = find_bases(data, _black(world), lambda rows: world.masks[rows], silent)
-    assert errors(placed.world_from_base["psm1"], world.poses_at(0.0))[0] < 0.8
+    assert errors(placed.world_from_base["psm1"], world.poses_at(0.0))[0] < 1.3
     assert placed.clock("ros").source == "found with the base"
     assert abs(placed.clock("ros").seconds - 0.03) < min(0.013, 2 * placed.clock("ros").sd)
     assert "its base was found from what moves in 44 frames" in data.notes.sentences[0]
