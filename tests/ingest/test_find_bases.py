@@ -33,7 +33,7 @@ from neeco.ingest.registration import find_bases as module
 from neeco.ingest.registration.base import BaseRegistration, in_camera
 from neeco.ingest.registration.find_bases import correct_placement, find_bases, follow_cameras
 from neeco.ingest.registration.hand_eye import Registration
-from neeco.ingest.timing.clock_search import GIVEN, ClockOffset
+from neeco.ingest.timing.clock_search import GIVEN, VIDEOS_OWN, ClockOffset
 
 LENS = Lens(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (), (WIDTH, HEIGHT))
 STILL = np.tile(np.eye(4), (44, 1, 1))
@@ -94,6 +94,15 @@ def test_what_shows_no_shaft_names_the_recording_and_the_key_that_states_the_bas
     ):
         find_bases(data, views, lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool), silent)
     assert LENS.intrinsics == INTRINSICS
+
+
+@pytest.mark.slow
+def test_a_log_on_the_videos_own_clock_keeps_it_while_its_base_is_found():
+    world = make_world(44)
+    own = ClockOffset(0.03, 0.0, VIDEOS_OWN)
+    data = _data(world, StatedBase(disturbed(8, 5, 1, world), 5.0, 3.0), {"ros": own})
+    placed, _ = find_bases(data, _black(world), lambda rows: world.masks[rows], silent)
+    assert placed.clock("ros") == own
 
 
 @pytest.mark.slow

@@ -152,6 +152,9 @@ def test_nine_numbers_are_a_camera_matrix(world, name, text):
     assert read_lens(world.text(text, name)) == Lens(300.5, 301.5, 160.0, 120.0)
 
 
+SCARAMUZZA = '{"width": 640, "height": 480, "cx": 320, "cy": 240, "a0": 300, "a1": 0, "a2": -0.001, "c": 1, "d": 0}'
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
@@ -162,7 +165,8 @@ def test_nine_numbers_are_a_camera_matrix(world, name, text):
         ("a.xml", "<opencv_storage><camera_matrix></opencv_storage>", "is XML that OpenCV cannot read"),
         ("a.yaml", "%YAML:1.0\na:" + "[" * 100_000, "no keys; expected camera_matrix"),
         ("a.xml", "<?xml version='1.0'?><opencv_storage>" + "<a>" * 100_000, "is XML that OpenCV cannot read"),
-        ("a.yaml", KALIBR.replace("pinhole", "omni"), "omni: this model of a lens is not read"),
+        ("a.yaml", KALIBR.replace("pinhole", "omni"), "omni: this lens model is not supported"),
+        *((name, SCARAMUZZA, "omnidirectional .*; undistort the images first") for name in ("a.json", "a.yaml")),
         ("a.yaml", "K: [300, 0, 0, 0, 300, 0, 160, 120, 1]", "camera_matrix: stands column by column"),
         ("a.yaml", OPENCV.replace("300.5", "-300.5"), "two positive focal lengths"),
         ("a.yaml", OPENCV.replace("0.1, 0.001, ", ""), "has 3 coefficients"),

@@ -39,6 +39,22 @@ def test_a_failure_leaves_nothing_behind(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_second_interrupt_while_it_is_removed_leaves_nothing_behind(tmp_path, monkeypatch):
+    remove, interrupts = shutil.rmtree, [KeyboardInterrupt]
+
+    def interrupted(*arguments, **options) -> None:
+        if interrupts:
+            raise interrupts.pop()
+        remove(*arguments, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", interrupted)
+    making = staged(tmp_path / "output")
+    fill(making.__enter__())
+    with pytest.raises(KeyboardInterrupt):
+        making.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_is_there_stays(tmp_path):
     fill(tmp_path)
     with pytest.raises(NeecoError, match="already exists"), staged(tmp_path / "capture"):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid
 from neeco.ingest.cameras.still_scene import stands_still
-from neeco.ingest.cameras.tissue_surface import epipolar_error
+from neeco.ingest.cameras.tissue_surface import epipolar_error, surface_behind
 from neeco.ingest.foreground.background import exposure, find_background
 from neeco.ingest.foreground.masks import moving_masks
 
@@ -134,3 +134,10 @@ def test_cameras_that_are_turned_otherwise_than_stated_show_it_by_their_epipolar
 def test_images_of_a_few_pixels_neither_move_nor_end_in_an_error() -> None:
     noise = np.random.default_rng(7).integers(0, 256, (8, 12, 16, 3), dtype=np.uint8)
     assert not stands_still(noise.__getitem__, len(noise))
+
+
+@pytest.mark.parametrize("deepest", [None, -38.0])
+def test_instruments_behind_the_camera_tell_no_depth_of_the_tissue(deepest: float | None) -> None:
+    surface = surface_behind([], Lens(145, 145, 80, 64, (), (160, 128)), deepest, 120.0)
+    assert (surface.depth == 120).all()
+    assert "not known" in surface.how

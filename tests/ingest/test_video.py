@@ -33,6 +33,12 @@ def test_frames_are_read_by_index_in_order(world):
     assert all(abs(left_edge(image) - index) <= 1 for index, image in frames)
 
 
+def test_a_video_in_dicom_is_named(tmp_path):
+    (tmp_path / "endoscopy.dcm").write_bytes(bytes(128) + b"DICM" + bytes(64))
+    with pytest.raises(NeecoError, match=r"endoscopy\.dcm: is a DICOM file, .*; write its video stream to a file"):
+        open_video(tmp_path / "endoscopy.dcm")
+
+
 def test_a_video_is_decoded_once_where_its_frames_fit_into_memory(world, monkeypatch):
     path = world.video()
     opened = [open_video(path)]

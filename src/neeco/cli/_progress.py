@@ -194,7 +194,7 @@ def train_with_progress(
     def show(row: ProgressRow) -> None:
         if not row.note and not started:
             started.append(row.iteration)
-            slow = " (no CUDA device found)" if device.type == "cpu" else ""
+            slow = " (a CUDA device is faster)" if device.type == "cpu" else ""
             remaining = row.seconds_left
             whole = "" if remaining is None else f", estimated total time {_duration(row.seconds + remaining)}"
             bars.training(replace(row, note=f"training on {device.type}{slow}{whole}; view it: neeco view {run}"))

@@ -48,7 +48,11 @@ def _emptied(folder: Path, place: Path) -> Iterator[None]:
             try:
                 yield
             finally:
-                _clear(folder)
+                try:
+                    _clear(folder)
+                except KeyboardInterrupt:  # a second one: nothing is left even so
+                    _clear(folder)
+                    raise
     finally:
         with suppress(OSError):  # another process's, or gone
             folder.rmdir()

@@ -96,6 +96,8 @@ def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
     if not isinstance(document, dict):
         return ()
     keys = _plain(document)
+    if {"a0", "a2"} <= keys.keys():
+        raise _unread_model(where, "a0, a2: omnidirectional (Scaramuzza)")
     for pair in SIDES:
         sides = [_side(keys, side) for side in pair]
         if all(_has_camera(side) for side in sides):
@@ -106,6 +108,11 @@ def cameras_in(where: Path | str, document: Any) -> tuple[CameraNumbers, ...]:
         if _has_camera(inner):
             return (_camera(where, inner),)
     return ()
+
+
+def _unread_model(where: Path | str, what: str) -> NeecoError:
+    remedy = "undistort the images first, or calibrate radial and tangential (radtan), or equidistant, distortion"
+    return NeecoError(f"{where}: {what}: this lens model is not supported; {remedy}")
 
 
 def first_of(document: Mapping[Any, Any], names: Sequence[str]) -> Any:
@@ -131,9 +138,8 @@ def matrix_numbers(where: Path | str, value: Any, field: str) -> list[float]:
         for entry in item if isinstance(item, list) else [item]:
             number = as_float(entry)
             if number is None:
-                raise NeecoError(
-                    f"{where}: {field}: {printable(entry)} is not a usable number; write it as OpenCV does"
-                )
+                problem = f"{printable(entry)} is not a usable number; write it as OpenCV does"
+                raise NeecoError(f"{where}: {field}: {problem}")
             flat.append(number)
     return flat
 
@@ -204,10 +210,7 @@ def _camera(where: Path | str, keys: Mapping[str, Any], pair_of: bool = False) -
     """Return the camera of keys that have one. Raises NeecoError."""
     models = {word(str(keys[name])) for name in _MODELS if name in keys}
     if unread := models & OTHER_MODELS:
-        raise NeecoError(
-            f"{where}: {min(unread)}: this model of a lens is not read; calibrate a pinhole with radial and tangential "
-            "(radtan), or equidistant, distortion"
-        )
+        raise _unread_model(where, min(unread))
     matrix, listed = first_of(keys, _MATRIX), first_of(keys, _INTRINSICS)
     if isinstance(matrix, dict | list):
         values = matrix_numbers(where, matrix, "camera_matrix")
@@ -238,9 +241,8 @@ def _distortion(where: Path | str, keys: Mapping[str, Any], fisheye: bool) -> li
     vector = first_of(keys, _DISTORTION)
     if vector is not None:
         return matrix_numbers(where, vector, "distortion_coefficients")
-    sections = [keys.get(name) for name in ("projectionparameters", "distortionparameters")]
     named = dict(keys)
-    for section in sections:
+    for section in (keys.get("projectionparameters"), keys.get("distortionparameters")):
         named |= _plain(section) if isinstance(section, dict) else {}
     names = _COEFFICIENTS if not fisheye else _FISHEYE_COEFFICIENTS["mu" in named]
     present = [index for index, name in enumerate(names) if named.get(name) is not None]

@@ -131,9 +131,8 @@ def _rational(
 ) -> tuple[float, ...]:
     """OpenCV's coefficients of a lens with four of a fisheye (Kannala & Brandt 2006). Raises NeecoError."""
     if len(fisheye) != 4:
-        raise NeecoError(
-            f"{source}: distortion: a fisheye lens has 4 coefficients, not {len(fisheye)}; calibrate again"
-        )
+        problem = f"a fisheye lens has 4 coefficients, not {len(fisheye)}; calibrate again"
+        raise NeecoError(f"{source}: distortion: {problem}")
     fl_x, fl_y, cx, cy = values
     coefficients = dict(zip(FISHEYE_DISTORTION, fisheye, strict=True))
     try:

@@ -102,9 +102,8 @@ class RosCamera:
         """Return rectified_from_camera [3, 3]. Raises NeecoError."""
         turn = _numbers(self.where, self.camera.keys, _RECTIFICATION, 9).reshape(3, 3)
         if rotation_error(turn) > STEREO.rotation_tolerance:
-            raise NeecoError(
-                f"{self.where}: rectification_matrix: is no rotation; calibrate the two cameras as one stereo rig"
-            )
+            problem = "is no rotation; calibrate the two cameras as one stereo rig"
+            raise NeecoError(f"{self.where}: rectification_matrix: {problem}")
         return turn
 
     def projection(self) -> np.ndarray:
@@ -119,9 +118,8 @@ def from_projections(left: RosCamera, right: RosCamera) -> tuple[Lens, Lens, np.
     of_left, of_right = left.projection(), right.projection()
     focal_x, focal_y = of_right[0, 0], of_right[1, 1]
     if min(focal_x, focal_y) <= 0:
-        raise NeecoError(
-            f"{right.where}: projection_matrix: has no focal length; calibrate the cameras as one stereo rig"
-        )
+        problem = "has no focal length; calibrate the cameras as one stereo rig"
+        raise NeecoError(f"{right.where}: projection_matrix: {problem}")
     if np.abs(of_left[:2, 3]).max() > 0:
         raise NeecoError(
             f"{left.where}: projection_matrix: has a baseline, so it is the right camera's; exchange left and right"
@@ -163,13 +161,6 @@ def _two_cameras(
     return *lenses, _pose(source, matrix_numbers(source, turn, "R"), matrix_numbers(source, shift, "T"))
 
 
-def _camera_keys(
-    focal: Sequence[Any], center: Sequence[Any], bends: Sequence[Any], size: Sequence[Any]
-) -> dict[str, Any]:
-    """Return a camera in the keys of ORB-SLAM."""
-    return dict(zip(("fx", "fy", "cx", "cy", "width", "height"), (*focal, *center, *size), strict=True)) | {"d": bends}
-
-
 def _of_ini(path: Path) -> dict[str, Any]:
     """Return [StereoLeft] and [StereoRight] with res_x, fc_x, cc_x, kc_0 ..., R_0 ... R_8 (by rows) and T_0 ... T_2, in
     the keys of OpenCV."""
@@ -196,10 +187,10 @@ def _of_ini(path: Path) -> dict[str, Any]:
             if stem in ("fc", "cc") and len(numbers[stem]) != 2:
                 raise NeecoError(f"{path}: [{section}] {stem}_x, {stem}_y: missing; save the calibration again")
         size = numbers["res"] if len(numbers["res"]) == 2 else [None, None]
-        converted[side] = _camera_keys(numbers["fc"], numbers["cc"], numbers["kc"], size)
-        if side == "left" and (
-            any(numbers["t"]) or not np.allclose(numbers["r"], np.eye(3).ravel()[: len(numbers["r"])], atol=1e-6)
-        ):
+        of_camera = (*numbers["fc"], *numbers["cc"], *size, numbers["kc"])
+        converted[side] = dict(zip(("fx", "fy", "cx", "cy", "width", "height", "d"), of_camera, strict=True))
+        turned = not np.allclose(numbers["r"], np.eye(3).ravel()[: len(numbers["r"])], atol=1e-6)
+        if side == "left" and (any(numbers["t"]) or turned):
             problem = "the left camera must be the origin; give the right one's from it"
             raise NeecoError(f"{path}: [StereoLeft] R, T: {problem}")
     return converted | {"R": numbers["r"], "T": numbers["t"]}
@@ -247,9 +238,8 @@ def _pose(path: Path | str, turn: Sequence[float] | np.ndarray, shift: Sequence[
     translation."""
     angles, vector = np.asarray(turn, np.float64).ravel(), np.asarray(shift, np.float64).ravel()
     if len(angles) not in (3, 9) or len(vector) != 3:
-        raise NeecoError(
-            f"{path}: R, T: need 9 (or 3) and 3 numbers, have {len(angles)} and {len(vector)}; correct them"
-        )
+        problem = f"need 9 (or 3) and 3 numbers, have {len(angles)} and {len(vector)}; correct them"
+        raise NeecoError(f"{path}: R, T: {problem}")
     if not (np.isfinite(angles).all() and np.isfinite(vector).all()):
         raise NeecoError(f"{path}: R, T: are not all numbers; calibrate again")
     matrix = angles.reshape(3, 3) if len(angles) == 9 else Rotation.from_rotvec(angles).as_matrix()

@@ -77,17 +77,18 @@ def surface_behind(
     """Estimate the tissue behind the instruments of a still scope.
 
     shapes: each rough shape with camera_from_instrument [N, 4, 4] mm of all frames; pinhole: of reduced images;
-    deepest: mm of the tracked origins where no shape was found; None: no instrument's place is known, and `otherwise`
-    mm are assumed.
+    deepest: mm of the tracked origins where no shape was found; None, or behind the camera: no instrument's place is
+    known, and `otherwise` mm are assumed.
     """
     assert pinhole.size is not None
     width, height = pinhole.size
     bound = _deepest_instrument(shapes, pinhole)
     if not bound.any():
-        flat = (otherwise if deepest is None else SETTINGS.behind_ratio * deepest) * np.ones((height, width))
+        unknown = deepest is None or deepest <= 0
+        flat = (otherwise if deepest is None or unknown else SETTINGS.behind_ratio * deepest) * np.ones((height, width))
         source = (
             f"not known and taken to be {otherwise:.0f} mm, as nothing says where an instrument was"
-            if deepest is None
+            if unknown
             else f"not known; a plane well behind the deepest recorded pose ({deepest:.0f} mm) stands for it"
         )
         return TissueSurface(flat, source)

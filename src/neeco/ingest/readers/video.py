@@ -17,6 +17,7 @@ from PIL import Image
 
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import require_content, visible_entries
+from neeco.base.placeholders import read_head
 from neeco.capture.images import FORMATS, open_image
 from neeco.capture.readers.parsed import natural_order
 from neeco.ingest.readers import VideoSource, numbers, one_line, read_table, reason_of
@@ -229,6 +230,9 @@ class _Scan:
         from av.stream import Disposition
 
         require_content(self.path)
+        if read_head(self.path, 132).endswith(b"DICM"):
+            remedy = "write its video stream to a file, e.g. with pydicom.encaps.generate_frames, and give that"
+            raise NeecoError(f"{self.path}: is a DICOM file, which is not supported; {remedy}")
         with one_line(self.path, "cannot be opened as a video", "give an intact video file"):
             container = av.open(str(self.path))
         with container:

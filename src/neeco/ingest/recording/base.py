@@ -26,7 +26,7 @@ UNKNOWN = "unknown"
 DVRK_SD_MM, DVRK_SD_DEG = 8.0, 5.0  # accuracy of the dVRK's registration by a marker, by its own README: 5 to 10 mm
 MM = 1000.0  # per m
 STATED = f"{{transform: 4 rows, mm, sd_mm: {DVRK_SD_MM:g}, sd_deg: {DVRK_SD_DEG:g}}}"
-NEAR_MM = 10.0  # no base is nearer to a camera: a transform in metres
+NEAR_MM = 10.0  # minimum distance of a base from a camera: a smaller one is in metres
 WHAT = "a camera registration of the dVRK: JSON"
 
 
@@ -123,9 +123,6 @@ def _of_registration(path: Path) -> StatedBase:
         raise NeecoError(f"{path}: is not {WHAT}; {remedy}") from error
     node = Node(document, str(path))
     if isinstance(document, dict) and (key := next((key for key in ("matrix", "transform") if key in document), None)):
-        matrix = node.child(key).rigid()
-        if np.abs(matrix[:3, 3]).max() < NEAR_MM:
-            node.child(key).fail(f"is within {NEAR_MM:g} mm of the camera: in metres?", "give it in mm")
         usual = {"sd_mm": DVRK_SD_MM, "sd_deg": DVRK_SD_DEG, "transform": document.pop(key)}
         return _stated(Node(usual | document, str(path)))
     frame = node.child("base-frame")
@@ -158,6 +155,8 @@ def parse_base(node: Node) -> StatedBase:
 def _stated(node: Node) -> StatedBase:
     stated: BaseSection = read(BaseSection, node)
     assert stated.transform is not None
+    if 0 < np.abs(stated.transform[:3, 3]).max() < NEAR_MM:
+        node.child("transform").fail(f"is within {NEAR_MM:g} mm of the origin: in metres?", "give it in mm")
     return StatedBase(CAMERA_FRAMES[stated.axes].poses_to_opencv(stated.transform), stated.sd_mm, stated.sd_deg)
 
 

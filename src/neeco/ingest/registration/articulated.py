@@ -90,7 +90,8 @@ class ArticulatedSettings:
     # minimum ratio of the cost with poses of other moments, about a stated base and about an unknown one: of right ones
     # 5 to 120, of another moment's 2 to 3 where a base is stated
     swinging_exchanged: tuple[float, float] = (4.0, 8.0)
-    # maximum standard deviation of a head's turns, of an unknown base before a still camera, and with errors of poses
+    # standard deviation of a head's turns above which errors of poses beside them would absorb those of the base, and
+    # above which an unknown base before a still camera may be mirrored
     max_swing_rad: float = 0.2
     # factors on standard deviations, before a moving and a still camera: its shape compensates slow errors of logs, and
     # before a still camera also a wrong size
@@ -104,7 +105,7 @@ class ArticulatedSettings:
     # changes of a fit, tried after it: factors on the size before a camera that stands still, as then hardly more than
     # the tip tells how far the instrument is
     sizes: tuple[float, ...] = (0.7, 1.4, 0.87, 1.15)
-    start_sizes: tuple[float, ...] = (0.6, 1.6, 2.5)  # the same, of the best coarse fits
+    start_sizes: tuple[float, ...] = (0.6, 1.6, 2.5)  # factors on the size of the best coarse fits, as further starts
     end_steps_mm: tuple[float, ...] = (-6.0, 6.0)  # shifts of the tube's end along it
     clock_steps_s: tuple[float, ...] = (-0.04, 0.04)  # changes of a clock that is not known
     max_changes: int = 6  # maximum number of times that each of these is made, as long as it improves the fit
@@ -394,7 +395,7 @@ def _exchangeable(problem: ArticulatedProblem, fit: ArticulatedFit) -> bool:
 def _result(problem: ArticulatedProblem, fits: list[ArticulatedFit], tree: KinematicTree | None) -> BaseRegistration:
     prior, alike = problem.prior, fits
     swinging = tree is None and bool((fits[0].swings[:, :2].std(0) > LINKED.max_swing_rad).any())
-    if tree is None and not swinging and prior.sd_mm is None:  # beside swings these would make up for too much
+    if tree is None and not swinging and prior.sd_mm is None:
         alike = sorted((with_pose_errors(problem, fit) for fit in fits[: LINKED.n_refined]), key=lambda fit: fit.cost)
     full = covariance(problem, with_errors := with_pose_errors(problem, alike[0]))
     best = fits[0] if swinging else with_errors
