@@ -84,11 +84,11 @@ def surface_behind(
     width, height = pinhole.size
     bound = _deepest_instrument(shapes, pinhole)
     if not bound.any():
-        unknown = deepest is None or deepest <= 0
-        flat = (otherwise if deepest is None or unknown else SETTINGS.behind_ratio * deepest) * np.ones((height, width))
+        deepest = deepest if deepest is not None and deepest > 0 else None
+        flat = (otherwise if deepest is None else SETTINGS.behind_ratio * deepest) * np.ones((height, width))
         source = (
             f"not known and taken to be {otherwise:.0f} mm, as nothing says where an instrument was"
-            if unknown
+            if deepest is None
             else f"not known; a plane well behind the deepest recorded pose ({deepest:.0f} mm) stands for it"
         )
         return TissueSurface(flat, source)
