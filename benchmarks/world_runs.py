@@ -106,8 +106,14 @@ WITHOUT: dict[str, Mechanism] = {
     ),
     "judging-again": Mechanism(f"{METHOD}m.judge_again = {NOTHING}", mistaken),
     "carving-again": Mechanism(f"{METHOD}m.carve_again = {NOTHING}", mistaken),
-    "refuted-dropped": Mechanism(f"{FINISH}m.drop_refuted = lambda session: session.scene.canonical"),
-    "detached-dropped": Mechanism(f"{FINISH}m.drop_detached = lambda canonical: canonical"),
+    "refuted-dropped": Mechanism(
+        f"{FINISH}m.drop_refuted = lambda run: (run.scene.canonical, run.scene.canonical.opacity_logits * 0)"
+    ),
+    "detached-dropped": Mechanism(f"{FINISH}m.drop_detached = lambda canonical, *_: canonical"),
+    "distinct-frames": Mechanism(
+        f"{FINISH}import neeco.evidence.carving as c, neeco.methods.tissue_fit as t; "
+        "c.distinct_frames = t.distinct_frames = m.distinct_frames = lambda states, _: list(range(len(states)))"
+    ),
     "wrists-found": Mechanism(
         f"import neeco.methods.kinematic.discovery as m; m.search_wrist = {NOTHING}", unstated_wrist
     ),

@@ -14,7 +14,7 @@ from source_trees import module_paths, module_trees
 
 # lines of Python: the limit, and the aim
 ROOMS = {
-    "cli": (1789, 1700),
+    "cli": (1786, 1700),
     "viewer": (3097, 2100),
     "report": (1590, 1500),
     "studies": (2999, 2600),
@@ -23,17 +23,17 @@ ROOMS = {
     "synthesis": (4329, 3200),
     "evaluation": (1390, 1200),
     "labels": (909, 800),
-    "methods": (5123, 3500),
+    "methods": (5138, 3500),
     "training": (2021, 1700),
     "states": (3271, 2600),
-    "evidence": (969, 1200),
-    "scene": (1949, 1800),
+    "evidence": (1001, 1200),
+    "scene": (1956, 1800),
     "capture": (4722, 3900),
     "raster": (3990, 3800),
     "geometry": (983, 1000),
     "base": (1580, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (308, 240), (3411, 3000), (284, 300)
+FILES, FUNCTIONS, NUMBERS = (308, 240), (3412, 3000), (284, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

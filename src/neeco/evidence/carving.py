@@ -10,6 +10,7 @@ carved volume yields the shaft's axis (not necessarily the sensor's z), the tip,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from neeco.base.errors import NeecoError
-from neeco.capture.model import Frame, evenly_spaced
+from neeco.capture.model import Camera, Frame, State, evenly_spaced
 from neeco.evidence.shaft_search import SETTINGS as SHAFT
 from neeco.evidence.shaft_search import CylinderViews, find_shaft, reduced_evidence
 from neeco.geometry.projection import project
@@ -42,6 +43,9 @@ class CarvingLimits:
     brightness: float = 0.25  # mean of images below which the evidence's floor is lowered for dark images
     color_frames: int = 20  # maximum number of images for the colours of seeds
     color_slice: float = 0.25  # shaft radii: length of a slice along the shaft whose seeds share one colour
+    alike: float = 0.03  # standard deviation of places at which frames repeat one another, share of the image width
+    axis: float = 0.2  # length of the axes that are compared, share of the distance
+    min_distinct: float = 0.8  # share of distinct frames above which all are used
     unseen_share: float = 1e-6  # share of all evidence added to every slice, as some have none
 
 
@@ -122,6 +126,43 @@ class Evidence:
         return self.hits.view(-1)[place], inside
 
 
+def distinct_frames(states: Sequence[State], cameras: Sequence[Camera]) -> list[int]:
+    """Return the indices of frames without near repetitions: while an instrument stands still, all frames show the same
+    tissue. All indices where few frames repeat others.
+
+    A frame is weighted by the inverse of the number of frames like it. As many frames are chosen as the weights are
+    worth (effective sample size), evenly spaced in their sum.
+    """
+    if not states or not states[0].instruments:
+        return list(range(len(states)))
+    places = _places(states, cameras)
+    squared = (torch.cdist(part, places).square() for part in places.split(512))
+    weights = 1 / torch.cat([torch.exp(-0.5 * part / CARVING.alike**2).sum(1) for part in squared])
+    effective = float(weights.sum().square() / weights.square().sum())
+    if effective > CARVING.min_distinct * len(states):
+        return list(range(len(states)))
+    count = max(1, round(effective))
+    sums = weights.cumsum(0) / weights.sum()
+    marks = (torch.arange(count, dtype=sums.dtype) + 0.5) / count
+    return sorted(set(torch.searchsorted(sums, marks).clamp_max(len(states) - 1).tolist()))
+
+
+def _places(states: Sequence[State], cameras: Sequence[Camera]) -> Tensor:
+    """Return origin and axes of every instrument, and of a place that rests amid them, in the cameras [F, S], so scaled
+    that the width of an image is about 1."""
+    bodies = torch.stack(
+        [torch.stack([body.pose.detach().cpu().double() for body in state.instruments.values()]) for state in states]
+    )
+    resting = torch.eye(4, dtype=bodies.dtype)
+    resting[:3, 3] = bodies[..., :3, 3].mean((0, 1))
+    rows = []
+    for poses, camera in zip(bodies, cameras, strict=True):
+        seen = torch.linalg.inv(camera.world_from_camera.detach().cpu().double()) @ torch.cat([resting[None], poses])
+        ends = torch.cat([seen[:, :3, 3:] / seen[0, :3, 3].norm(), CARVING.axis * seen[:, :3, :3]], 2)
+        rows.append(ends.flatten() * float(camera.fx / camera.width))
+    return torch.stack(rows)
+
+
 @torch.no_grad()
 def gather_evidence(
     scene: GaussianScene, views: TrainingViews, settings: CarvingSettings, *, unshaded: bool = False
@@ -129,7 +170,8 @@ def gather_evidence(
     """Return residuals of a tissue-only `scene` for evenly spaced training images, at most `settings.evidence_frames`,
     on its device; with `unshaded` also those that no shadow explains. Masked pixels have none."""
     frames = views.frames
-    picked = list(range(0, len(frames), max(1, -(-len(frames) // settings.evidence_frames))))
+    distinct = distinct_frames([frame.state for frame in frames], [frame.camera for frame in frames])
+    picked = distinct[:: max(1, -(-len(distinct) // settings.evidence_frames))]
     hits: list[Tensor] = []
     without_shadows: list[Tensor] = []
     depths: list[Tensor] = []

@@ -14,6 +14,7 @@ from neeco.evidence.carving import (
     CarvedShape,
     Evidence,
     carve,
+    distinct_frames,
     gather_evidence,
     posed_views,
     score_points,
@@ -77,7 +78,8 @@ def fit_tissue(
         density_stop=0.8,
         optimizer=OptimizerConfig(),  # what counts as evidence was measured at these rates, whatever training has
     )
-    session = new_session(tissue, views, short)
+    distinct = distinct_frames([frame.state for frame in views.frames], [frame.camera for frame in views.frames])
+    session = new_session(tissue, views.subset(distinct), short)
     session.start()
     while session.iteration < steps:
         session.step()

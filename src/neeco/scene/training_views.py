@@ -76,6 +76,13 @@ class TrainingViews:
         prefetcher = None if self.prefetcher is None else PixelPrefetcher(self.prefetcher.device)
         return TrainingViews(tuple(frames), tuple(images), tuple(masks), prefetcher)
 
+    def subset(self, indices: Sequence[int]) -> TrainingViews:
+        """Return the views of the frames `indices`."""
+        prefetcher = None if self.prefetcher is None else PixelPrefetcher(self.prefetcher.device)
+        rows = [(self.frames[index], self.images[index], self.masks[index]) for index in indices]
+        frames, images, masks = zip(*rows, strict=True)
+        return TrainingViews(frames, images, masks, prefetcher)
+
     def target(self, index: int) -> Tensor:
         """Return the target image [H, W, 3] of one frame, float32 in [0, 1]."""
         return self._pixels(index)[0].float() / 255

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,8 +15,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, evenly_spaced
-from neeco.evidence.carving import CARVING
+from neeco.capture.model import REFERENCE_PIXELS, Camera, InstrumentState, State, evenly_spaced
+from neeco.evidence.carving import CARVING, distinct_frames
 from neeco.evidence.foreground import Foreground
 from neeco.evidence.label_quality import QUALITY
 from neeco.geometry.projection import in_image, project_world
@@ -40,6 +41,7 @@ class FinishSettings:
     # show either for certain
     refuting_frames: int = 2
     refuting_share: float = 0.25
+    confirming_share: float = 0.5  # share of the images that show detached ones, which must show them on an instrument
     max_gap_mm: float = 3.0  # maximum gap between solid Gaussians of one instrument; beyond, they are detached
     cells_per_gap: int = 4  # grid cells per gap for finding connected components, which bounds the number of pairs
     # training frames that must observe a position of the shaft for it to be copied: share, and number (half at most)
@@ -59,8 +61,8 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
     the joints' verdicts into `scene.diagnostics`. Warn of an instrument of which hardly anything was learned.
     """
     session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
-    session.scene.canonical = drop_refuted(session)
-    session.scene.canonical = finalise_links(drop_detached(drop_occluded(session.scene)), articulated)
+    session.scene.canonical = drop_detached(*drop_refuted(session))
+    session.scene.canonical = finalise_links(drop_occluded(session.scene), articulated)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         articulation = articulated.articulations[index]
@@ -161,8 +163,9 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
     }
 
 
-def drop_refuted(session: GaussianSession) -> CanonicalGaussians:
-    """Return the canonical Gaussians without those of instruments at whose position training images show tissue.
+def drop_refuted(session: GaussianSession) -> tuple[CanonicalGaussians, Tensor]:
+    """Return the canonical Gaussians without those of instruments at whose position training images show tissue, and
+    the share of the images, of those that show it, in which each of the others [N] is on an instrument for certain.
 
     An instrument occludes the tissue behind it in every frame. Gaussians learned from one or two frames do not, and
     would be labelled in new states. Tissue within the standard deviation of a frame's state does not count.
@@ -172,8 +175,8 @@ def drop_refuted(session: GaussianSession) -> CanonicalGaussians:
     views = [session.compared(index) for index in indices]
     foreground = Foreground.learned(views)
     if foreground is None:
-        return canonical
-    refuting, confirming = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))  # frames [N]
+        return canonical, torch.zeros_like(canonical.opacity_logits)
+    seen, refuting, confirming = (torch.zeros_like(canonical.opacity_logits) for _ in range(3))  # frames [N]
     for index, view in zip(indices, views, strict=True):
         state, camera = session.corrected(index)
         means = session.scene.at(state).means
@@ -184,6 +187,7 @@ def drop_refuted(session: GaussianSession) -> CanonicalGaussians:
         in_front = canonical.of_instruments & in_image(means, camera) & (depths < CARVING.behind * surface[place])
         if not bool(in_front.any()):
             continue
+        seen += in_front
         deviation = float(refinement.pose_sd[refinement.instants[index], :, 3:].max())
         margin = 2 * int(deviation * camera.fx / float(depths[in_front].median())) + 1
         certainty = foreground.certainty(view, foreground.settings.reach)
@@ -191,7 +195,7 @@ def drop_refuted(session: GaussianSession) -> CanonicalGaussians:
         for votes, where in ((refuting, tissue > 0), (confirming, certainty > QUALITY.certain)):
             votes += in_front & torch.from_numpy(where).to(in_front.device)[place]
     refuted = (refuting >= FINISH.refuting_frames) & (refuting > FINISH.refuting_share * (refuting + confirming))
-    return _selected(canonical, ~refuted)
+    return _selected(canonical, ~refuted), (confirming / seen.clamp_min(1))[~refuted]
 
 
 def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
@@ -214,8 +218,9 @@ def drop_occluded(scene: GaussianScene) -> CanonicalGaussians:
     return _selected(canonical, stays)
 
 
-def drop_detached(canonical: CanonicalGaussians) -> CanonicalGaussians:
-    """Return the canonical Gaussians without those detached from the rest of their instrument.
+def drop_detached(canonical: CanonicalGaussians, confirmed: Tensor) -> CanonicalGaussians:
+    """Return the canonical Gaussians without those detached from the rest of their instrument, unless images confirm
+    them: confirmed [N] as `drop_refuted` returns it.
 
     A detached cloud is tissue that moved like the instrument in a few frames, or that no frame observed, and would be
     labelled in new states.
@@ -234,8 +239,11 @@ def drop_detached(canonical: CanonicalGaussians) -> CanonicalGaussians:
         pairs = KDTree(cells).query_pairs(FINISH.cells_per_gap, output_type="ndarray")
         links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), 2 * (len(cells),))
         group = connected_components(links, directed=False)[1][cell.ravel()]
-        largest = np.bincount(group, areas.cpu().numpy()[solid]).argmax()
-        away, _ = KDTree(points[solid][group == largest]).query(points, distance_upper_bound=FINISH.max_gap_mm)
+        weights, votes = areas.cpu().numpy()[solid], confirmed[rows].cpu().numpy()[solid]
+        sizes = np.bincount(group, weights)
+        kept = np.bincount(group, weights * votes) > FINISH.confirming_share * sizes
+        kept[sizes.argmax()] = True
+        away, _ = KDTree(points[solid][kept[group]]).query(points, distance_upper_bound=FINISH.max_gap_mm)
         stays[rows] = torch.from_numpy(np.isfinite(away)).to(stays.device)
     return _selected(canonical, stays)
 
@@ -267,9 +275,12 @@ def extend_shaft(
         return canonical
     device = canonical.means.device
     positions = torch.linspace(rear, front, 40, device=device)
-    coverage = shaft_coverage(positions, name, articulation, recorded)
+    coverage = shaft_coverage(positions, name, articulation, recorded.states, recorded.cameras)
     observed = coverage >= max(FINISH.min_coverage, min(0.5, FINISH.min_frames / len(recorded.states)))
-    if float(coverage[0]) > FINISH.max_end_coverage or not bool(observed.any()):
+    distinct = distinct_frames(recorded.states, recorded.cameras)
+    states, cameras = [recorded.states[k] for k in distinct], [recorded.cameras[k] for k in distinct]
+    end = shaft_coverage(positions[:1], name, articulation, states, cameras)
+    if float(end) > FINISH.max_end_coverage or not bool(observed.any()):
         return canonical
     start = float(positions[observed][0])
     behind = solid & (along < front)
@@ -293,12 +304,14 @@ def extend_shaft(
     return extended
 
 
-def shaft_coverage(positions: Tensor, name: str, articulation: Articulation, recorded: Recorded) -> Tensor:
-    """Return the share [Q] of the training frames whose image contains the shaft's axis at `positions` [Q] mm."""
+def shaft_coverage(
+    positions: Tensor, name: str, articulation: Articulation, states: Sequence[State], cameras: Sequence[Camera]
+) -> Tensor:
+    """Return the share [Q] of the frames whose image contains the shaft's axis at `positions` [Q] mm."""
     origin, direction = articulation.shaft()
     points = origin + positions[:, None] * direction  # [Q, 3]
     counts = torch.zeros_like(positions)
-    for state, camera in zip(recorded.states, recorded.cameras, strict=True):
+    for state, camera in zip(states, cameras, strict=True):
         pose = state.instruments[name].pose.to(points)
         counts += in_image(points @ pose[:3, :3].T + pose[:3, 3], camera)
-    return counts / max(1, len(recorded.states))
+    return counts / max(1, len(states))
