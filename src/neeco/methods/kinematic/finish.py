@@ -241,9 +241,9 @@ def drop_detached(canonical: CanonicalGaussians, confirmed: Tensor) -> Canonical
         group = connected_components(links, directed=False)[1][cell.ravel()]
         weights, votes = areas.cpu().numpy()[solid], confirmed[rows].cpu().numpy()[solid]
         sizes = np.bincount(group, weights)
-        kept = np.bincount(group, weights * votes) > FINISH.confirming_share * sizes
-        kept[sizes.argmax()] = True
-        away, _ = KDTree(points[solid][kept[group]]).query(points, distance_upper_bound=FINISH.max_gap_mm)
+        retained = np.bincount(group, weights * votes) > FINISH.confirming_share * sizes
+        retained[sizes.argmax()] = True
+        away, _ = KDTree(points[solid][retained[group]]).query(points, distance_upper_bound=FINISH.max_gap_mm)
         stays[rows] = torch.from_numpy(np.isfinite(away)).to(stays.device)
     return _selected(canonical, stays)
 
