@@ -48,6 +48,9 @@ class FinishSettings:
     min_coverage: float = 0.08
     min_frames: int = 6
     max_end_coverage: float = 0.3  # share of frames above which the observed rear end counts as the real one
+    behind_radii: tuple[float, ...] = (3.0, 4.0, 5.0)  # places behind that end where images are asked, shaft radii
+    # share of them that is an instrument for certain, less the share that is tissue, above which the shaft goes on
+    goes_on_share: float = 0.3
     min_joint_explained: float = 0.35  # minimum share of the moving parts' error that a joint must explain
     slab_radii: float = 1.5  # length of the copied slab, in shaft radii
 
@@ -61,7 +64,8 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
     the joints' verdicts into `scene.diagnostics`. Warn of an instrument of which hardly anything was learned.
     """
     session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
-    session.scene.canonical = drop_detached(*drop_refuted(session))
+    judged = judge_frames(session)
+    session.scene.canonical = drop_detached(*drop_refuted(session, judged))
     session.scene.canonical = finalise_links(drop_occluded(session.scene), articulated)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
@@ -90,7 +94,7 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
             weights = articulated.link_weights(scene.canonical, index)
             articulation.measure_tips(points[solid], weights[solid])
         scene.canonical = extend_shaft(
-            scene.canonical, index + 1, instrument.name, articulation, scene.recorded, 1.5 * session.extent
+            scene.canonical, index + 1, instrument.name, articulation, scene.recorded, 1.5 * session.extent, judged
         )
     session.scene.diagnostics["joints"] = verdicts
     session.scene.diagnostics["latency_s"] = float(session.refinement.latency)
@@ -163,7 +167,48 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
     }
 
 
-def drop_refuted(session: GaussianSession) -> tuple[CanonicalGaussians, Tensor]:
+@dataclass(frozen=True, eq=False)
+class JudgedFrame:
+    """A training frame: its number, state and camera, and which pixels [H, W] are an instrument (1) or tissue (-1) for
+    certain, of those near a rendered instrument and of all that may show one; depth [H, W] mm of the tissue."""
+
+    index: int
+    state: State
+    camera: Camera
+    near: np.ndarray
+    beside: np.ndarray
+    depth: np.ndarray
+
+
+def judge_frames(session: GaussianSession) -> list[JudgedFrame]:
+    """Judge frames whose states count; none where instruments and tissue cannot be distinguished."""
+    indices = [k for k in session.frames_along_poses(FINISH.max_occlusion_frames) if session.refinement.counts(k)]
+    views = [session.compared(index) for index in indices]
+    foreground = Foreground.learned(views)
+    if foreground is None:
+        return []
+    judged, settings = [], foreground.settings
+    for index, view in zip(indices, views, strict=True):
+        near, beside = (foreground.certainty(view, reach) for reach in (settings.reach, settings.apart))
+        judged.append(JudgedFrame(index, *session.corrected(index), near, beside, view.depth))
+    return judged
+
+
+def shows_shaft(judged: Sequence[JudgedFrame], name: str, articulation: Articulation, places: Tensor) -> bool:
+    """Return whether images show an instrument rather than tissue at places [Q] mm along the shaft."""
+    distinct = distinct_frames([frame.state for frame in judged], [frame.camera for frame in judged])
+    origin, direction = articulation.shaft()
+    points, votes = origin + places[:, None] * direction, []
+    for frame in (judged[index] for index in distinct):
+        pose = frame.state.instruments[name].pose.to(points)
+        placed = points @ pose[:3, :3].T + pose[:3, 3]
+        column, row = project_world(placed, frame.camera)[0][in_image(placed, frame.camera)].long().cpu().numpy().T
+        certainty = frame.beside[row, column]
+        votes.append(np.sign(certainty) * (np.abs(certainty) > QUALITY.certain))
+    return bool(np.concatenate(votes or [np.zeros(1)]).mean() > FINISH.goes_on_share)
+
+
+def drop_refuted(session: GaussianSession, judged: Sequence[JudgedFrame]) -> tuple[CanonicalGaussians, Tensor]:
     """Return the canonical Gaussians without those of instruments at whose position training images show tissue, and
     the share of the images, of those that show it, in which each of the others [N] is on an instrument for certain.
 
@@ -171,28 +216,21 @@ def drop_refuted(session: GaussianSession) -> tuple[CanonicalGaussians, Tensor]:
     would be labelled in new states. Tissue within the standard deviation of a frame's state does not count.
     """
     canonical, refinement = session.scene.canonical, session.refinement
-    indices = [k for k in session.frames_along_poses(FINISH.max_occlusion_frames) if refinement.counts(k)]
-    views = [session.compared(index) for index in indices]
-    foreground = Foreground.learned(views)
-    if foreground is None:
-        return canonical, torch.zeros_like(canonical.opacity_logits)
     seen, refuting, confirming = (torch.zeros_like(canonical.opacity_logits) for _ in range(3))  # frames [N]
-    for index, view in zip(indices, views, strict=True):
-        state, camera = session.corrected(index)
-        means = session.scene.at(state).means
+    for frame in judged:
+        means, camera = session.scene.at(frame.state).means, frame.camera
         pixels, depths = project_world(means, camera)
         column, row = pixels.nan_to_num().long().unbind(-1)
         place = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
-        surface = torch.from_numpy(view.depth).to(depths)
+        surface = torch.from_numpy(frame.depth).to(depths)
         in_front = canonical.of_instruments & in_image(means, camera) & (depths < CARVING.behind * surface[place])
         if not bool(in_front.any()):
             continue
         seen += in_front
-        deviation = float(refinement.pose_sd[refinement.instants[index], :, 3:].max())
+        deviation = float(refinement.pose_sd[refinement.instants[frame.index], :, 3:].max())
         margin = 2 * int(deviation * camera.fx / float(depths[in_front].median())) + 1
-        certainty = foreground.certainty(view, foreground.settings.reach)
-        tissue = cv2.erode((certainty < -QUALITY.certain).astype(np.uint8), np.ones((margin, margin), np.uint8))
-        for votes, where in ((refuting, tissue > 0), (confirming, certainty > QUALITY.certain)):
+        tissue = cv2.erode((frame.near < -QUALITY.certain).astype(np.uint8), np.ones((margin, margin), np.uint8))
+        for votes, where in ((refuting, tissue > 0), (confirming, frame.near > QUALITY.certain)):
             votes += in_front & torch.from_numpy(where).to(in_front.device)[place]
     refuted = (refuting >= FINISH.refuting_frames) & (refuting > FINISH.refuting_share * (refuting + confirming))
     return _selected(canonical, ~refuted), (confirming / seen.clamp_min(1))[~refuted]
@@ -256,10 +294,16 @@ def _selected(canonical: CanonicalGaussians, chosen: Tensor) -> CanonicalGaussia
 
 @torch.no_grad()
 def extend_shaft(
-    canonical: CanonicalGaussians, body: int, name: str, articulation: Articulation, recorded: Recorded, length: float
+    canonical: CanonicalGaussians,
+    body: int,
+    name: str,
+    articulation: Articulation,
+    recorded: Recorded,
+    length: float,
+    judged: Sequence[JudgedFrame] = (),
 ) -> CanonicalGaussians:
     """Return canonical Gaussians with the shaft of instrument `body` (row group index) prolonged by about `length` mm;
-    unchanged when its real end is observed.
+    unchanged when its real end is observed, unless images show that it goes on.
 
     A frame shows a shaft only up to the image's border; in a new state more of it comes into view. A shaft is uniform,
     so the rearmost well observed slab is repeated towards the rear.
@@ -270,23 +314,29 @@ def extend_shaft(
     if int(solid.sum()) < 50:
         return canonical
     rear = float(along[solid].quantile(0.01))
-    front = float(articulation.wrist_start if articulation.jointed else articulation.extent[1])
+    front = float(articulation.extent[1])
+    if articulation.jointed and float(articulation.wrist_start) > rear:  # else only the wrist was learned
+        front = float(articulation.wrist_start)
     if not rear < front:
         return canonical
     device = canonical.means.device
     positions = torch.linspace(rear, front, 40, device=device)
     coverage = shaft_coverage(positions, name, articulation, recorded.states, recorded.cameras)
     observed = coverage >= max(FINISH.min_coverage, min(0.5, FINISH.min_frames / len(recorded.states)))
-    distinct = distinct_frames(recorded.states, recorded.cameras)
-    states, cameras = [recorded.states[k] for k in distinct], [recorded.cameras[k] for k in distinct]
-    end = shaft_coverage(positions[:1], name, articulation, states, cameras)
-    if float(end) > FINISH.max_end_coverage or not bool(observed.any()):
+    if not bool(observed.any()):
         return canonical
     start = float(positions[observed][0])
     behind = solid & (along < front)
     origin, direction = articulation.shaft()
     across = canonical.means[rows] - origin - along[:, None] * direction
-    slab = FINISH.slab_radii * float(across[behind if bool(behind.any()) else solid].norm(dim=1).median())
+    radius = float(across[behind if bool(behind.any()) else solid].norm(dim=1).median())
+    beyond = rear - radius * torch.tensor(FINISH.behind_radii, device=device)
+    distinct = distinct_frames(recorded.states, recorded.cameras)
+    states, cameras = [recorded.states[k] for k in distinct], [recorded.cameras[k] for k in distinct]
+    in_view = float(shaft_coverage(beyond[:1], name, articulation, states, cameras))
+    if in_view > FINISH.max_end_coverage and not shows_shaft(judged, name, articulation, beyond):
+        return canonical
+    slab = FINISH.slab_radii * radius
     copied = torch.nonzero((along >= start) & (along < start + slab))[:, 0]
     if start + slab > front or len(copied) < 10:
         return canonical
