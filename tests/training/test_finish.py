@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from ball_world import RADIUS, ball_scene
@@ -18,6 +19,7 @@ from neeco.capture.model import Camera, InstrumentState, State
 from neeco.methods.kinematic import wrist
 from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.methods.kinematic.finish import (
+    JudgedFrame,
     conclude,
     drop_detached,
     drop_occluded,
@@ -282,6 +284,24 @@ def test_a_shaft_whose_end_was_seen_stays_as_it_is() -> None:
     canonical, hinges = shaft_of(40)
     same = extend_shaft(canonical, 1, "tool", hinges, recorded_at(-60.0), 60.0)
     assert same is canonical
+
+
+@pytest.mark.parametrize("certainty", [1.0, 0.1, -1.0])
+def test_images_tell_whether_a_shaft_whose_end_is_in_view_goes_on(certainty: float) -> None:
+    canonical, hinges = shaft_of(40)
+    recorded = recorded_at(-60.0)
+    pixels = np.full((100, 100), certainty)
+    judged = [JudgedFrame(0, recorded.states[0], recorded.cameras[0], pixels, pixels, pixels)] * 4
+    longer = extend_shaft(canonical, 1, "tool", hinges, recorded, 60.0, judged)
+    assert (longer is not canonical) == (certainty == 1)
+
+
+def test_a_shaft_that_is_cut_before_its_wrist_is_prolonged_all_the_same() -> None:
+    canonical, hinges = shaft_of(40)
+    with torch.no_grad():
+        hinges.wrist_start.fill_(-45.0)  # the rear of what was learned is taken for the wrist
+    longer = extend_shaft(canonical, 1, "tool", hinges, recorded_at(-20.0), 60.0)
+    assert float(longer.means[longer.body(1)][:, 2].min()) < -70
 
 
 def test_frames_in_which_the_instrument_rests_do_not_make_the_end_of_what_was_learned_the_real_one() -> None:

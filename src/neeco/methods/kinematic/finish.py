@@ -47,9 +47,11 @@ class FinishSettings:
     # training frames that must observe a position of the shaft for it to be copied: share, and number (half at most)
     min_coverage: float = 0.08
     min_frames: int = 6
-    max_end_coverage: float = 0.3  # share of frames above which the observed rear end counts as the real one
-    behind_radii: tuple[float, ...] = (3.0, 4.0, 5.0)  # places behind that end where images are asked, shaft radii
-    # share of them that is an instrument for certain, less the share that is tissue, above which the shaft goes on
+    # places behind the rear end of what was learned, shaft radii: in more than this share of the frames the nearest is in
+    # view, and the end counts as the real one; unless, of all in view, the share that is certainly an instrument
+    # exceeds the share that is certainly tissue by `goes_on_share`
+    behind_radii: tuple[float, ...] = (3.0, 4.0, 5.0)
+    max_end_coverage: float = 0.3
     goes_on_share: float = 0.3
     min_joint_explained: float = 0.35  # minimum share of the moving parts' error that a joint must explain
     slab_radii: float = 1.5  # length of the copied slab, in shaft radii
@@ -198,14 +200,14 @@ def shows_shaft(judged: Sequence[JudgedFrame], name: str, articulation: Articula
     """Return whether images show an instrument rather than tissue at places [Q] mm along the shaft."""
     distinct = distinct_frames([frame.state for frame in judged], [frame.camera for frame in judged])
     origin, direction = articulation.shaft()
-    points, votes = origin + places[:, None] * direction, []
+    points, votes = origin + places[:, None] * direction, [np.zeros(1)]
     for frame in (judged[index] for index in distinct):
         pose = frame.state.instruments[name].pose.to(points)
         placed = points @ pose[:3, :3].T + pose[:3, 3]
         column, row = project_world(placed, frame.camera)[0][in_image(placed, frame.camera)].long().cpu().numpy().T
         certainty = frame.beside[row, column]
         votes.append(np.sign(certainty) * (np.abs(certainty) > QUALITY.certain))
-    return bool(np.concatenate(votes or [np.zeros(1)]).mean() > FINISH.goes_on_share)
+    return bool(np.concatenate(votes).mean() > FINISH.goes_on_share)
 
 
 def drop_refuted(session: GaussianSession, judged: Sequence[JudgedFrame]) -> tuple[CanonicalGaussians, Tensor]:
