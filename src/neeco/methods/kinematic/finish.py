@@ -196,20 +196,6 @@ def judge_frames(session: GaussianSession) -> list[JudgedFrame]:
     return judged
 
 
-def shows_shaft(judged: Sequence[JudgedFrame], name: str, articulation: Articulation, places: Tensor) -> bool:
-    """Return whether images show an instrument rather than tissue at places [Q] mm along the shaft."""
-    distinct = distinct_frames([frame.state for frame in judged], [frame.camera for frame in judged])
-    origin, direction = articulation.shaft()
-    points, votes = origin + places[:, None] * direction, [np.zeros(1)]
-    for frame in (judged[index] for index in distinct):
-        pose = frame.state.instruments[name].pose.to(points)
-        placed = points @ pose[:3, :3].T + pose[:3, 3]
-        column, row = project_world(placed, frame.camera)[0][in_image(placed, frame.camera)].long().cpu().numpy().T
-        certainty = frame.beside[row, column]
-        votes.append(np.sign(certainty) * (np.abs(certainty) > QUALITY.certain))
-    return bool(np.concatenate(votes).mean() > FINISH.goes_on_share)
-
-
 def drop_refuted(session: GaussianSession, judged: Sequence[JudgedFrame]) -> tuple[CanonicalGaussians, Tensor]:
     """Return the canonical Gaussians without those of instruments at whose position training images show tissue, and
     the share of the images, of those that show it, in which each of the others [N] is on an instrument for certain.
@@ -367,3 +353,17 @@ def shaft_coverage(
         pose = state.instruments[name].pose.to(points)
         counts += in_image(points @ pose[:3, :3].T + pose[:3, 3], camera)
     return counts / max(1, len(states))
+
+
+def shows_shaft(judged: Sequence[JudgedFrame], name: str, articulation: Articulation, places: Tensor) -> bool:
+    """Return whether distinct frames show an instrument rather than tissue at places [Q] mm along the shaft."""
+    distinct = distinct_frames([frame.state for frame in judged], [frame.camera for frame in judged])
+    origin, direction = articulation.shaft()
+    points, votes = origin + places[:, None] * direction, [np.zeros(1)]
+    for frame in (judged[index] for index in distinct):
+        pose = frame.state.instruments[name].pose.to(points)
+        placed = points @ pose[:3, :3].T + pose[:3, 3]
+        column, row = project_world(placed, frame.camera)[0][in_image(placed, frame.camera)].long().cpu().numpy().T
+        certainty = frame.beside[row, column]
+        votes.append(np.sign(certainty) * (np.abs(certainty) > QUALITY.certain))
+    return bool(np.concatenate(votes).mean() > FINISH.goes_on_share)
