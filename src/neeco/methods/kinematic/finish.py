@@ -47,8 +47,8 @@ class FinishSettings:
     # training frames that must observe a position of the shaft for it to be copied: share, and number (half at most)
     min_coverage: float = 0.08
     min_frames: int = 6
-    # places behind the rear end of what was learned, shaft radii: in more than this share of the frames the nearest is in
-    # view, and the end counts as the real one; unless, of all in view, the share that is certainly an instrument
+    # places behind the rear end of what was learned, shaft radii. The end counts as the real one where the nearest is
+    # in view in more than this share of the frames, unless the share of all in view that is certainly an instrument
     # exceeds the share that is certainly tissue by `goes_on_share`
     behind_radii: tuple[float, ...] = (3.0, 4.0, 5.0)
     max_end_coverage: float = 0.3
