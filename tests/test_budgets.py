@@ -23,7 +23,7 @@ ROOMS = {
     "synthesis": (4329, 3200),
     "evaluation": (1390, 1200),
     "labels": (909, 800),
-    "methods": (5191, 3500),
+    "methods": (5193, 3500),
     "training": (2021, 1700),
     "states": (3271, 2600),
     "evidence": (1001, 1200),

@@ -292,7 +292,7 @@ def test_images_tell_whether_a_shaft_whose_end_is_in_view_goes_on(certainty: flo
     recorded = recorded_at(-60.0)
     pixels = np.full((100, 100), certainty)
     judged = [JudgedFrame(0, recorded.states[0], recorded.cameras[0], pixels, pixels, pixels)] * 4
-    longer = extend_shaft(canonical, 1, "tool", hinges, recorded, 60.0, judged)
+    longer = extend_shaft(canonical, 1, "tool", hinges, recorded, 60.0, judged=judged)
     assert (longer is not canonical) == (certainty == 1)
 
 

@@ -95,8 +95,9 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
             points = scene.canonical.means[scene.canonical.body(index + 1)]
             weights = articulated.link_weights(scene.canonical, index)
             articulation.measure_tips(points[solid], weights[solid])
+        length = 1.5 * session.extent
         scene.canonical = extend_shaft(
-            scene.canonical, index + 1, instrument.name, articulation, scene.recorded, 1.5 * session.extent, judged
+            scene.canonical, index + 1, instrument.name, articulation, scene.recorded, length, judged=judged
         )
     session.scene.diagnostics["joints"] = verdicts
     session.scene.diagnostics["latency_s"] = float(session.refinement.latency)
@@ -288,6 +289,7 @@ def extend_shaft(
     articulation: Articulation,
     recorded: Recorded,
     length: float,
+    *,
     judged: Sequence[JudgedFrame] = (),
 ) -> CanonicalGaussians:
     """Return canonical Gaussians with the shaft of instrument `body` (row group index) prolonged by about `length` mm;
