@@ -150,14 +150,14 @@ def distinct_frames(states: Sequence[State], cameras: Sequence[Camera]) -> list[
 def _places(states: Sequence[State], cameras: Sequence[Camera]) -> Tensor:
     """Return origin and axes of every instrument, and of a place that rests amid them, in the cameras [F, S], so scaled
     that the width of an image is about 1."""
-    bodies = torch.stack(
-        [torch.stack([body.pose.detach().cpu().double() for body in state.instruments.values()]) for state in states]
-    )
+    names = list(states[0].instruments)
+    poses = torch.stack([state.instruments[name].pose.detach().cpu().double() for state in states for name in names])
+    bodies = poses.view(len(states), len(names), 4, 4)
     resting = torch.eye(4, dtype=bodies.dtype)
     resting[:3, 3] = bodies[..., :3, 3].mean((0, 1))
     rows = []
-    for poses, camera in zip(bodies, cameras, strict=True):
-        seen = torch.linalg.inv(camera.world_from_camera.detach().cpu().double()) @ torch.cat([resting[None], poses])
+    for placed, camera in zip(bodies, cameras, strict=True):
+        seen = torch.linalg.inv(camera.world_from_camera.detach().cpu().double()) @ torch.cat([resting[None], placed])
         ends = torch.cat([seen[:, :3, 3:] / seen[0, :3, 3].norm(), CARVING.axis * seen[:, :3, :3]], 2)
         rows.append(ends.flatten() * float(camera.fx / camera.width))
     return torch.stack(rows)
