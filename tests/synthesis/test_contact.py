@@ -31,7 +31,7 @@ def test_a_tip_that_is_lowered_through_tissue_touches_it_and_its_depth_is_measur
     assert [label["contact"] != "none" for label in labels] == [depth > CONTACT.touching_mm for depth in depths]
     assert [label["penetration_mm"] for label in labels] == pytest.approx(depths, abs=0.3)
     assert all(0.5 <= label["contact_confidence"] <= 1 for label in labels)
-    assert labels[0]["contact_confidence"] > labels[1]["contact_confidence"] > 0.75
+    assert labels[0]["contact_confidence"] > labels[1]["contact_confidence"] > 0.65
 
 
 def test_jaws_that_close_on_tissue_grasp_it(contact, state):
@@ -51,7 +51,7 @@ def test_the_box_is_the_tissue_within_reach(contact, state, camera):
 def test_an_uncertain_state_is_less_sure_to_touch(contact, state):
     exact = state(z=WALL_MM + 2, jaw=0.0)
     rod = exact.instruments["rod"]
-    doubt = Uncertainty((0.1, 0.1, 5.0), (0.1, 0.1, 180.0))
+    doubt = Uncertainty((0.1, 0.1, 15.0), (0.1, 0.1, 180.0))
     doubted = State({"rod": InstrumentState(rod.pose, rod.joints, uncertainty=doubt)})
     sure, unsure = contact(exact), contact(doubted)
     assert sure["penetration_mm"] == unsure["penetration_mm"]

@@ -44,7 +44,7 @@ class ContactSettings:
     n_measured: int = 100  # Gaussians sampled per working end
     quantile: float = 0.97  # quantile of their depths, robust to single outliers
     touching_mm: float = -1.5  # depth at which contact has probability 1/2; tissue learned during contact is indented
-    depth_sd_mm: float = 3.0  # standard deviation of a depth, calibrated for correct confidences
+    depth_sd_mm: float = 6.0  # standard deviation of a depth, calibrated for correct confidences
     joint_quantiles: tuple[float, float] = (0.05, 0.95)  # quantiles of recorded values: a range without outliers
     closed_share: float = 0.25  # share of the recorded range of the jaws' opening, below which they are closed
 
