@@ -107,7 +107,7 @@ WITHOUT: dict[str, Mechanism] = {
     "judging-again": Mechanism(f"{METHOD}m.judge_again = {NOTHING}", mistaken),
     "carving-again": Mechanism(f"{METHOD}m.carve_again = {NOTHING}", mistaken),
     "refuted-dropped": Mechanism(
-        f"{FINISH}m.drop_refuted = lambda run: (run.scene.canonical, run.scene.canonical.opacity_logits * 0)"
+        f"{FINISH}m.drop_refuted = lambda run, _: (run.scene.canonical, run.scene.canonical.opacity_logits * 0)"
     ),
     "detached-dropped": Mechanism(f"{FINISH}m.drop_detached = lambda canonical, *_: canonical"),
     "distinct-frames": Mechanism(

@@ -124,3 +124,27 @@ def test_a_mechanism_is_left_out_where_it_applies() -> None:
     for name, mechanism in WITHOUT.items():
         assert any(mechanism.applies_to(world) for world in worlds), name
     assert not any(WITHOUT["frame-joints"].applies_to(world) for world in worlds if not world.joints)
+
+
+BINDS = """
+import importlib, inspect, re, sys
+for statement in sys.argv[1:]:
+    modules = [importlib.import_module(name) for name in re.findall(r"(neeco[\\w.]+) as", statement)]
+    before = [dict(vars(module)) for module in modules]
+    exec(statement, {})
+    for module, names in zip(modules, before):
+        for name, old in names.items():
+            new = vars(module)[name]
+            if new is not old:
+                parameters = inspect.signature(old).parameters.values()
+                inspect.signature(new).bind(*[None for p in parameters if p.kind is not p.KEYWORD_ONLY])
+                setattr(module, name, old)
+                print(name)
+"""
+
+
+def test_what_takes_a_mechanisms_place_takes_what_the_mechanism_takes() -> None:
+    statements = [mechanism.left_out for mechanism in WITHOUT.values() if isinstance(mechanism.left_out, str)]
+    said = subprocess.run([sys.executable, "-c", BINDS, *statements], capture_output=True, text=True)
+    assert said.returncode == 0, said.stderr
+    assert {"drop_refuted", "drop_detached", "distinct_frames", "fit_states"} <= set(said.stdout.split())
