@@ -17,7 +17,7 @@ from neeco.capture import read_capture
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
 from neeco.methods.kinematic.deformation import observe_silhouettes
-from neeco.methods.kinematic.finish import drop_refuted
+from neeco.methods.kinematic.finish import drop_refuted, judge_frames
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
@@ -177,7 +177,7 @@ def test_what_training_images_refute_is_dropped_within_the_uncertainty_of_their_
         counts=lambda index: True, instants=[0, 1], pose_sd=torch.full((2, 1, 6), deviation_mm)
     )
     canonical = session.scene.canonical
-    left = drop_refuted(session)
+    left, confirmed = drop_refuted(session, judge_frames(session))
     assert torch.equal(left.means[left.body(0)], canonical.means[canonical.body(0)])
     columns, kept = (
         project_world(means[means[:, 1].abs() < 20], CAMERA)[0][:, 0]  # in the image
@@ -186,6 +186,9 @@ def test_what_training_images_refute_is_dropped_within_the_uncertainty_of_their_
     assert (float(columns.min()), float(columns.max())) == pytest.approx((32.5, 62.0), abs=1)
     assert (float(kept.min()) > 33.5) == dropped  # the image shows the instrument in columns 36 .. 61
     assert int(((columns > 38) & (columns < 59)).sum()) == int(((kept > 38) & (kept < 59)).sum())
+    assert float(confirmed[left.body(0)].max()) == 0  # tissue is never on an instrument
+    inside = confirmed[left.body(1)][left.means[left.body(1), 1].abs() < 20][(kept > 40) & (kept < 57)]
+    assert float(inside.median()) > 0.9
 
 
 def test_a_checkpoint_brings_them_back(capture: Path) -> None:
