@@ -112,7 +112,7 @@ WITHOUT: dict[str, Mechanism] = {
     "detached-dropped": Mechanism(f"{FINISH}m.drop_detached = lambda canonical, *_: canonical"),
     "distinct-frames": Mechanism(
         f"{FINISH}import neeco.evidence.carving as c, neeco.methods.tissue_fit as t; "
-        "c.distinct_frames = t.distinct_frames = m.distinct_frames = lambda states, _: list(range(len(states)))"
+        "c.distinct_frames = t.distinct_frames = m.distinct_frames = lambda views: list(range(len(views)))"
     ),
     "wrists-found": Mechanism(
         f"import neeco.methods.kinematic.discovery as m; m.search_wrist = {NOTHING}", unstated_wrist

@@ -137,7 +137,7 @@ TRACKER = {"parameters": {"eye_on_hand": False, "tracking_base_frame": "camera_l
     [
         ("reg.json", {"name": "PSM1", "measured_cp": []}, "base-frame.*: is missing"),
         ("reg.json", {"x": 1}, r"base-frame.*: is missing; .* or write \{transform: 4 rows, mm, sd_mm: 8, sd_deg: 5\}"),
-        ("reg.json", {"matrix": METRES}, "in metres"),
+        ("reg.json", {"matrix": METRES}, "matrix.*: in metres"),
         ("reg.json", {"matrix": METRES[:1]}, "matrix"),
         ("reg.json", {"matrix": MILLIMETRES, "unit": "m"}, "unit: it has no"),
         ("reg.json", "transform", "is not a camera registration"),

@@ -126,37 +126,37 @@ class Evidence:
         return self.hits.view(-1)[place], inside
 
 
-def distinct_frames(states: Sequence[State], cameras: Sequence[Camera]) -> list[int]:
-    """Return the indices of frames without near repetitions: while an instrument stands still, all frames show the same
-    tissue. All indices where few frames repeat others.
+def distinct_frames(views: Sequence[tuple[State, Camera]]) -> list[int]:
+    """Return the indices of views without near repetitions: while an instrument stands still, all frames show the same
+    tissue. All indices where few views repeat others.
 
-    A frame is weighted by the inverse of the number of frames like it. As many frames are chosen as the weights are
-    worth (effective sample size), evenly spaced in their sum.
+    A view is weighted by the inverse of the number of views like it. As many are chosen as the weights are worth
+    (effective sample size), evenly spaced in their sum.
     """
-    if not states or not states[0].instruments:
-        return list(range(len(states)))
-    places = _places(states, cameras)
+    if not views or not views[0][0].instruments:
+        return list(range(len(views)))
+    places = _places(views)
     squared = (torch.cdist(part, places).square() for part in places.split(512))
     weights = 1 / torch.cat([torch.exp(-0.5 * part / CARVING.alike**2).sum(1) for part in squared])
     effective = float(weights.sum().square() / weights.square().sum())
-    if effective > CARVING.min_distinct * len(states):
-        return list(range(len(states)))
+    if effective > CARVING.min_distinct * len(views):
+        return list(range(len(views)))
     count = max(1, round(effective))
     sums = weights.cumsum(0) / weights.sum()
     marks = (torch.arange(count, dtype=sums.dtype) + 0.5) / count
-    return sorted(set(torch.searchsorted(sums, marks).clamp_max(len(states) - 1).tolist()))
+    return sorted(set(torch.searchsorted(sums, marks).clamp_max(len(views) - 1).tolist()))
 
 
-def _places(states: Sequence[State], cameras: Sequence[Camera]) -> Tensor:
+def _places(views: Sequence[tuple[State, Camera]]) -> Tensor:
     """Return origin and axes of every instrument, and of a place that rests amid them, in the cameras [F, S], so scaled
     that the width of an image is about 1."""
-    names = list(states[0].instruments)
-    poses = torch.stack([state.instruments[name].pose.detach().cpu().double() for state in states for name in names])
-    bodies = poses.view(len(states), len(names), 4, 4)
+    names = list(views[0][0].instruments)
+    poses = torch.stack([state.instruments[name].pose.detach().cpu().double() for state, _ in views for name in names])
+    bodies = poses.view(len(views), len(names), 4, 4)
     resting = torch.eye(4, dtype=bodies.dtype)
     resting[:3, 3] = bodies[..., :3, 3].mean((0, 1))
     rows = []
-    for placed, camera in zip(bodies, cameras, strict=True):
+    for placed, (_, camera) in zip(bodies, views, strict=True):
         seen = torch.linalg.inv(camera.world_from_camera.detach().cpu().double()) @ torch.cat([resting[None], placed])
         ends = torch.cat([seen[:, :3, 3:] / seen[0, :3, 3].norm(), CARVING.axis * seen[:, :3, :3]], 2)
         rows.append(ends.flatten() * float(camera.fx / camera.width))
@@ -170,7 +170,7 @@ def gather_evidence(
     """Return residuals of a tissue-only `scene` for evenly spaced training images, at most `settings.evidence_frames`,
     on its device; with `unshaded` also those that no shadow explains. Masked pixels have none."""
     frames = views.frames
-    distinct = distinct_frames([frame.state for frame in frames], [frame.camera for frame in frames])
+    distinct = distinct_frames([(frame.state, frame.camera) for frame in frames])
     picked = distinct[:: max(1, -(-len(distinct) // settings.evidence_frames))]
     hits: list[Tensor] = []
     without_shadows: list[Tensor] = []

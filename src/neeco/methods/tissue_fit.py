@@ -78,7 +78,7 @@ def fit_tissue(
         density_stop=0.8,
         optimizer=OptimizerConfig(),  # what counts as evidence was measured at these rates, whatever training has
     )
-    distinct = distinct_frames([frame.state for frame in views.frames], [frame.camera for frame in views.frames])
+    distinct = distinct_frames([(frame.state, frame.camera) for frame in views.frames])
     session = new_session(tissue, views.subset(distinct), short)
     session.start()
     while session.iteration < steps:

@@ -93,12 +93,11 @@ def _of_hand_eye(path: Path) -> StatedBase:
     axes = CAMERA if camera is None else meaning_of(str(camera.value)).frame or ""
     if camera is not None and axes not in CAMERA_FRAMES:
         camera.fail(f"is {printable(camera.value)}, and nothing says in which axes", f"write {STATED[:-1]}, axes: …}}")
-    numbers = [place.number() for place in places]
-    quaternion = np.array(numbers[3:])
-    if not 0.99 < np.linalg.norm(quaternion) < 1.01:
+    numbers = np.array([place.number() for place in places])
+    if not 0.99 < np.linalg.norm(numbers[3:]) < 1.01:
         stated.fail("qx, qy, qz, qw are no unit quaternion", "calibrate again")
-    rotation = Rotation.from_quat(quaternion).as_matrix()
-    camera_from_base = rigid(rotation.T, -rotation.T @ np.array(numbers[:3]) * MM)
+    rotation = Rotation.from_quat(numbers[3:]).as_matrix()
+    camera_from_base = rigid(rotation.T, -rotation.T @ numbers[:3] * MM)
     return StatedBase(CAMERA_FRAMES[axes].poses_to_opencv(camera_from_base), DVRK_SD_MM, DVRK_SD_DEG)
 
 
@@ -123,8 +122,9 @@ def _of_registration(path: Path) -> StatedBase:
         raise NeecoError(f"{path}: is not {WHAT}; {remedy}") from error
     node = Node(document, str(path))
     if isinstance(document, dict) and (key := next((key for key in ("matrix", "transform") if key in document), None)):
+        transform = node.child(key)
         usual = {"sd_mm": DVRK_SD_MM, "sd_deg": DVRK_SD_DEG, "transform": document.pop(key)}
-        return _stated(Node(usual | document, str(path)))
+        return _stated(Node(usual | document, str(path)), transform)
     frame = node.child("base-frame")
     if not isinstance(frame.value, dict):
         frame.fail("is missing", f"give {WHAT}, as …-registration-open-cv.json has it, or write {STATED} instead")
@@ -149,14 +149,14 @@ def parse_base(node: Node) -> StatedBase:
         return read_dvrk_registration(existing_file(node))
     if not isinstance(node.value, dict):
         raise Fault(node.field, f"expected `unknown`, a file or {STATED}, found {printable(node.value)}")
-    return _stated(node)
+    return _stated(node, node.child("transform"))
 
 
-def _stated(node: Node) -> StatedBase:
+def _stated(node: Node, transform: Node) -> StatedBase:
     stated: BaseSection = read(BaseSection, node)
     assert stated.transform is not None
     if 0 < np.abs(stated.transform[:3, 3]).max() < NEAR_MM:
-        node.child("transform").fail(f"is within {NEAR_MM:g} mm of the origin: in metres?", "give it in mm")
+        transform.fail(f"is within {NEAR_MM:g} mm of the origin: in metres?", "give it in mm")
     return StatedBase(CAMERA_FRAMES[stated.axes].poses_to_opencv(stated.transform), stated.sd_mm, stated.sd_deg)
 
 

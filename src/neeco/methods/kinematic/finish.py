@@ -172,8 +172,9 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
 
 @dataclass(frozen=True, eq=False)
 class JudgedFrame:
-    """A training frame: its number, state and camera, and which pixels [H, W] are an instrument (1) or tissue (-1) for
-    certain, of those near a rendered instrument and of all that may show one; depth [H, W] mm of the tissue."""
+    """A training frame: its number, state and camera, and which pixels, int8 [H, W], are an instrument (1) or tissue
+    (-1) for certain, of those near a rendered instrument and of all that may show one; depth [H, W] mm of the
+    tissue."""
 
     index: int
     state: State
@@ -192,7 +193,8 @@ def judge_frames(session: GaussianSession) -> list[JudgedFrame]:
         return []
     judged, settings = [], foreground.settings
     for index, view in zip(indices, views, strict=True):
-        near, beside = (foreground.certainty(view, reach) for reach in (settings.reach, settings.apart))
+        certainties = (foreground.certainty(view, reach) for reach in (settings.reach, settings.apart))
+        near, beside = ((np.sign(c) * (np.abs(c) > QUALITY.certain)).astype(np.int8) for c in certainties)
         judged.append(JudgedFrame(index, *session.corrected(index), near, beside, view.depth))
     return judged
 
@@ -218,8 +220,8 @@ def drop_refuted(session: GaussianSession, judged: Sequence[JudgedFrame]) -> tup
         seen += in_front
         deviation = float(refinement.pose_sd[refinement.instants[frame.index], :, 3:].max())
         margin = 2 * int(deviation * camera.fx / float(depths[in_front].median())) + 1
-        tissue = cv2.erode((frame.near < -QUALITY.certain).astype(np.uint8), np.ones((margin, margin), np.uint8))
-        for votes, where in ((refuting, tissue > 0), (confirming, frame.near > QUALITY.certain)):
+        tissue = cv2.erode((frame.near < 0).astype(np.uint8), np.ones((margin, margin), np.uint8))
+        for votes, where in ((refuting, tissue > 0), (confirming, frame.near > 0)):
             votes += in_front & torch.from_numpy(where).to(in_front.device)[place]
     refuted = (refuting >= FINISH.refuting_frames) & (refuting > FINISH.refuting_share * (refuting + confirming))
     return _selected(canonical, ~refuted), (confirming / seen.clamp_min(1))[~refuted]
@@ -311,8 +313,9 @@ def extend_shaft(
         return canonical
     device = canonical.means.device
     positions = torch.linspace(rear, front, 40, device=device)
-    coverage = shaft_coverage(positions, name, articulation, recorded.states, recorded.cameras)
-    observed = coverage >= max(FINISH.min_coverage, min(0.5, FINISH.min_frames / len(recorded.states)))
+    views = list(zip(recorded.states, recorded.cameras, strict=True))
+    coverage = shaft_coverage(positions, name, articulation, views)
+    observed = coverage >= max(FINISH.min_coverage, min(0.5, FINISH.min_frames / len(views)))
     if not bool(observed.any()):
         return canonical
     start = float(positions[observed][0])
@@ -321,9 +324,8 @@ def extend_shaft(
     across = canonical.means[rows] - origin - along[:, None] * direction
     radius = float(across[behind if bool(behind.any()) else solid].norm(dim=1).median())
     beyond = rear - radius * torch.tensor(FINISH.behind_radii, device=device)
-    distinct = distinct_frames(recorded.states, recorded.cameras)
-    states, cameras = [recorded.states[k] for k in distinct], [recorded.cameras[k] for k in distinct]
-    in_view = float(shaft_coverage(beyond[:1], name, articulation, states, cameras))
+    distinct = [views[index] for index in distinct_frames(views)]
+    in_view = float(shaft_coverage(beyond[:1], name, articulation, distinct))
     if in_view > FINISH.max_end_coverage and not shows_shaft(judged, name, articulation, beyond):
         return canonical
     slab = FINISH.slab_radii * radius
@@ -345,27 +347,25 @@ def extend_shaft(
 
 
 def shaft_coverage(
-    positions: Tensor, name: str, articulation: Articulation, states: Sequence[State], cameras: Sequence[Camera]
+    positions: Tensor, name: str, articulation: Articulation, views: Sequence[tuple[State, Camera]]
 ) -> Tensor:
-    """Return the share [Q] of the frames whose image contains the shaft's axis at `positions` [Q] mm."""
+    """Return the share [Q] of the views whose image contains the shaft's axis at `positions` [Q] mm."""
     origin, direction = articulation.shaft()
     points = origin + positions[:, None] * direction  # [Q, 3]
     counts = torch.zeros_like(positions)
-    for state, camera in zip(states, cameras, strict=True):
+    for state, camera in views:
         pose = state.instruments[name].pose.to(points)
         counts += in_image(points @ pose[:3, :3].T + pose[:3, 3], camera)
-    return counts / max(1, len(states))
+    return counts / max(1, len(views))
 
 
 def shows_shaft(judged: Sequence[JudgedFrame], name: str, articulation: Articulation, places: Tensor) -> bool:
     """Return whether distinct frames show an instrument rather than tissue at places [Q] mm along the shaft."""
-    distinct = distinct_frames([frame.state for frame in judged], [frame.camera for frame in judged])
     origin, direction = articulation.shaft()
     points, votes = origin + places[:, None] * direction, [np.zeros(1)]
-    for frame in (judged[index] for index in distinct):
+    for frame in (judged[index] for index in distinct_frames([(frame.state, frame.camera) for frame in judged])):
         pose = frame.state.instruments[name].pose.to(points)
         placed = points @ pose[:3, :3].T + pose[:3, 3]
         column, row = project_world(placed, frame.camera)[0][in_image(placed, frame.camera)].long().cpu().numpy().T
-        certainty = frame.beside[row, column]
-        votes.append(np.sign(certainty) * (np.abs(certainty) > QUALITY.certain))
+        votes.append(frame.beside[row, column])
     return bool(np.concatenate(votes).mean() > FINISH.goes_on_share)
