@@ -27,8 +27,9 @@ class LampSearchSettings:
     max_coverage: float = 0.05  # share of a pixel covered by solid instrument, above which it is not compared
     n_lamp_frames: int = 12  # frames used to score lamps
     n_lamp_directions: int = 8  # candidate directions around the lens
-    min_agreement: float = 0.75  # minimum share of frames that the first lamps improve
-    min_further_agreement: float = 0.5  # the same for further lamps
+    # minimum share of the frames' changes in error, in sum, that are reductions; frames without a visible shadow have
+    # hardly any change
+    min_agreement: float = 0.7
     min_explained: float = 0.005  # minimum share of the squared error near the instruments explained by each lamp
     margin_px: int = 3  # px of search images, around compared pixels, that must show no instrument
     max_brightness: float = 0.8  # of white: errors at highlights exceed those of any shadow
@@ -70,10 +71,11 @@ class _NormalEquations:
         return _Fit(chosen, strengths, float(2 * strengths @ moment - strengths @ gram @ strengths))
 
     def agreement(self, fit: _Fit) -> float:
-        """Return the share of the frames whose error the lamps reduce."""
+        """Return the sum of the reductions of error over frames, as a share of all frames' changes in error."""
         index = list(fit.chosen)
         common = np.einsum("i,fij,j->f", fit.strengths, self.gram[:, index][:, :, index], fit.strengths)
-        return float((2 * self.moment[:, index] @ fit.strengths > common).mean())
+        reductions = 2 * self.moment[:, index] @ fit.strengths - common  # [F]
+        return float(reductions.clip(0).sum() / max(np.abs(reductions).sum(), 1e-12))
 
 
 @torch.no_grad()
@@ -98,7 +100,7 @@ def find_shadow(session: GaussianSession) -> None:
             "found_at_mm": [],
         }
     )
-    if not fit.chosen or agree < (LAMPS.min_further_agreement if fixed_lamps else LAMPS.min_agreement):
+    if not fit.chosen or agree < LAMPS.min_agreement:
         return
     for lamp, candidate, strength in zip(free, fit.chosen, fit.strengths, strict=False):
         scene.shadow_offsets[lamp] = offsets[candidate]
