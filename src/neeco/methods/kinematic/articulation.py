@@ -153,7 +153,11 @@ class Articulation(nn.Module):
         self.register_buffer("inner", turns * nn.functional.one_hot(carrier, len(links)), persistent=False)
         self._pivot_names = [common_name([link.name for link in group]) for group in self.joint_groups]
         self._ends = [k for k, link in enumerate(links) if k and not any(o.parent == link.name for o in links)]
-        self.skeleton = (("shaft_far", "shaft_near"), *self._bones())
+        bones, ends = [], [self.link_names[k] for k in self._ends]  # from every pivot to the next ones and to the tips
+        for name, group, inner in zip(self._pivot_names, self.joint_groups, self.inner_joints, strict=True):
+            bones.append((f"pivot_{self._pivot_names[inner]}" if inner >= 0 else "shaft_near", f"pivot_{name}"))
+            bones += [(f"pivot_{name}", f"tip_{link.name}") for link in group if link.name in ends]
+        self.skeleton = (("shaft_far", "shaft_near"), *bones[::-1])
 
     def add_unknowns(self, joints: int, readings: int) -> None:
         """Add the learnable parameters of axes and readings."""
@@ -242,7 +246,15 @@ class Articulation(nn.Module):
     def _sides(self, points: Tensor) -> Tensor:
         """Return the logits [M, L] <= 0 of the links given the positions [M, 3] mm of Gaussians."""
         pivots, axes = self.axes()
-        directions = self._link_directions(pivots)
+        # unit directions [J, 3] of the links at every joint at rest, from the preceding pivot; else the shaft's
+        headings = [self.shaft()[1]] * len(pivots)
+        for joint in reversed(range(len(pivots))):  # the innermost first
+            inner = self.inner_joints[joint]
+            if inner >= 0 and not self.slides[joint]:
+                step = pivots[joint] - pivots[inner]
+                far = float(step.norm()) > SETTINGS.min_step_mm
+                headings[joint] = nn.functional.normalize(step, dim=0) if far else headings[inner]
+        directions = torch.stack(headings)
         along = (points @ directions.T - (pivots * directions).sum(1)) / self.radius  # [M, J]
         aside = (points @ axes.T - (pivots * axes).sum(1)).abs() / self.radius  # [M, J]
         prongs = SETTINGS.prongs * ((aside - SETTINGS.prongs_from) / (SETTINGS.prongs_to - SETTINGS.prongs_from)).clamp(
@@ -250,18 +262,6 @@ class Articulation(nn.Module):
         )
         beyond = SETTINGS.side_logits * (along - SETTINGS.side_start - prongs)
         return beyond.clamp_max(0) @ self.outer - beyond.clamp_min(0) @ self.inner
-
-    def _link_directions(self, pivots: Tensor) -> Tensor:
-        """Return unit directions [J, 3] of the links at every joint at rest, from the preceding pivot; else the
-        shaft's."""
-        directions = [self.shaft()[1]] * len(pivots)
-        for joint in reversed(range(len(pivots))):  # the innermost first
-            inner = self.inner_joints[joint]
-            if inner >= 0 and not self.slides[joint]:
-                step = pivots[joint] - pivots[inner]
-                far = float(step.norm()) > SETTINGS.min_step_mm
-                directions[joint] = nn.functional.normalize(step, dim=0) if far else directions[inner]
-        return torch.stack(directions)
 
     @property
     def _following(self) -> int:
@@ -449,14 +449,6 @@ class Articulation(nn.Module):
         while name is not None and signature(self.tree, name) not in numbers:
             name = parents[name]
         return 0 if name is None else numbers[signature(self.tree, name)]
-
-    def _bones(self) -> list[tuple[str, str]]:
-        """Return lines from every pivot to the next ones and to the tips."""
-        bones, ends = [], [self.link_names[k] for k in self._ends]
-        for name, group, inner in zip(self._pivot_names, self.joint_groups, self.inner_joints, strict=True):
-            bones.append((f"pivot_{self._pivot_names[inner]}" if inner >= 0 else "shaft_near", f"pivot_{name}"))
-            bones += [(f"pivot_{name}", f"tip_{link.name}") for link in group if link.name in ends]
-        return bones[::-1]
 
 
 class ArticulatedInstruments(nn.Module):

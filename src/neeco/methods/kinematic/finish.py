@@ -68,7 +68,12 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
     session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
     judged = judge_frames(session)
     session.scene.canonical = drop_detached(*drop_refuted(session, judged))
-    session.scene.canonical = finalise_links(drop_occluded(session.scene), articulated)
+    canonical = drop_occluded(session.scene)
+    logits = canonical.extras[LINK_LOGITS].clone()
+    for index, articulation in enumerate(articulated.articulations):  # without links that positions exclude
+        rows = canonical.body(index + 1)
+        logits[rows] = articulation.settled(canonical.means[rows], logits[rows])
+    session.scene.canonical = canonical.with_extras(**{LINK_LOGITS: logits})
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         articulation = articulated.articulations[index]
@@ -102,15 +107,6 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
     session.scene.diagnostics["joints"] = verdicts
     session.scene.diagnostics["latency_s"] = float(session.refinement.latency)
     session.scene.diagnostics["registration"] = session.scene.registration.tolist()
-
-
-def finalise_links(canonical: CanonicalGaussians, articulated: ArticulatedInstruments) -> CanonicalGaussians:
-    """Return the canonical Gaussians with links excluded by position."""
-    logits = canonical.extras[LINK_LOGITS].clone()
-    for index, articulation in enumerate(articulated.articulations):
-        rows = canonical.body(index + 1)
-        logits[rows] = articulation.settled(canonical.means[rows], logits[rows])
-    return canonical.with_extras(**{LINK_LOGITS: logits})
 
 
 def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, index: int, name: str) -> dict[str, Any]:

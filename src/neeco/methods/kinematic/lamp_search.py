@@ -86,7 +86,10 @@ def find_shadow(session: GaussianSession) -> None:
     free = [lamp for lamp in range(MAX_LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
     if not scene.instruments or not free:
         return
-    offsets = _candidates(2 * session.extent, LAMPS.n_lamp_directions).to(scene.center)
+    angles = torch.arange(LAMPS.n_lamp_directions) * (2 * math.pi / LAMPS.n_lamp_directions)
+    around = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], 1)
+    # candidate lamps [C, 3] mm around the lens, camera frame
+    offsets = torch.cat([radius * (2 * session.extent) * around for radius in LAMPS.candidate_radii]).to(scene.center)
     equations = _normal_equations(session, offsets)
     fixed_lamps = [scene.shadow_offsets[lamp] for lamp in range(MAX_LAMPS) if lamp not in free]
     fit = _choose(equations, offsets, fixed_lamps, LAMPS.min_explained)
@@ -110,13 +113,6 @@ def find_shadow(session: GaussianSession) -> None:
     faint = scene.canonical.of_instruments & (torch.sigmoid(logits) <= LAMPS.faint_opacity)
     logits[faint] = logits[faint].clamp_max(math.log(LAMPS.faded_opacity / (1 - LAMPS.faded_opacity)))
     session.adam.forget("opacity_logits")
-
-
-def _candidates(distance: float, directions: int) -> Tensor:
-    """Return candidate lamps [C, 3] mm around the lens, camera frame, for tissue at `distance` mm."""
-    angles = torch.arange(directions) * (2 * math.pi / directions)
-    around = torch.stack([angles.cos(), angles.sin(), torch.zeros(directions)], 1)
-    return torch.cat([radius * distance * around for radius in LAMPS.candidate_radii])
 
 
 def _choose(equations: _NormalEquations, offsets: Tensor, known: list[Tensor], min_explained: float) -> _Fit:

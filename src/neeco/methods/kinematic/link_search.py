@@ -185,7 +185,10 @@ def _open_links(
     instrument = next(item for item in session.scene.instruments if item.name == name)
     sides: dict[int, tuple[Tensor, Tensor]] = {}
     for reading in instrument.unrecorded:
-        opening = _opened_by(links, reading)
+        opening: dict[int, tuple[int, float]] = {}  # {link: (joint, sign)} that turn in opposite directions
+        for joint, gains in enumerate(links.gains[:, :, links.reading_names.index(reading)]):  # [L - 1]
+            if bool((gains > 0).any()) and bool((gains < 0).any()) and not links.slides[joint]:
+                opening |= {k + 1: (joint, 1.0 if gain > 0 else -1.0) for k, gain in enumerate(gains.tolist()) if gain}
         if not opening:
             continue
         low, high = instrument.joints[reading] or (0.0, 0.0)
@@ -208,15 +211,6 @@ def _open_links(
             opens_to = sense * towards
             sides[link] = (pivot, torch.stack([ahead, opens_to]) if headed else opens_to[None])
     return sides
-
-
-def _opened_by(links: Articulation, reading: str) -> dict[int, tuple[int, float]]:
-    """Return {link: (joint, sign)} of links that a reading turns about one axis in opposite directions."""
-    opened: dict[int, tuple[int, float]] = {}
-    for joint, gains in enumerate(links.gains[:, :, links.reading_names.index(reading)]):  # [L - 1]
-        if bool((gains > 0).any()) and bool((gains < 0).any()) and not links.slides[joint]:
-            opened |= {k + 1: (joint, 1.0 if gain > 0 else -1.0) for k, gain in enumerate(gains.tolist()) if gain}
-    return opened
 
 
 @torch.no_grad()

@@ -30,19 +30,16 @@ def joints_by_axis(tree: KinematicTree) -> list[list[Link]]:
     for joint in tree.joints:
         if not any(tree.carries(joint, body) for body in tree.bodies):
             continue
-        same = [group for group in groups if _same_axis(group[0], joint)]
-        if same:
-            same[0].append(joint)
+        for group in groups:
+            one = group[0]
+            off = np.linalg.norm(np.cross(joint.origin[:3, 3] - one.origin[:3, 3], one.axis))
+            same = (one.parent, one.type) == (joint.parent, joint.type)
+            if same and np.allclose(one.axis, joint.axis, atol=1e-6) and off < 1e-6:
+                group.append(joint)
+                break
         else:
             groups.append([joint])
     return groups
-
-
-def _same_axis(one: Link, other: Link) -> bool:
-    if (one.parent, one.type) != (other.parent, other.type) or not np.allclose(one.axis, other.axis, atol=1e-6):
-        return False
-    between = other.origin[:3, 3] - one.origin[:3, 3]
-    return bool(np.linalg.norm(np.cross(between, one.axis)) < 1e-6)
 
 
 def common_name(names: Sequence[str]) -> str:

@@ -75,12 +75,10 @@ def refine_wrists(session: GaussianSession, articulated: ArticulatedInstruments)
 
 
 def _boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float:
-    boundary = color_boundary(session, articulated, index)
-    return _symmetry_boundary(session, articulated, index) if boundary is None else boundary
-
-
-def _symmetry_boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float:
-    """Return the position in mm along the shaft up to which spinning the part behind costs little."""
+    """Return the position in mm along the shaft of the largest change of colour; without one, that up to which spinning
+    the part behind costs little."""
+    if (boundary := color_boundary(session, articulated, index)) is not None:
+        return boundary
     scene = session.scene
     articulation = articulated.articulations[index]
     before = float(articulation.wrist_start)
