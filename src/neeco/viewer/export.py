@@ -192,13 +192,11 @@ def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
         "instruments": _instruments(scene, motion),
         "recorded": _recorded(scene, motion),
     }
-    return header, b"".join(_planes(numbers, kind) for _, numbers, kind in fields)
-
-
-def _planes(numbers: np.ndarray, kind: str) -> bytes:
-    """Return K planes of N numbers [N, K], all low bytes before the high ones."""
-    split = np.ascontiguousarray(numbers.T, "<i4")[..., None].view(np.uint8)  # [K, N, 4]
-    return np.ascontiguousarray(split[..., : BYTES[kind]].transpose(2, 0, 1)).tobytes()
+    planes = []
+    for _, numbers, kind in fields:  # K planes of N numbers, all low bytes before the high ones
+        split = np.ascontiguousarray(numbers.T, "<i4")[..., None].view(np.uint8)  # [K, N, 4]
+        planes.append(np.ascontiguousarray(split[..., : BYTES[kind]].transpose(2, 0, 1)).tobytes())
+    return header, b"".join(planes)
 
 
 def _harmonics(rest: Tensor, degree: int) -> tuple[np.ndarray, list[float]]:

@@ -51,7 +51,7 @@ class MovingScene:
     """A scene in a sequence of states."""
 
     nodes: tuple[MovingNode, ...]  # parents before their children
-    times: np.ndarray  # [T] s, from 0 on
+    times: np.ndarray  # [T] s, from 0 on; `frame_s` apart where the states have none that increase
     blended: float  # share of the instruments' Gaussians that blend links: right in the first state only
 
 
@@ -67,20 +67,16 @@ def exported_states(scene: GaussianScene, first: State, states: Path | None) -> 
     return list(instants.values()) if len(instants) > 1 else recorded  # all equal: no times were recorded
 
 
-def times_of(states: Sequence[State]) -> np.ndarray:
-    """Return the states' times [T] s from 0 on; `frame_s` apart where they state none that increase."""
-    times = np.array([float(state.time) for state in states])
-    if not (np.diff(times) > 0).all():
-        times = MOVING.frame_s * np.arange(len(states))
-    return (times - times[0]).astype(np.float32)
-
-
 @torch.no_grad()
 def moving_scene(scene: GaussianScene, states: Sequence[State], camera: Camera) -> MovingScene:
     """Return the scene moving through `states`, lit as `camera` observes the first one; still where its method has no
     joints to move by. Raises NeecoError where its numbers are not finite."""
     motion = scene.motion()
-    splats, times = splats_of(scene, states[0], camera, moving=motion is not None), times_of(states)
+    splats = splats_of(scene, states[0], camera, moving=motion is not None)
+    times = np.array([float(state.time) for state in states])
+    if not (np.diff(times) > 0).all():
+        times = MOVING.frame_s * np.arange(len(states))
+    times = (times - times[0]).astype(np.float32)
     if motion is None:
         return MovingScene((MovingNode(name="tissue", splats=splats),), times, 0.0)
     tissue = local_splats(splats, np.arange(scene.canonical.counts[0]), np.eye(4))

@@ -22,7 +22,7 @@ from neeco.viewer.controls import Controls, controlled_state, interpolated_state
 from neeco.viewer.panel import Panel, message_html, status_html
 from neeco.viewer.runs import LoadedRun, ViewedRun, score_frame
 from neeco.viewer.saving import SavedStates
-from neeco.viewer.views import Picture, render_run
+from neeco.viewer.views import render_run
 from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, pose_of, stands_at
 
 if TYPE_CHECKING:
@@ -138,24 +138,20 @@ class RenderThread:
     def _run(self) -> None:
         while not self._stopped:
             self._wake.clear()
-            moments = self._tick()
+            now, moments = time.perf_counter(), []
+            for session in self.sessions:
+                try:
+                    if (moment := session.tick(now)) is not None:
+                        moments.append(moment)
+                except Exception:
+                    log.exception("a session failed")
+                    self.remove(session.key)
             if self._do_most_urgent() or _attempted(self._when_idle, False):
                 continue
             with self._lock:
                 moments += [when for _, when in self._due.values()]
             now = time.perf_counter()
             self._wake.wait(max(0.0, min([VIEWER.idle_s, *(moment - now for moment in moments)])))
-
-    def _tick(self) -> list[float]:
-        """Advance every session; return the time of each one's next call."""
-        now, moments = time.perf_counter(), []
-        for session in self.sessions:
-            try:
-                moments.append(session.tick(now))
-            except Exception:
-                log.exception("a session failed")
-                self.remove(session.key)
-        return [moment for moment in moments if moment is not None]
 
     def _do_most_urgent(self) -> bool:
         """Run a job or render a picture; return whether there was one."""
@@ -223,11 +219,14 @@ class ClientSession:
             self._client.gui.reset()
             self._client.scene.reset()
             self._build(current)
-        self._loaded = current
-        self._fit_window()
-        controls, window = self._follow_recording(), self._client.camera
+        self._loaded, window, unit = current, self._client.camera, self._run.unit
+        if (shape := aspect_of(window)) != self._shape:  # fit the whole recorded image, where it stands at its camera
+            self._shape, recorded = shape, current.recorded.cameras[self._camera_frame]
+            if stands_at(browser_camera(window, unit, VIEWER.min_px), recorded, self._run.distance):
+                window.fov = fitting_view(recorded, shape)
+        controls = self._follow_recording()
         height = self._resolution.height(sharp, window.image_height, aspect_of(window))
-        camera = browser_camera(window, self._run.unit, height)
+        camera = browser_camera(window, unit, height)
         try:
             picture, as_recorded = render_run(current, controls, camera, self._panel.view.value)
         except NeecoError as error:
@@ -235,9 +234,26 @@ class ClientSession:
             return
         seconds = time.perf_counter() - began
         self._resolution.record(seconds, picture.depth.size)
-        if self._connected():
-            self._send(picture, sharp)
-            self._show_status(controls, picture, as_recorded, seconds, sharp)
+        if not self._connected():
+            return
+        depth = None
+        if self.overlays.shown:  # 0 means empty: far away, not at the eye
+            depth = np.where(picture.depth > 0, picture.depth * unit, np.inf)
+        quality = VIEWER.jpeg_sharp if sharp else VIEWER.jpeg_moving
+        self._client.scene.set_background_image(picture.pixels, format="jpeg", jpeg_quality=quality, depth=depth)
+        self._client.flush()
+        now = time.perf_counter()
+        if not sharp and now - self.status_at < VIEWER.status_every_s:
+            return
+        self.status_at = now
+        notes, score = [self._run.trouble or current.trouble, picture.note], None
+        if sharp and as_recorded and current.frames:  # else things move on before it is read
+            try:
+                with current.scene.torch_threads():
+                    score = score_frame(current, int(controls.frame))
+            except NeecoError as error:
+                notes.append(str(error))
+        self._panel.status.content = status_html(current, controls, picture, seconds, notes, score)
 
     def tick(self, now: float) -> float | None:
         """Advance playback, and show new scores of frames. now: of time.perf_counter(); return when to call again, or
@@ -279,16 +295,6 @@ class ClientSession:
         self._camera_frame = frame
         camera = self._loaded.recorded.cameras[frame]
         jump(self._client, camera, self._run.unit, self._run.distance)
-
-    def _fit_window(self) -> None:
-        """Fit the whole recorded image when the window at its camera has changed its shape."""
-        window, recorded = self._client.camera, self._loaded.recorded.cameras[self._camera_frame]
-        shape = aspect_of(window)
-        if shape == self._shape:
-            return
-        self._shape = shape
-        if stands_at(browser_camera(window, self._run.unit, VIEWER.min_px), recorded, self._run.distance):
-            window.fov = fitting_view(recorded, shape)
 
     def _follow_recording(self) -> Controls:
         """Return the sliders' values, after sliders and camera have followed the recording."""
@@ -348,28 +354,3 @@ class ClientSession:
             self._panel.saved.content = message_html(task())
         except NeecoError as error:
             self._panel.saved.content = message_html(f"error: {error}")
-
-    def _send(self, picture: Picture, sharp: bool) -> None:
-        depth = None
-        if self.overlays.shown:
-            # 0 means empty: far away, not at the eye
-            depth = np.where(picture.depth > 0, picture.depth * self._run.unit, np.inf)
-        quality = VIEWER.jpeg_sharp if sharp else VIEWER.jpeg_moving
-        self._client.scene.set_background_image(picture.pixels, format="jpeg", jpeg_quality=quality, depth=depth)
-        self._client.flush()
-
-    def _show_status(
-        self, controls: Controls, picture: Picture, as_recorded: bool, seconds: float, sharp: bool
-    ) -> None:
-        now, loaded = time.perf_counter(), self._loaded
-        if not sharp and now - self.status_at < VIEWER.status_every_s:
-            return
-        self.status_at = now
-        notes, score = [self._run.trouble or loaded.trouble, picture.note], None
-        if sharp and as_recorded and loaded.frames:  # else things move on before it is read
-            try:
-                with loaded.scene.torch_threads():
-                    score = score_frame(loaded, int(controls.frame))
-            except NeecoError as error:
-                notes.append(str(error))
-        self._panel.status.content = status_html(loaded, controls, picture, seconds, notes, score)

@@ -49,7 +49,7 @@ def require_usd() -> None:
 def write_usd(scene: MovingScene, path: Path) -> None:
     """Write a binary file, .usdc. Raises NeecoError where OpenUSD is missing or too old, or the disk refuses."""
     require_usd()
-    from pxr import Tf, Usd, UsdGeom
+    from pxr import Gf, Tf, Usd, UsdGeom
 
     codes = scene.times * USD.codes_per_second
     stage = Usd.Stage.CreateInMemory()
@@ -72,7 +72,13 @@ def write_usd(scene: MovingScene, path: Path) -> None:
         else:
             prim = _define_field(stage, places[-1], node.splats, node.name)
         if node.poses is not None:
-            _set_poses(prim, node.poses, codes)
+            operation = prim.AddTransformOp()
+            matrices = [Gf.Matrix4d(*pose.T.ravel().tolist()) for pose in node.poses]  # USD multiplies rows
+            if np.ptp(node.poses, axis=0).max() == 0:
+                operation.Set(matrices[0])
+            else:
+                for code, matrix in zip(codes.tolist(), matrices, strict=True):
+                    operation.Set(matrix, code)
 
     def write(temporary: Path) -> None:
         try:
@@ -81,19 +87,6 @@ def write_usd(scene: MovingScene, path: Path) -> None:
             raise OSError(f"OpenUSD: {str(error).splitlines()[-1]}") from error
 
     write_atomically(path, write)
-
-
-def _set_poses(prim: Any, poses: np.ndarray, codes: np.ndarray) -> None:
-    """Set parent_from_prim [T, 4, 4] mm at time codes [T]; one value where it does not change."""
-    from pxr import Gf
-
-    operation = prim.AddTransformOp()
-    matrices = [Gf.Matrix4d(*pose.T.ravel().tolist()) for pose in poses]  # USD multiplies rows
-    if np.ptp(poses, axis=0).max() == 0:
-        operation.Set(matrices[0])
-        return
-    for code, matrix in zip(codes.tolist(), matrices, strict=True):
-        operation.Set(matrix, code)
 
 
 def _define_field(stage: Any, path: str, splats: Splats, label: str) -> Any:

@@ -64,7 +64,12 @@ def picture(scene: DrawableScene, state: State, camera: Camera, view: str, label
             return Picture(overlay_parts(np.zeros_like(color), parts, 1.0), depth)
         return Picture(overlay_parts(color, parts), depth)
     if view == DEPTH:
-        return _depth_picture(depth)
+        if not (has_depth := depth > 0).any():
+            return Picture(np.zeros_like(color, np.uint8), depth, "nothing in view")
+        near, far = np.percentile(depth[has_depth], DEPTH_PERCENTILES)
+        grey = np.clip((far - depth) / max(far - near, 1e-6), 0, 1) * has_depth
+        note = f"white {near:.1f} mm or nearer, black {far:.1f} mm"
+        return Picture(to_uint8(np.repeat(grey[..., None], 3, 2) * 255), depth, note)
     if view == UNOBSERVED:
         assert rendering.channels is not None
         share = rendering.channels[..., -1:].clamp(0, 1).cpu().numpy()
@@ -118,13 +123,3 @@ def _rendering(scene: DrawableScene, state: State, camera: Camera, view: str, la
     gaussians = scene.at(state)
     channels = labels if view in LABELLED else scene.unobserved(gaussians, camera)[:, None]
     return rasterize(gaussians, camera, channels=channels)
-
-
-def _depth_picture(depth: np.ndarray) -> Picture:
-    has_depth = depth > 0
-    if not has_depth.any():
-        return Picture(np.zeros((*depth.shape, 3), np.uint8), depth, "nothing in view")
-    near, far = np.percentile(depth[has_depth], DEPTH_PERCENTILES)
-    grey = np.clip((far - depth) / max(far - near, 1e-6), 0, 1) * has_depth
-    note = f"white {near:.1f} mm or nearer, black {far:.1f} mm"
-    return Picture(to_uint8(np.repeat(grey[..., None], 3, 2) * 255), depth, note)

@@ -137,7 +137,18 @@ class Overlays:
                 position=pose[:3, 3] * unit,
             )
             frustum.on_click(lambda _, frame=frame: clicked(frame))
-        self.points = self._add_points(points)
+        self.points: Any = None
+        if points is not None and len(points.positions):
+            chosen = evenly_spaced(len(points.positions), SCENE.max_points)
+            self.points = self._scene.add_point_cloud(
+                "/points",
+                (points.positions[chosen] * unit).astype(np.float32),
+                points.colors[chosen].astype(np.float32),
+                point_size=SCENE.point_units,
+                point_shape="circle",
+                precision="float32",
+                visible=False,
+            )
         self._gizmos: dict[str, Any] = {}
 
     @property
@@ -172,17 +183,3 @@ class Overlays:
         """Pose [4, 4] in mm of an instrument's gizmo; None without one."""
         gizmo = self._gizmos.get(name)
         return None if gizmo is None else pose_of(gizmo.wxyz, gizmo.position, self._unit)
-
-    def _add_points(self, points: PointCloud | None) -> Any:
-        if points is None or not len(points.positions):
-            return None
-        chosen = evenly_spaced(len(points.positions), SCENE.max_points)
-        return self._scene.add_point_cloud(
-            "/points",
-            (points.positions[chosen] * self._unit).astype(np.float32),
-            points.colors[chosen].astype(np.float32),
-            point_size=SCENE.point_units,
-            point_shape="circle",
-            precision="float32",
-            visible=False,
-        )
