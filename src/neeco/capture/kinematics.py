@@ -157,19 +157,17 @@ class KinematicTree:
 
     def to_json(self) -> dict[str, Any]:
         """The `kinematics` block that `neeco.capture.readers.kinematics` reads."""
-        written: dict[str, Any] = {"links": [_link_to_json(link) for link in self.links]}
-        return written if self.pose_of is None else {"pose_of": self.pose_of} | written
-
-
-def _link_to_json(link: Link) -> dict[str, Any]:
-    shifted_only = np.array_equal(link.origin[:3, :3], np.eye(3))
-    written: dict[str, Any] = {"name": link.name}
-    written |= {} if link.parent is None else {"parent": link.parent}
-    written |= {"type": link.type, "origin": (link.origin[:3, 3] if shifted_only else link.origin).tolist()}
-    if link.type != FIXED:
-        written |= {"axis": link.axis.tolist(), "value": dict(link.value), "offset": link.offset}
-    written |= {} if link.limits is None else {"limits": list(link.limits)}
-    return written if link.body else written | {"body": False}
+        written: dict[str, Any] = {} if self.pose_of is None else {"pose_of": self.pose_of}
+        written["links"] = links = []
+        for link in self.links:
+            shifted_only = np.array_equal(link.origin[:3, :3], np.eye(3))
+            entry: dict[str, Any] = {"name": link.name} | ({} if link.parent is None else {"parent": link.parent})
+            entry |= {"type": link.type, "origin": (link.origin[:3, 3] if shifted_only else link.origin).tolist()}
+            if link.type != FIXED:
+                entry |= {"axis": link.axis.tolist(), "value": dict(link.value), "offset": link.offset}
+            entry |= {} if link.limits is None else {"limits": list(link.limits)}
+            links.append(entry if link.body else entry | {"body": False})
+        return written
 
 
 def _parents_first(links: tuple[Link, ...]) -> tuple[Link, ...]:

@@ -180,13 +180,20 @@ def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
         ("sh", harmonics, "int8"),
     )
     turn_ranges = [ends for _, ends in turns]
+    lamps = zip(scene.shadow_offsets.tolist(), scene.shadow_strengths.clamp(0, 1).tolist(), strict=True)
     header = {
         "schema": SCHEMA,
         "counts": list(canonical.counts),
         "degree": degree,
         "fields": [[name, numbers.shape[1], kind] for name, numbers, kind in fields],
         "ranges": {"mean": boxes, "scale": scale_range, "base": base_range, "turn": turn_ranges, "sh": bands},
-        "light": _light(scene),
+        "light": {
+            "falloff": scene.falloff.tolist(),
+            "vignette": scene.vignette.tolist(),
+            "background": scene.background,
+            "shadow_width": float(scene.shadow_width),
+            "lamps": [[*offset, strength] for offset, strength in lamps if strength > 0] if scene.casts_shadow else [],
+        },
         "threshold": threshold_of(scene),
         "labels": [list(name) for name in scene.label_names],
         "instruments": _instruments(scene, motion),
@@ -231,17 +238,6 @@ def _rounded(values: Tensor) -> np.ndarray:
     if not values.isfinite().all():
         raise NeecoError(NOT_FINITE)
     return np.rint(values.double().cpu().numpy()).astype(np.int64)
-
-
-def _light(scene: GaussianScene) -> dict[str, Any]:
-    lamps = zip(scene.shadow_offsets.tolist(), scene.shadow_strengths.clamp(0, 1).tolist(), strict=True)
-    return {
-        "falloff": scene.falloff.tolist(),
-        "vignette": scene.vignette.tolist(),
-        "background": scene.background,
-        "shadow_width": float(scene.shadow_width),
-        "lamps": [[*offset, strength] for offset, strength in lamps if strength > 0] if scene.casts_shadow else [],
-    }
 
 
 def _instruments(scene: GaussianScene, motion: ArticulatedMotion) -> list[dict[str, Any]]:

@@ -26,7 +26,6 @@ from neeco.viewer.viser_scene import field_of_view, upward
 if TYPE_CHECKING:
     import viser
 
-MISSING = f"view: needs viser 1.1; {install_hint('view')}"
 # Keys on a focused slider are the slider's own. viser turns the camera by arrows that are pressed anywhere but in a
 # form; it listens on the document, the slider within.
 SLIDER_KEYS = b"""<script>
@@ -44,7 +43,23 @@ class ViserPage(contextlib.AbstractContextManager["ViserPage"]):
         it looks at. unit: viser's per mm. Raises NeecoError."""
         access = Access.at(host, port)
         self.address = access.address
-        self._server = _start_server(access)
+        try:
+            import viser
+        except ImportError:
+            raise NeecoError(f"view: needs viser 1.1; {install_hint('view')}") from None
+
+        class Server(viser.ViserServer):
+            """Never asks for a tunnel: a browser may request one without any button."""
+
+            def request_share_url(self, verbose: bool = True) -> None:
+                return None
+
+        # viser's own banner would name an address without the token
+        with controlled_sockets(access, SLIDER_KEYS) as opened, contextlib.redirect_stdout(io.StringIO()):
+            self._server = Server(host=access.host, port=access.port, label="neeco", verbose=False)
+        if not opened:
+            ViserPage.stop(self)
+            raise NeecoError(f"view: viser {viser.__version__} is too old or too new; {install_hint('view')}")
         pose = to_numpy(cameras[0].world_from_camera)
         scene, initial = self._server.scene, self._server.initial_camera
         scene.set_up_direction(tuple(upward(cameras)))
@@ -59,7 +74,8 @@ class ViserPage(contextlib.AbstractContextManager["ViserPage"]):
 
     def stop(self) -> None:
         """End the server."""
-        _stop_server(self._server)
+        with contextlib.redirect_stdout(io.StringIO()):  # without viser's farewell
+            self._server.stop()
 
 
 class ViewerServer(ViserPage):
@@ -98,30 +114,3 @@ class ViewerServer(ViserPage):
 
         session = ClientSession(client, self.run, self.saved, self.render_thread, connected, self._sharp_px)
         self.render_thread.add(session)
-
-
-def _start_server(access: Access) -> viser.ViserServer:
-    """viser's server, whose every request `access` has allowed. Raises NeecoError."""
-    try:
-        import viser
-    except ImportError:
-        raise NeecoError(MISSING) from None
-
-    class Server(viser.ViserServer):
-        """Never asks for a tunnel: a browser may request one without any button."""
-
-        def request_share_url(self, verbose: bool = True) -> None:
-            return None
-
-    # viser's own banner would name an address without the token
-    with controlled_sockets(access, SLIDER_KEYS) as opened, contextlib.redirect_stdout(io.StringIO()):
-        server = Server(host=access.host, port=access.port, label="neeco", verbose=False)
-    if not opened:
-        _stop_server(server)
-        raise NeecoError(f"view: viser {viser.__version__} is too old or too new; {install_hint('view')}")
-    return server
-
-
-def _stop_server(server: viser.ViserServer) -> None:
-    with contextlib.redirect_stdout(io.StringIO()):  # without viser's farewell
-        server.stop()

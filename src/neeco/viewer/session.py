@@ -200,6 +200,7 @@ class ClientSession:
         self._client, self._run, self._saved, self._thread, self._connected = client, run, saved, thread, connected
         self._resolution = AdaptiveResolution(sharp_px)
         self._saving = False
+        self._request = partial(thread.request, self.key)
         self._played_at: float | None = None
         self._shape = 0.0  # of the window, width by height
         self._camera_frame = 0  # whose camera the window was sent to last
@@ -283,9 +284,6 @@ class ClientSession:
         self._panel: Panel = Panel(self._client, loaded, self._request, self._go_to, self._toggle_gizmo)
         self._panel.keep.on_click(lambda _: self._save_state())
         self._panel.save.on_click(lambda _: self._save_image())
-
-    def _request(self) -> None:
-        self._thread.request(self.key)
 
     def _go_to(self, frame: int) -> None:
         self._jump_to(frame)

@@ -124,13 +124,14 @@ def spz_bytes(splats: Splats, version: SpzVersion = 4) -> bytes:
     fixed = np.rint(splats.means.astype(np.float64) * 2**SPZ_FRACTION).astype(np.int64)
     if fixed.size and np.abs(fixed).max() >= 2**23:
         raise NeecoError("--format: spz holds positions within 2 m of the world's origin only; use ply")
+    steps = np.repeat(SPZ_STEPS, (3, 5, 7))[: sh.shape[1] - 1, None]
     columns = (
         (fixed & 0xFFFFFF).astype("<u4")[..., None].view(np.uint8)[..., :3],
         to_uint8(255 / (1 + np.exp(-splats.logits.astype(np.float64)))),
         to_uint8(splats.sh[:, 0] * (SPZ_COLOR * 255) + 127.5),
         to_uint8((splats.log_scales + 10) * 16),
         _smallest_three(splats.quats),
-        _harmonics(splats.sh[:, 1:]),
+        np.clip((np.rint(sh[:, 1:] * 128) + 128 + steps // 2) // steps * steps, 0, 255).astype(np.uint8),
     )
     streams = [np.ascontiguousarray(column).tobytes() for column in columns if column.size]
     header = struct.pack("<IIIBB", SPZ_MAGIC, version, len(splats.means), splats.degree, SPZ_FRACTION)
@@ -153,13 +154,6 @@ def _smallest_three(quats: np.ndarray) -> np.ndarray:
         component = (xyzw[:, place] < 0).astype(np.uint32) << 9 | sizes[:, place]
         packed = np.where(place == largest, packed, packed << 10 | component)
     return packed.astype("<u4")
-
-
-def _harmonics(rest: np.ndarray) -> np.ndarray:
-    """uint8 [N, K - 1, 3], each coefficient's colours together."""
-    steps = np.repeat(SPZ_STEPS, (3, 5, 7))[: rest.shape[1], None]
-    whole = np.rint(rest * 128) + 128
-    return np.clip((whole + steps // 2) // steps * steps, 0, 255).astype(np.uint8)
 
 
 def _in_world(posed: Gaussians) -> Tensor:

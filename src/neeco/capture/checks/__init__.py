@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -33,9 +32,6 @@ class CaptureSummary:
     joints: dict[str, tuple[float, float]]  # "instrument.joint" -> lowest and highest value, rad
     travel_mm: dict[str, float]  # instrument -> diagonal of the box its origin moves in
     still: bool = False  # whether the scope was still
-
-    def as_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True)

@@ -145,8 +145,9 @@ class ColorEvidence:
         return mean / max(recorded, 1e-9), gain_certainty((agreement - self.recorded)[both]), mean
 
     def agreement(self, candidate: Candidate | None = None, every: int = 1, *, coarse: bool = False) -> np.ndarray:
-        """Return [F] correlation of the points' brightness with the images', relative to their neighbours: 0 with too
-        few visible points, NaN without a camera in the candidate. Evaluated for some images only."""
+        """Return [F] correlation of the points' brightness with the images', relative to their neighbours (coarse:
+        these relative to more neighbours): 0 with too few visible points, NaN without a camera in the candidate. every:
+        evaluated for some images only."""
         few = slice(None, None, every)
         cameras, pixels = self.cameras, None
         if candidate is not None:
@@ -155,8 +156,15 @@ class ColorEvidence:
             cameras = replace(cameras, poses=poses)
         u, v, inside = cameras[np.arange(len(self.rows))[few]].project(self.points, pixels)
         observed = np.stack([_sample(gray, *place) for gray, *place in zip(self.grays[few], u, v, inside, strict=True)])
+
+        def mean(values: np.ndarray, count: int) -> np.ndarray:
+            near = self.neighbours[:, :count]
+            return np.asarray((values * inside)[:, near].sum(-1) / inside[:, near].sum(-1).clip(1))
+
+        planes, count = (observed, np.tile(self.brightness, (len(u), 1))), SETTINGS.neighbours
         observed, color = (
-            self._relative(values, inside, coarse) for values in (observed, np.tile(self.brightness, (len(u), 1)))
+            mean(values, count) - mean(values, SETTINGS.far_neighbours) if coarse else values - mean(values, count)
+            for values in planes
         )
         near = inside[:, self.neighbours[:, : SETTINGS.neighbours]].sum(-1)
         counted = inside & (near >= SETTINGS.neighbours // 2)
@@ -171,16 +179,6 @@ class ColorEvidence:
         if candidate is not None and candidate.available is not None:
             correlation[~candidate.available[few]] = np.nan
         return np.asarray(correlation)
-
-    def _relative(self, values: np.ndarray, inside: np.ndarray, coarse: bool) -> np.ndarray:
-        """Values [F, P] less the mean of their neighbours; coarse: that mean less the mean of more neighbours."""
-
-        def mean(count: int) -> np.ndarray:
-            near = self.neighbours[:, :count]
-            return np.asarray((values * inside)[:, near].sum(-1) / inside[:, near].sum(-1).clip(1))
-
-        near = mean(SETTINGS.neighbours)
-        return near - mean(SETTINGS.far_neighbours) if coarse else values - near
 
     def color_difference(self, order: tuple[int, int, int]) -> float:
         """Median difference, of 255, between the points' colours and the images', whose channels are in this order."""
@@ -237,7 +235,19 @@ class MotionEvidence:
         differences = in_threads(find, range(len(valid)))
         # [F, h, w] confidence in [0, 1] that a pixel moves
         moving = np.stack([cv2.blur(((pixels - low) / (high - low)).clip(0, 1), (3, 3)) for pixels in differences])
-        self._choose_rays(moving)
+        generator, each = np.random.default_rng(0), -(-SETTINGS.rays // len(moving))
+        places = [
+            (index, place)
+            for index, pixels in enumerate(moving)
+            if len(candidates := np.flatnonzero(pixels > 0.5)) >= each
+            for place in generator.choice(candidates, each, replace=False)
+        ]
+        self.ray_views, place = np.array(places, int).reshape(-1, 2).T
+        row, column = np.divmod(place, self.width)
+        fx, fy, cx, cy = self.cameras.intrinsics[self.ray_views].T
+        slopes = np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(len(row))], -1)  # [R, 3]
+        at_depths = self.depths[self.ray_views, row, column][:, None] * DEPTHS
+        self.points = slopes[:, None] * at_depths[..., None]  # [R, D, 3] mm, in the camera's frame
         # uniform and permanent motion, and pixels outside the image (a border of one pixel), are not evidence
         evidence = np.pad((moving - moving.mean(0)).astype(np.float32), ((0, 0), (1, 1), (1, 1)))
         self._evidence, self._first = evidence.ravel(), np.arange(len(valid), dtype=np.int32) * evidence[0].size
@@ -263,10 +273,16 @@ class MotionEvidence:
         fx, fy, cx, cy = self.cameras.intrinsics[index]
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         world = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1) @ pose[:3, :3].T + pose[:3, 3]
-        predictions, observed = [], np.zeros(depth.shape, int)
-        for other in self._neighbours(index):
-            other_pose = self.cameras.poses[other]
-            local = (world - other_pose[:3, 3]) @ other_pose[:3, :3]
+        # others with cameras near this one, spread over the time that they span
+        poses, predictions, observed = self.cameras.poses, [], np.zeros(depth.shape, int)
+        cosine = (np.einsum("ij,fij->f", pose[:3, :3], poses[:, :3, :3]) - 1) / 2
+        distance = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.median(depth)
+        distance += np.arccos(cosine.clip(-1, 1))
+        distance[index] = np.inf
+        count = min(len(poses) - 1, max(3 * SETTINGS.predicting, len(poses) // 2))
+        near = np.sort(np.argsort(distance, kind="stable")[:count])
+        for other in near[evenly_spaced(len(near), SETTINGS.predicting)].tolist():
+            local = (world - poses[other, :3, 3]) @ poses[other, :3, :3]
             fx, fy, cx, cy = self.cameras.intrinsics[other]
             x, y = (place.astype(np.float32) - 0.5 for place in project(local, fx, fy, cx, cy, MIN_DEPTH))
             warped = cv2.remap(images[other], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -280,33 +296,6 @@ class MotionEvidence:
         below = cv2.erode(predicted, np.ones((3, 3))) - image
         above = image - cv2.dilate(predicted, np.ones((3, 3)))
         return np.where(valid, np.maximum(below, above).clip(0).max(-1), 0.0)
-
-    def _neighbours(self, index: int) -> list[int]:
-        """Return frames with cameras near that of `index`, spread over the time that they span."""
-        poses, pose = self.cameras.poses, self.cameras.poses[index]
-        shift = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.median(self.depths[index])
-        cosine = (np.einsum("ij,fij->f", pose[:3, :3], poses[:, :3, :3]) - 1) / 2
-        distance = shift + np.arccos(cosine.clip(-1, 1))
-        distance[index] = np.inf
-        count = min(len(poses) - 1, max(3 * SETTINGS.predicting, len(poses) // 2))
-        near = np.sort(np.argsort(distance, kind="stable")[:count])
-        return near[evenly_spaced(len(near), SETTINGS.predicting)].tolist()
-
-    def _choose_rays(self, moving: np.ndarray) -> None:
-        generator = np.random.default_rng(0)
-        each = -(-SETTINGS.rays // len(moving))
-        places = [
-            (index, place)
-            for index, pixels in enumerate(moving)
-            if len(candidates := np.flatnonzero(pixels > 0.5)) >= each
-            for place in generator.choice(candidates, each, replace=False)
-        ]
-        self.ray_views, place = np.array(places, int).reshape(-1, 2).T
-        row, column = np.divmod(place, self.width)
-        fx, fy, cx, cy = self.cameras.intrinsics[self.ray_views].T
-        slopes = np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(len(row))], -1)  # [R, 3]
-        depths = self.depths[self.ray_views, row, column][:, None] * DEPTHS
-        self.points = slopes[:, None] * depths[..., None]  # [R, D, 3] mm, in the camera's frame
 
     def enough(self, ray_views: np.ndarray) -> bool:
         """Return True if the rays come from enough frames."""

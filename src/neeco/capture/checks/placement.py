@@ -109,7 +109,7 @@ def _check_instrument(
     visible = cameras.sees(origins[:, None])[:, 0]  # [I]
     outside = "every image" if not visible.any() else f"{len(visible) - int(visible.sum())} of {len(visible)} images"
     out_of_view = visible.mean() < SETTINGS.min_visible
-    verdict = verdicts.instrument(instrument) if out_of_view else None
+    verdict = verdicts.instruments[instrument.name] if out_of_view else None
     if verdict is not None and verdict.wrong_poses:
         all_poses.error(f"instrument {name} is outside {outside}: {verdict.message}", verdict.remedy)
         return

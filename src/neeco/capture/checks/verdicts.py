@@ -6,7 +6,7 @@ candidate explains it, only the contradiction is reported.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import permutations, product
@@ -19,7 +19,6 @@ from neeco.capture.checks.evidence import Candidate, ColorEvidence, MotionEviden
 from neeco.capture.checks.pictures import Picture
 from neeco.capture.checks.settings import SETTINGS
 from neeco.capture.documents import errors_only, printable
-from neeco.capture.model import Instrument
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.conventions import DVRK_ECM, OPENCV, OPENGL, swap_camera_axes
 
@@ -53,11 +52,10 @@ class ImageVerdicts:
 
     def __init__(self, parsed: Parsed, pictures: Sequence[Picture]) -> None:
         self.parsed, self.pictures = parsed, pictures
-        self._instruments: dict[str, Verdict] = {}  # cache by name
 
     def report(self) -> None:
         """Report all contradictions as warnings."""
-        for verdict in (self.cameras, *map(self.instrument, self.parsed.instruments)):
+        for verdict in (self.cameras, *self.instruments.values()):
             if verdict.status == "contradicted":
                 self.parsed.header(verdict.field).warning(verdict.message, verdict.remedy, contradicted=True)
 
@@ -93,24 +91,27 @@ class ImageVerdicts:
         contradicted = self.cameras.status == "contradicted"
         return None if contradicted else MotionEvidence.of(self.parsed, self.pictures)
 
-    def instrument(self, instrument: Instrument) -> Verdict:
-        """Return the verdict whether an instrument is at its stated poses, by motion. Needs states in all frames."""
-        if instrument.name not in self._instruments:
-            self._instruments[instrument.name] = self._find(instrument)
-        return self._instruments[instrument.name]
+    @cached_property
+    def instruments(self) -> dict[str, Verdict]:
+        """Return the verdicts whether instruments are at their stated poses, by motion. Needs states in all frames."""
+        poses: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # [N, 4, 4] as recorded, and to the root: most visible
+        for item in self.parsed.instruments:
+            tree, states = item.kinematics, [state for _, state in self.parsed.states_of(item.name)]
+            if len(states) == len(self.parsed.frames):
+                back = [np.eye(4) if tree is None else tree.world_from_root(np.eye(4), one.joints) for one in states]
+                poses[item.name] = np.stack([state.pose.numpy() for state in states]), np.stack(back)
+        return {item.name: self._verdict(item.name, poses) for item in self.parsed.instruments}
 
-    def _find(self, instrument: Instrument) -> Verdict:
-        poses = dict(self._poses)
-        recorded_poses = poses.pop(instrument.name)
-        if recorded_poses is None or self._motion is None:
+    def _verdict(self, instrument: str, poses: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Verdict:
+        if instrument not in poses or self._motion is None:
             return Verdict("undecided")
-        rows, (recorded, root_from_recorded) = self._motion.rows, recorded_poses
+        rows, (recorded, root_from_recorded) = self._motion.rows, poses[instrument]
         roots = recorded @ root_from_recorded
-        other_paths = [(other[0] @ other[1])[rows] for other in poses.values() if other is not None]
+        other_paths = [(other @ back)[rows] for name, (other, back) in poses.items() if name != instrument]
         motion = self._motion.without(other_paths, roots[rows])
         if motion is None:
             return Verdict("undecided")
-        name, motion = printable(instrument.name), motion.with_recorded(roots[rows])
+        name, motion = printable(instrument), motion.with_recorded(roots[rows])
         if (mistake := self._mistake(name, recorded, root_from_recorded, motion)) is not None:
             return Verdict.of(mistake, POSES, STATES)
         evidence = motion.mean(roots[rows])
@@ -127,19 +128,6 @@ class ImageVerdicts:
         )
         remedy = "shifts, other axes, frames and units were tried; states, cameras and images must be of one recording"
         return Verdict("contradicted", POSES, message, remedy)
-
-    @cached_property
-    def _poses(self) -> dict[str, tuple[np.ndarray, np.ndarray] | None]:
-        """Return recorded poses [N, 4, 4] of each instrument, and the transforms [N, 4, 4] to its root, which is most
-        visible; None if a frame has no state."""
-        poses: dict[str, tuple[np.ndarray, np.ndarray] | None] = {}
-        for item in self.parsed.instruments:
-            poses[item.name], tree = None, item.kinematics
-            states = [state for _, state in self.parsed.states_of(item.name)]
-            if len(states) == len(self.parsed.frames):
-                back = [np.eye(4) if tree is None else tree.world_from_root(np.eye(4), one.joints) for one in states]
-                poses[item.name] = np.stack([state.pose.numpy() for state in states]), np.stack(back)
-        return poses
 
     def _mistake(self, name: str, recorded: np.ndarray, back: np.ndarray, motion: MotionEvidence) -> Candidate | None:
         """Return the mistake in the poses [N, 4, 4] of an instrument that the images confirm."""
