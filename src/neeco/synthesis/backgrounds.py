@@ -76,7 +76,7 @@ class ImageFolder:
     def crop(self, number: int, rng: Generator, width: int, height: int) -> np.ndarray:
         """Sample a background, float32 [height, width, 3] in [0, 1]: a random crop of an image, possibly mirrored,
         resized. Raises NeecoError where the file cannot be read."""
-        image = _decoded(self.files[number])
+        image = _DECODED(self.files[number])
         rows, columns = image.shape[:2]
         scale = rng.uniform(IMAGES.min_crop, 1) * min(columns / width, rows / height)
         size = max(1, int(scale * width)), max(1, int(scale * height))
@@ -87,9 +87,7 @@ class ImageFolder:
         return cv2.resize(np.ascontiguousarray(crop), (width, height), interpolation=way).astype(np.float32) / 255
 
 
-@lru_cache(maxsize=IMAGES.cached_images)
-def _decoded(file: Path) -> np.ndarray:
-    return read_image_bytes(file)
+_DECODED = lru_cache(maxsize=IMAGES.cached_images)(read_image_bytes)
 
 
 @dataclass(frozen=True)

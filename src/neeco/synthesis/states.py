@@ -136,19 +136,16 @@ class InterpolatedStates:
         if not set(first.instruments) & set(second.instruments):
             second = first
         state = interpolate_state(first, second, float(rng.random()))
-        state = self._jittered(state, rng)
-        return with_joints(state, lambda name, joint: self.ranges[name, joint].at(rng.random()))
-
-    def _jittered(self, state: State, rng: Generator) -> State:
         centre = np.mean([to_numpy(item.pose)[:3, 3] for item in state.instruments.values()], axis=0)
         turn = Rotation.from_rotvec(self.jitter_rad * rng.standard_normal(3)).as_matrix()
         shift = self.jitter_mm * rng.standard_normal(3)
-        return with_poses(
-            state,
-            lambda name, pose: rigid(
-                turn @ pose[:3, :3], np.clip(turn @ (pose[:3, 3] - centre) + centre + shift, *self.bounds[name])
-            ),
-        )
+
+        def jittered(name: str, pose: np.ndarray) -> np.ndarray:
+            place = turn @ (pose[:3, 3] - centre) + centre + shift
+            return rigid(turn @ pose[:3, :3], np.clip(place, *self.bounds[name]))
+
+        state = with_poses(state, jittered)
+        return with_joints(state, lambda name, joint: self.ranges[name, joint].at(rng.random()))
 
 
 class ExtrapolatedStates(InterpolatedStates):
