@@ -18,8 +18,7 @@ import pytest
 
 from neeco.base.errors import NeecoError, install_hint
 from neeco.cli import main
-from neeco.viewer.server import ViewerServer
-from neeco.viewer.session import VIEWER, AdaptiveResolution, RenderThread
+from neeco.viewer.server import VIEWER, AdaptiveResolution, RenderThread, ViewerServer
 
 viser = pytest.importorskip("viser")
 from viser import _messages as messages  # noqa: E402

@@ -32,11 +32,12 @@ from neeco.synthesis.generator import (
     ENTERS_TISSUE,
     LEAVES_IMAGE,
     UNOBSERVED_TISSUE,
+    GeneratorSpec,
     SampleGenerator,
     draw_encoded,
+    draw_in_workers,
     format_counts,
 )
-from neeco.synthesis.parallel import GeneratorSpec, draw_in_workers
 from neeco.synthesis.samplers import SAMPLING, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
 from neeco.synthesis.writers import Writer, WrittenImages

@@ -30,9 +30,8 @@ from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.visibility import VISIBILITY
-from neeco.synthesis.samplers import Sampler, make_sampler
+from neeco.synthesis.samplers import Sampler, make_sampler, with_poses
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.states import with_poses
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,7 @@ from neeco.scene.drawable import ArticulatedMotion
 from neeco.scene.gaussian_scene import require_gaussians
 from neeco.synthesis.samplers import shafts_of
 from neeco.training.run import TrainedRun, load_run
-from neeco.viewer.controls import slider_ranges
+from neeco.viewer.views import slider_ranges
 
 SCHEMA = "neeco-page/1"
 SCRIPTS = ("scene.js", "states.js", "drawing.js", "camera.js", "panel.js", "main.js")  # in this order, as one module

@@ -1,23 +1,33 @@
-"""Instruments of a scene that moves, for files that other viewers open: the parts of their links, and their poses.
+"""`neeco export --format glb` and `usdc`: a scene that moves, for other viewers, as binary glTF 2.0 with the extension
+KHR_gaussian_splatting, or as OpenUSD.
 
-Each part's Gaussians are rigid: those that blend links follow the link of most weight from the first state on. Lamps
-and shadows are left out: light is baked into the colours as one camera observes the first state, and the tissue stays
-in that.
+One node (or prim) per instrument, and below it one per part of each link, with which its Gaussians and their harmonics
+turn; the poses and joints of a sequence of states are an animation (or time samples of transforms). Each part's
+Gaussians are rigid: those that blend links follow the link of most weight from the first state on. Lamps and shadows
+are left out: light is baked into the colours as one camera observes the first state, and the tissue stays in that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import math
+import re
+import struct
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError, install_hint
+from neeco.base.files import write_atomically
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.capture.readers import read_states
+from neeco.evaluation.image_metrics import to_uint8
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply, rotate_about
+from neeco.raster.reference import SH_C0
 from neeco.scene import GaussianScene
 from neeco.scene.drawable import ArticulatedMotion
 from neeco.viewer.splats import Splats, splats_of
@@ -29,9 +39,19 @@ class MovingSettings:
 
     frame_s: float = 1 / 15  # between states without increasing times
     least_weight: float = 0.9  # of a link, below which a Gaussian blends links
+    meters_per_unit: float = 0.001  # of OpenUSD's stage
+    extent_sd: float = 3.0  # standard deviations to which a Gaussian counts for the extent
+    codes_per_second: float = 1000.0  # time codes: states keep their times to the ms
 
 
 MOVING = MovingSettings()
+EXTENSION, SCHEMA = "KHR_gaussian_splatting", "ParticleField3DGaussianSplat"  # of glTF, of OpenUSD
+Unit = Literal["m", "cm", "mm"]
+UNITS: Mapping[Unit, float] = {"m": 1e-3, "cm": 0.1, "mm": 1.0}  # of the file, per mm
+COMPONENTS = {"float32": 5126, "uint8": 5121, "int16": 5122}
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+TURN = np.array([0.0, 0.0, 1.0, 0.0])  # xyzw: 180 degrees about z, from the capture's axes to glTF's
+CAMERA_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # glTF's cameras look along -z
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,3 +163,196 @@ def _link_pose(motion: ArticulatedMotion, number: int, link: int, state: Instrum
     pose[:3, 3] = points[0].numpy()
     pose[:3, :3] = (points[1:] - points[0]).T.numpy()
     return pose
+
+
+@dataclass
+class _Document:
+    """JSON and binary chunk while they are put together."""
+
+    per_mm: float  # units of the file
+    content: dict[str, Any] = field(default_factory=lambda: {"accessors": [], "bufferViews": [], "meshes": []})
+    nodes: list[dict[str, Any]] = field(default_factory=list)
+    binary: bytearray = field(default_factory=bytearray)
+
+    def add(self, values: np.ndarray, *, bounds: bool = False) -> int:
+        """Return the number of an accessor of values [M, K] or [M], float32 or normalised integers."""
+        values = np.ascontiguousarray(values)
+        views, accessors = self.content["bufferViews"], self.content["accessors"]
+        views.append({"buffer": 0, "byteOffset": len(self.binary), "byteLength": values.nbytes})
+        self.binary += values.tobytes() + bytes(-values.nbytes % 4)
+        accessor = {
+            "bufferView": len(views) - 1,
+            "componentType": COMPONENTS[str(values.dtype)],
+            "count": len(values),
+            "type": TYPES[1 if values.ndim == 1 else values.shape[1]],
+        }
+        if values.dtype != np.float32:
+            accessor["normalized"] = True
+        if bounds:
+            rows = values.reshape(len(values), -1)
+            accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
+        accessors.append(accessor)
+        return len(accessors) - 1
+
+    def node(self, name: str, parent: int | None = None, **fields: Any) -> int:
+        """Return the number of a new node."""
+        self.nodes.append({"name": name} | fields)
+        if parent is not None:
+            self.nodes[parent].setdefault("children", []).append(len(self.nodes) - 1)
+        return len(self.nodes) - 1
+
+    def packed(self) -> bytes:
+        """Return the file."""
+        self.content["buffers"] = [{"byteLength": len(self.binary)}]
+        text = json.dumps(self.content | {"nodes": self.nodes}, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        size = 12 + 8 + len(text) + 8 + len(self.binary)
+        chunks = struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(self.binary), b"BIN\0")
+        return struct.pack("<4sII", b"glTF", 2, size) + b"".join(chunks) + bytes(self.binary)
+
+
+def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") -> None:
+    """Write the scene and its camera as glTF, lengths in `unit`: the root turns the capture's world (right, down,
+    front) by 180 degrees about z to glTF's axes. Raises NeecoError where the disk refuses."""
+    document = _Document(UNITS[unit])
+    root = document.node("neeco", rotation=TURN.tolist())
+    clock: int | None = None
+    channels: list[dict[str, Any]] = []
+    samplers: list[dict[str, Any]] = []
+    for item in scene.nodes:  # numbered from 1 on in the file
+        parent = root if item.parent is None else item.parent + 1
+        node = document.node(item.name, parent, **({"extras": item.facts} if item.facts else {}))
+        if item.poses is not None:  # the first at rest, all of them as an animation
+            if clock is None and len(scene.times) > 1:
+                clock = document.add(scene.times, bounds=True)
+            rotations, places = _rotations(item.poses), (item.poses[:, :3, 3] * document.per_mm).astype(np.float32)
+            document.nodes[node] |= {"rotation": rotations[0].tolist(), "translation": places[0].tolist()}
+            for target, values in (("rotation", rotations), ("translation", places)):
+                if clock is not None and np.ptp(values, axis=0).max() > 0:
+                    samplers.append({"input": clock, "output": document.add(values), "interpolation": "LINEAR"})
+                    channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": target}})
+        if item.splats is not None:
+            _add_mesh(document, node, item.splats)
+    pose = camera.world_from_camera.double().cpu()
+    lens = {
+        "yfov": 2 * math.atan(camera.height / (2 * camera.fy)),
+        "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
+        "znear": document.per_mm,  # 1 mm
+    }
+    document.content["cameras"] = [{"name": "laparoscope", "type": "perspective", "perspective": lens}]
+    rotation = _rotations((pose[:3, :3] @ CAMERA_TURN).numpy()[None])
+    place = (pose[:3, 3] * document.per_mm).tolist()
+    # glTF cannot state a principal point off the image's centre
+    document.node("laparoscope", root, camera=0, rotation=rotation[0].tolist(), translation=place)
+    document.content |= {"asset": {"version": "2.0", "generator": "neeco"}, "extensionsUsed": [EXTENSION]}
+    document.content |= {"scene": 0, "scenes": [{"nodes": [root]}]}
+    if channels:
+        document.content["animations"] = [{"name": "states", "channels": channels, "samplers": samplers}]
+    write_atomically(path, lambda temporary: temporary.write_bytes(document.packed()))
+
+
+def _add_mesh(document: _Document, node: int, splats: Splats) -> None:
+    """Give a node its Gaussians, in its own frame, mm."""
+    colors = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, splats.opacities[:, None]], 1)
+    columns = {"SCALE": np.exp(splats.log_scales) * document.per_mm, "OPACITY": splats.opacities}
+    for degree in range(splats.degree + 1):
+        for order in range(2 * degree + 1):
+            columns[f"SH_DEGREE_{degree}_COEF_{order}"] = splats.sh[:, degree**2 + order]
+    attributes = {"POSITION": document.add((splats.means * document.per_mm).astype(np.float32), bounds=True)}
+    attributes["COLOR_0"] = document.add(to_uint8(255 * colors))
+    rotations = np.rint(splats.quats[:, [1, 2, 3, 0]] * np.iinfo(np.int16).max).astype(np.int16)  # to .002 degrees
+    attributes[f"{EXTENSION}:ROTATION"] = document.add(rotations)
+    attributes |= {f"{EXTENSION}:{name}": document.add(v.astype(np.float32)) for name, v in columns.items()}
+    settings = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: settings}}
+    meshes = document.content["meshes"]
+    meshes.append({"name": document.nodes[node]["name"], "primitives": [primitive]})
+    document.nodes[node]["mesh"] = len(meshes) - 1
+
+
+def _rotations(poses: np.ndarray) -> np.ndarray:
+    """Return quaternions [T, 4] xyzw float32 of poses [T, 4, 4] or rotations [T, 3, 3], each nearer to the one before
+    than its negative."""
+    quats = matrix_to_quat(torch.from_numpy(np.ascontiguousarray(poses[:, :3, :3]))).numpy()[:, [1, 2, 3, 0]]
+    for k in range(1, len(quats)):
+        if quats[k] @ quats[k - 1] < 0:
+            quats[k] = -quats[k]
+    return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
+
+
+def require_usd() -> None:
+    """Raise NeecoError where OpenUSD is missing, or older than the schema."""
+    try:
+        from pxr import Usd, UsdVol
+    except ImportError:
+        raise NeecoError(f"--format: usdc needs usd-core; {install_hint('usd')}") from None
+    if not hasattr(UsdVol, SCHEMA):
+        version = ".".join(map(str, Usd.GetVersion()[1:]))
+        raise NeecoError(f"--format: usdc needs OpenUSD 26.03 or newer, this is {version}; {install_hint('usd')}")
+
+
+def write_usd(scene: MovingScene, path: Path) -> None:
+    """Write a binary file, .usdc. The stage has y up and the capture's mm; its default prim turns the world (right,
+    down, front) by 180 degrees about x. Schema: OpenUSD 26.03 and newer,
+    openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html
+
+    Raises NeecoError where OpenUSD is missing or too old, or the disk refuses."""
+    require_usd()
+    from pxr import Gf, Tf, Usd, UsdGeom
+
+    codes = scene.times * MOVING.codes_per_second
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, MOVING.meters_per_unit)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    stage.SetTimeCodesPerSecond(MOVING.codes_per_second)
+    stage.SetStartTimeCode(float(codes[0]))
+    stage.SetEndTimeCode(float(codes[-1]))
+    root = UsdGeom.Xform.Define(stage, "/Scene")
+    root.AddRotateXOp().Set(180.0)
+    stage.SetDefaultPrim(root.GetPrim())
+    places: list[str] = []
+    for node in scene.nodes:
+        name = re.sub(r"^(\d)|\W", r"_\1", node.name)  # a prim's name
+        place = f"{root.GetPath() if node.parent is None else places[node.parent]}/{name}"
+        places.append(f"{place}_{node.facts['link']}" if stage.GetPrimAtPath(place) and "link" in node.facts else place)
+        if node.splats is None:
+            prim = UsdGeom.Xform.Define(stage, places[-1])
+            prim.GetPrim().SetCustomDataByKey("neeco:instrument", node.name)
+        else:
+            prim = _define_field(stage, places[-1], node.splats, node.name)
+        if node.poses is not None:
+            operation = prim.AddTransformOp()
+            matrices = [Gf.Matrix4d(*pose.T.ravel().tolist()) for pose in node.poses]  # USD multiplies rows
+            if np.ptp(node.poses, axis=0).max() == 0:
+                operation.Set(matrices[0])
+            else:
+                for code, matrix in zip(codes.tolist(), matrices, strict=True):
+                    operation.Set(matrix, code)
+
+    def write(temporary: Path) -> None:
+        try:
+            stage.GetRootLayer().Export(str(temporary))
+        except Tf.ErrorException as error:
+            raise OSError(f"OpenUSD: {str(error).splitlines()[-1]}") from error
+
+    write_atomically(path, write)
+
+
+def _define_field(stage: Any, path: str, splats: Splats, label: str) -> Any:
+    """Return a new prim with these Gaussians in its own frame, of the semantic class `label`."""
+    from pxr import UsdSemantics, UsdVol, Vt
+
+    field = getattr(UsdVol, SCHEMA).Define(stage, path)
+    scales = np.exp(splats.log_scales)
+    reach = MOVING.extent_sd * scales.max(1, keepdims=True)
+    extent = np.stack([(splats.means - reach).min(0), (splats.means + reach).max(0)])
+    field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(splats.means))
+    field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])))  # w last
+    field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
+    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(splats.opacities))
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(splats.degree)
+    coefficients = np.ascontiguousarray(splats.sh.reshape(-1, 3))
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(coefficients))
+    field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
+    UsdSemantics.LabelsAPI.Apply(field.GetPrim(), "class").CreateLabelsAttr([label])
+    return field

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neeco.capture.model import Instrument, InstrumentState
-from neeco.synthesis.states import JointRange, Shaft
-from neeco.viewer.controls import Controls, InstrumentControls, slider_ranges
+from neeco.synthesis.samplers import JointRange, Shaft
 from neeco.viewer.runs import FrameScore, LoadedRun, Timeline
-from neeco.viewer.views import IMAGE, Picture, views_of
+from neeco.viewer.views import IMAGE, Controls, InstrumentControls, Picture, slider_ranges, views_of
 
 if TYPE_CHECKING:
     import viser

@@ -9,11 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.capture.checks.frames import check_frames, check_pictures, check_states
-from neeco.capture.checks.pictures import read_pictures
-from neeco.capture.checks.placement import check_placement
-from neeco.capture.checks.truth import check_truth
-from neeco.capture.checks.verdicts import ImageVerdicts
+from neeco.capture.checks.evidence import read_pictures
+from neeco.capture.checks.frames import check_frames, check_pictures, check_states, check_truth
+from neeco.capture.checks.verdicts import ImageVerdicts, check_placement
 from neeco.capture.documents import Problem, ProblemReport, condensed, errors_only, key_name
 from neeco.capture.model import Capture
 from neeco.capture.readers import capture_of, parse_capture

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neeco.evaluation.mask_metrics import boundary_f, dice, iou, mean_of, precision
+from neeco.studies.configurations import UNKNOWN, Cell, Column, ResultTable, Row, csv_text
 from neeco.studies.downstream.samples import Example
 from neeco.studies.downstream.training_data import BASELINES, PERMUTED, REAL
-from neeco.studies.tables import UNKNOWN, Cell, Column, ResultTable, Row, csv_text
 
 MASK_SCORES = ("iou", "dice", "precision", "recall", "boundary_f")
 BOX_SCORES = ("ap", "ap50", "ap75")
