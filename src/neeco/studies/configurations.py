@@ -1,5 +1,5 @@
-"""STUDY.yaml: the configurations of a sweep, and the tables of its results, as CSV of unrounded numbers, and rounded for
-the terminal and pages. Without heavy imports."""
+"""STUDY.yaml: the configurations of a sweep, and the tables of its results, as CSV of unrounded numbers, and rounded
+for the terminal and pages. Without heavy imports."""
 
 from __future__ import annotations
 
