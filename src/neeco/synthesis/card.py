@@ -16,6 +16,7 @@ import cv2
 import matplotlib
 import numpy as np
 import yaml
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -35,50 +36,7 @@ MARK = "<!-- Written by neeco, which writes it anew with --resume. Remove this l
 SIZES = {"n<1K": 10**3, "1K<n<10K": 10**4, "10K<n<100K": 10**5, "100K<n<1M": 10**6, "1M<n<10M": 10**7}
 TASKS = ["image-segmentation", "object-detection", "keypoint-detection", "depth-estimation"]
 TAGS = ["surgical-instruments", "endoscopy", "6d-pose-estimation", "gaussian-splatting"]
-SYNTHETIC = """The images were rendered by a Gaussian-splatting model learned from a recording, in states of the
-instruments that were not recorded. Labels come from the same model: exact for what is rendered."""
-RECORDED = """The images were recorded. Their labels were rendered by a Gaussian-splatting model of the recording, at
-poses fitted to each image; images whose labels could not be trusted were left out. Files are numbered anew: the field
-`frame` of `states.jsonl` has the name that the frame has in its capture."""
-TEXT = """---
-{front}---
-
-{mark}
-
-# {title}
-
-{how}
-
-{images} images ({splits}). The publisher of the set states its license.
-
-## Classes
-
-| part id | instrument | part |
-|---|---|---|
-{classes}
-
-Keypoints, where an instrument has them: {keypoints}.
-
-## Files
-
-- `images`: the images, RGB
-- `masks`: instrument or not: 255 or 0
-- `soft`: share of a pixel that is instrument, in counts of 1/255
-- `ignore`: 255 where a loss had better ignore the pixel: uncertain edges, and what no training frame saw
-- `parts`: part ids, see above
-- `depth`: 16 bit, in counts of {mm_per_count} mm; 0 is none
-- `silhouettes`: bit k is set where instrument k would be visible if nothing else were there
-- `states.jsonl`: one line per image: instrument states (mm, rad), camera (OpenGL axes), intrinsics, labels
-- `dataset.json`: how the set was made, in full
-- `preview.png`: a look at the labels
-{formats}
-
-## How it was made
-
-By neeco {version}, of a scene with SHA-256 `{scene}`:
-
-    {command}
-"""
+PAGES = Environment(loader=PackageLoader("neeco.synthesis", "."), undefined=StrictUndefined, trim_blocks=True)
 
 
 def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) -> None:
@@ -114,28 +72,21 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
         "configs": [config],
     }
 
-    def named(instrument: str) -> str:
-        name = info["classes"].get(instrument, instrument)
-        return instrument if name == instrument else f"{instrument}: {name}"
-
-    text = TEXT.format(
+    instruments = [item.get("instrument", "") for item in info["ids"]]
+    names = [info["classes"].get(instrument, instrument) for instrument in instruments]
+    words = [a if a == b else f"{a}: {b}" for a, b in zip(instruments, names, strict=True)]
+    text = PAGES.get_template("card.md").render(
         front=yaml.safe_dump(front, sort_keys=False),
         mark=MARK,
         title=title,
-        how=RECORDED if annotated else SYNTHETIC,
-        images=info["images"],
+        annotated=annotated,
+        info=info,
         splits=", ".join(f"{count} {split}" for split, count in info["splits"].items()),
-        classes="\n".join(
-            f"| {item['id']} | {named(item.get('instrument', ''))} | {item['part']} |" for item in info["ids"]
-        ),
-        keypoints=", ".join(info["keypoints"]) or "none",
-        mm_per_count=info["depth"]["mm_per_count"],
-        formats="\n".join(f"- {formats[name]}" for name in info["formats"]),
-        version=info["version"],
-        scene=info["scene_sha256"],
+        classes=[(item["id"], word, item["part"]) for item, word in zip(info["ids"], words, strict=True)],
+        formats=[formats[name] for name in info["formats"]],
         command=_command(info),
     )
-    write_text(path, text)
+    write_text(path, text + "\n")
 
 
 def _command(info: Mapping[str, Any]) -> str:

@@ -178,6 +178,11 @@ class Scores:
         scores = {fold: job["splits"].get(test, {}).get(metric) for fold, job in self.jobs.get(arm, {}).items()}
         return {fold: score for fold, score in sorted(scores.items()) if score is not None}
 
+    def mean(self, arm: Arm, test: str, metric: str) -> float | None:
+        """Return the mean score over folds; None if no fold has it."""
+        values = self.by_fold(arm, test, metric)
+        return float(np.mean(list(values.values()))) if values else None
+
     def estimate(self, arm: Arm, test: str, metric: str, against: Arm | None = None) -> Estimate | None:
         """Return the mean of an arm's score over folds, or of its difference to another arm over their common folds;
         None if there is no such fold."""
@@ -234,11 +239,6 @@ def block_weights(frames: int) -> np.ndarray:
     return covered[:, :frames] + covered[:, frames : 2 * frames]
 
 
-def mean_or_none(values: Mapping[int, float]) -> float | None:
-    """Return the mean over folds; None if no fold has the score."""
-    return float(np.mean(list(values.values()))) if values else None
-
-
 def words_of(condition: str) -> set[str]:
     """Return the terms of a condition, without their order."""
     return set(condition.split("+"))
@@ -276,7 +276,7 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
         for test in tests:
             score = scores.estimate(arm, test, main) or Estimate(0, math.nan, None, None)
             row: dict[str, Any] = {**arm._asdict(), "test": test, "folds": score.folds}
-            row |= {metric: mean_or_none(scores.by_fold(arm, test, metric)) for metric in metrics}
+            row |= {metric: scores.mean(arm, test, metric) for metric in metrics}
             row |= {"low": score.low, "high": score.high}
             reference = _reference(arm, test, scores, main)
             if reference is not None and (gain := scores.estimate(arm, test, main, reference)) is not None:
@@ -304,7 +304,7 @@ def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
         for other in other_arms
         if words_of(other.condition) in references
         and other.real == real
-        and (mean := mean_or_none(scores.by_fold(other, test, metric))) is not None
+        and (mean := scores.mean(other, test, metric)) is not None
     ]
     return max(rivals)[1] if rivals else None
 
