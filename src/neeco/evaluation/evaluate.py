@@ -24,15 +24,16 @@ from neeco.capture.checks.frames import SHADOW_FOLDER
 from neeco.capture.images import read_mask
 from neeco.capture.model import Capture, Frame, State, evenly_spaced
 from neeco.evaluation.image_metrics import COMPARISON, WEIGHTS_VARIABLE, Lpips, psnr, resize_mask, ssim
-from neeco.evaluation.mask_folders import load_reference, truth_names
-from neeco.evaluation.mask_metrics import (
+from neeco.evaluation.masks import (
     PartTally,
     dice,
     iou,
+    load_reference,
     mean_of,
     pairs_of,
     part_scores,
     precision,
+    truth_names,
     truth_table,
 )
 from neeco.evidence.foreground import Comparison, Foreground

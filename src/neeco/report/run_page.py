@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw
 from neeco.base.files import read_bytes
 from neeco.capture.model import Capture, Frame, State, evenly_spaced
 from neeco.evaluation.image_metrics import COMPARISON, overlay_outline, overlay_parts, part_color
-from neeco.evaluation.mask_folders import load_reference
+from neeco.evaluation.masks import load_reference
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.report.page import (

@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 from neeco.base.errors import counted
 from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import COMPARISON, PART_COLORS, Pixels, overlay_outline, overlay_parts, psnr
-from neeco.evaluation.mask_folders import load_reference
+from neeco.evaluation.masks import load_reference
 from neeco.labels.drawing import draw
 from neeco.report.page import (
     REPORT_FILE,

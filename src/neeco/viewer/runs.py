@@ -25,8 +25,7 @@ from neeco.capture.model import Capture, Frame, State
 from neeco.capture.readers import StateLine, read_states
 from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.evaluation.image_metrics import psnr
-from neeco.evaluation.mask_folders import load_reference
-from neeco.evaluation.mask_metrics import iou
+from neeco.evaluation.masks import iou, load_reference
 from neeco.geometry.camera import Camera
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw, draw_layers, to_numpy

@@ -20,7 +20,7 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import own_folder, read_json, require_like, require_same, write_atomically, write_json, write_text
 from neeco.capture import Capture, read_capture
 from neeco.capture.checks import read_checked
-from neeco.evaluation.mask_folders import truth_file
+from neeco.evaluation.masks import truth_file
 from neeco.raster.devices import device_of
 from neeco.studies.downstream import DownstreamRequest
 from neeco.studies.downstream.model import Predict, TorchModel, TrainingTask, input_size, model_class

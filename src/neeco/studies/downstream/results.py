@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neeco.evaluation.mask_metrics import boundary_f, dice, iou, mean_of, precision
+from neeco.evaluation.masks import boundary_f, dice, iou, mean_of, precision
 from neeco.studies.configurations import UNKNOWN, Cell, Column, ResultTable, Row, csv_text
 from neeco.studies.downstream.samples import Example
 from neeco.studies.downstream.training_data import BASELINES, PERMUTED, REAL
