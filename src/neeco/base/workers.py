@@ -165,7 +165,11 @@ class Processes:
         context = multiprocessing.get_context("spawn")  # a forked one would share threads' locks
         parent_end, child_end = context.Pipe()
         slot = self._slots.pop(0)
-        gpu = _visible_gpu(slot % (self._workers.shared_gpus or self.capacity)) if self._workers.gpu else None
+        gpu = None
+        if self._workers.gpu:  # what CUDA_VISIBLE_DEVICES is to be
+            number = slot % (self._workers.shared_gpus or self.capacity)
+            visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+            gpu = visible[number] if visible else str(number)
         process = context.Process(target=_serve, args=(*self._arguments, child_end, gpu), daemon=True)
         process.start()
         child_end.close()
@@ -214,12 +218,6 @@ class Processes:
         worker.connection.close()
         worker.process.join()
         self._slots.append(worker.slot)
-
-
-def _visible_gpu(slot: int) -> str:
-    """Return what CUDA_VISIBLE_DEVICES is to be for the worker with this number."""
-    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
-    return visible[slot] if visible else str(slot)
 
 
 def _serve(function: TaskFunction, shared: Any, threads: int, connection: Connection, gpu: str | None) -> None:

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from neeco.training.run import TrainedRun
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EvaluationSettings:
     """Thresholds of shadows, the timing of renderings, and the depth maps for occlusion tests."""
 

@@ -225,7 +225,16 @@ def difference_map(
     """
     difference = np.abs(np.asarray(image, np.float64) - np.asarray(target, np.float64)).mean(axis=2)
     colored = _colored(difference / full_scale)
-    return np.concatenate([colored, _legend(colored.shape[1], full_scale)]) if legend else colored
+    if not legend:
+        return colored
+    width, height, margin = colored.shape[1], COMPARISON.legend_height, COMPARISON.legend_margin
+    strip = Image.new("RGB", (width, height))
+    strip.paste(Image.fromarray(_colored(np.linspace(0, 1, width)[None].repeat(4, 0))), (0, 1))
+    pen, font = ImageDraw.Draw(strip), ImageFont.load_default(COMPARISON.legend_font)
+    for place, anchor in ((0.0, "ls"), (0.5, "ms"), (1.0, "rs")):
+        across = round(margin + place * (width - 2 * margin))
+        pen.text((across, height - 2), f"{place * full_scale:.3g}", "white", font, anchor)
+    return np.concatenate([colored, np.asarray(strip)])
 
 
 def part_color(part: int) -> str:
@@ -259,23 +268,6 @@ def outline(mask: np.ndarray) -> np.ndarray:
 def _colored(fraction: np.ndarray) -> Pixels:
     """Return the colours of values [H, W], which are clipped to [0, 1]: dark is right, bright is wrong."""
     return np.ascontiguousarray(cv2.applyColorMap(to_uint8(fraction * 255), cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8)
-
-
-def _legend(width: int, full_scale: float) -> Pixels:
-    """Return a strip [H, width, 3]: the colour scale with its ends and middle labelled."""
-    height, margin = COMPARISON.legend_height, COMPARISON.legend_margin
-    strip = Image.new("RGB", (width, height))
-    strip.paste(Image.fromarray(_colored(np.linspace(0, 1, width)[None].repeat(4, 0))), (0, 1))
-    pen, font = ImageDraw.Draw(strip), ImageFont.load_default(COMPARISON.legend_font)
-    for place, anchor in ((0.0, "ls"), (0.5, "ms"), (1.0, "rs")):
-        pen.text(
-            (round(margin + place * (width - 2 * margin)), height - 2),
-            f"{place * full_scale:.3g}",
-            "white",
-            font,
-            anchor,
-        )
-    return np.asarray(strip)
 
 
 def to_uint8(pixels: np.ndarray) -> Pixels:

@@ -23,7 +23,7 @@ import torch
 
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import write_atomically
-from neeco.capture.model import Camera, Instrument, InstrumentState, State
+from neeco.capture.model import Camera, InstrumentState, State
 from neeco.capture.readers import read_states
 from neeco.evaluation.image_metrics import to_uint8
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply, rotate_about
@@ -108,7 +108,21 @@ def moving_scene(scene: GaussianScene, states: Sequence[State], camera: Camera) 
         columns = [k for k, (name, _) in enumerate(scene.label_names) if name == instrument.name]
         links, body = motion.links[number][0].argmax(1).cpu().numpy(), len(nodes)
         bodies = np.stack([item.pose.double().cpu().numpy() for item in instrument_states])
-        facts = _facts(instrument, motion, number)
+        limits = {name: None if span is None else list(span) for name, span in instrument.joints.items()}
+        amounts = motion.links[number][1]  # an axis turns or shifts a link by at_zero + per_unit * joint
+        axes = [
+            {
+                "joint": axis.reading,
+                "type": "prismatic" if axis.slides else "revolute",
+                "pivot_mm": axis.pivot.tolist(),
+                "axis": axis.axis.tolist(),
+                "at_zero": amounts[:, k, 0].tolist(),
+                "per_unit": amounts[:, k, 1].tolist(),
+            }
+            for k, axis in enumerate(motion.axes[number])
+        ]
+        joints = {name: {"limits": span} for name, span in limits.items()}
+        facts: dict[str, Any] = {"instrument": instrument.name, "joints": joints, "axes": axes}
         nodes.append(MovingNode(name=instrument.name, poses=bodies, facts=facts))
         for link in np.unique(links).tolist():
             link_rows = rows[links == link]
@@ -132,24 +146,6 @@ def local_splats(splats: Splats, rows: np.ndarray, world_from_part: np.ndarray) 
     selected = {name: values[rows] for name, values in vars(splats).items()}
     means = ((selected["means"] - translation) @ rotation).astype(np.float32)
     return replace(Splats(**selected), means=means, quats=quats)
-
-
-def _facts(instrument: Instrument, motion: ArticulatedMotion, number: int) -> dict[str, Any]:
-    """Return joints, their limits (rad or mm) and the axes (mm, instrument frame) that they move links by: a link's
-    turn or shift about an axis is at_zero + per_unit * joint."""
-    axes = [
-        {
-            "joint": axis.reading,
-            "type": "prismatic" if axis.slides else "revolute",
-            "pivot_mm": axis.pivot.tolist(),
-            "axis": axis.axis.tolist(),
-            "at_zero": motion.links[number][1][:, k, 0].tolist(),
-            "per_unit": motion.links[number][1][:, k, 1].tolist(),
-        }
-        for k, axis in enumerate(motion.axes[number])
-    ]
-    joints = {name: {"limits": None if limits is None else list(limits)} for name, limits in instrument.joints.items()}
-    return {"instrument": instrument.name, "joints": joints, "axes": axes}
 
 
 def _link_pose(motion: ArticulatedMotion, number: int, link: int, state: InstrumentState) -> np.ndarray:
