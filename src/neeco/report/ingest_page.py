@@ -359,6 +359,14 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
         rotation_deg = float(np.degrees(rms(fit.rotation_residual)))
         residuals = {"position_rms": rms(fit.position_residual), "rotation_rms": rotation_deg}
         registration = {**residuals, "sensor_mm": fit.camera_from_sensor[:3, 3]}
+    clocks = []
+    for name, clock in result.clocks.items():
+        sd = f"±{clock.sd * 1000:.1f}" if np.isfinite(clock.sd) and clock.sd > 0 else "–"
+        moved = clock_cost_mm(name, clock.sd, capture)
+        cost = f"{moved:.2f}" if moved else "–"
+        offset = f"{clock.seconds * 1000:+.1f}".replace("-", "−")
+        rate = "1" if clock.rate == 1 else f"{clock.rate:.5f} ±{clock.rate_sd:.5f}"
+        clocks.append([name, offset, sd, rate, cost, clock.source])
     write_page(
         path,
         "ingest.html",
@@ -373,23 +381,11 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
         second=len(capture.frames) - len(result.selected),  # images of a stereo partner, which are training frames
         in_view=[(item.name, in_view(capture, item.name)) for item in capture.instruments if capture.registered],
         registration=registration,
-        clocks=_clocks(result, capture),
+        clocks=clocks,
         **_frames(result, capture),
         **_coverage(capture),
         dropped=_dropped(result),
     )
-
-
-def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
-    rows = []
-    for name, clock in result.clocks.items():
-        sd = f"±{clock.sd * 1000:.1f}" if np.isfinite(clock.sd) and clock.sd > 0 else "–"
-        moved = clock_cost_mm(name, clock.sd, capture)
-        cost = f"{moved:.2f}" if moved else "–"
-        offset = f"{clock.seconds * 1000:+.1f}".replace("-", "−")
-        rate = "1" if clock.rate == 1 else f"{clock.rate:.5f} ±{clock.rate_sd:.5f}"
-        rows.append([name, offset, sd, rate, cost, clock.source])
-    return rows
 
 
 def _frames(result: IngestResult, capture: Capture) -> dict[str, Any]:

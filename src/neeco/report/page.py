@@ -169,7 +169,17 @@ def line_chart(
     for order, value in levels:
         axes.axhline(value, color=_color(order), linewidth=1.1, dashes=(4, 4), gid="level")
     if over_logarithmic:
-        _set_logarithmic_x(axes, xs)
+        span = xs[-1] / xs[0]
+        margin = span**0.03 if span > 1 else 2.0
+        axes.set_xscale("log")
+        axes.set_xlim(xs[0] / margin, xs[-1] * margin)
+        ticks: list[float] = []  # at the points, where they do not overlap
+        for x in reversed(xs):
+            if not ticks or ticks[-1] / x > span**0.06:  # share of the axis
+                ticks.append(x)
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_locator(FixedLocator(ticks))
+        axes.xaxis.set_major_formatter(lambda value, _: short(round(value, 9)))
     else:
         axes.set_xlim(min(0.0, xs[0]), xs[-1] if xs[-1] > min(0.0, xs[0]) else None)
         round_ticks(axes.xaxis, 5, short)
@@ -240,21 +250,6 @@ def _draw_line(axes: Axes, order: int, points: Sequence[Point], dashes: tuple[in
     """Draw a line through points, or a mark for a single point."""
     style = {"color": _color(order), **({"dashes": dashes} if dashes else {}), **style}
     axes.plot(*np.array(points).reshape(-1, 2).T, **(style if len(points) > 1 else _mark(order, 8.0)))
-
-
-def _set_logarithmic_x(axes: Axes, xs: Sequence[float]) -> None:
-    """Make x logarithmic from the first to the last of increasing `xs`, with ticks at those that do not overlap."""
-    span = xs[-1] / xs[0]
-    margin = span**0.03 if span > 1 else 2.0
-    axes.set_xscale("log")
-    axes.set_xlim(xs[0] / margin, xs[-1] * margin)
-    ticks: list[float] = []
-    for x in reversed(xs):
-        if not ticks or ticks[-1] / x > span**0.06:  # share of the axis
-            ticks.append(x)
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_locator(FixedLocator(ticks))
-    axes.xaxis.set_major_formatter(lambda value, _: short(round(value, 9)))
 
 
 REPORT_FILE = "report.html"

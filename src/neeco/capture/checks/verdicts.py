@@ -70,7 +70,14 @@ class ImageVerdicts:
         if colors is None:
             return Verdict("contradicted" if has_errors else "undecided")
         fine = float(colors.recorded.mean())
-        candidates = list(offset_candidates(colors.all_cameras.poses, colors.rows))
+        all_poses, rows, candidates = colors.all_cameras.poses, colors.rows, list[Candidate]()
+        for steps in range(-SETTINGS.max_offset, SETTINGS.max_offset + 1):
+            if steps:
+                at = (rows + steps).clip(0, len(all_poses) - 1)
+                words = f"{abs(steps)} frame{'s' * (abs(steps) > 1)} {'earlier' if steps < 0 else 'later'}"
+                message, remedy = f"the images fit the cameras of {words}", f"list each with the frame that is {words}"
+                offset = Candidate("order", message, remedy, SETTINGS.offset, poses=all_poses[at])
+                candidates.append(replace(offset, available=at == rows + steps))
         candidates += camera_candidates(colors.cameras.poses) if fine < SETTINGS.good_colors else []
         if (mistake := likeliest(candidates, colors)) is not None:
             return Verdict.of(mistake, "frames[*].transform_matrix", "frames")
@@ -272,16 +279,6 @@ def camera_candidates(poses: np.ndarray) -> Iterator[Candidate]:
     for candidate in _pose_candidates(written, "the cameras"):
         assert candidate.poses is not None
         yield replace(candidate, poses=swap_camera_axes(candidate.poses), margin=SETTINGS.camera)
-
-
-def offset_candidates(poses: np.ndarray, rows: np.ndarray) -> Iterator[Candidate]:
-    """Return candidate offsets between images of `rows` [F] and cameras, of poses [N, 4, 4]."""
-    for steps in range(-SETTINGS.max_offset, SETTINGS.max_offset + 1):
-        if steps:
-            at = (rows + steps).clip(0, len(poses) - 1)
-            words = f"{abs(steps)} frame{'s' * (abs(steps) > 1)} {'earlier' if steps < 0 else 'later'}"
-            message, remedy = f"the images fit the cameras of {words}", f"list each with the frame that is {words}"
-            yield Candidate("order", message, remedy, SETTINGS.offset, poses=poses[at], available=at == rows + steps)
 
 
 ALL_IN_MM = "give all lengths in mm"
