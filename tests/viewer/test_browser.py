@@ -36,10 +36,10 @@ from neeco.viewer.views import (
     Controls,
     InstrumentControls,
     controlled_state,
+    fitting_view,
     picture,
     views_of,
 )
-from neeco.viewer.viser_scene import fitting_view
 
 pytestmark = pytest.mark.browser
 pytest.importorskip("viser")

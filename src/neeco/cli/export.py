@@ -40,8 +40,16 @@ def run(arguments: Arguments) -> int:
     from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run
-    from neeco.viewer.moving import exported_states, moving_scene, require_usd, write_glb, write_usd
-    from neeco.viewer.splats import exported_state, splats_of, write_splats
+    from neeco.viewer.other_viewers import (
+        exported_state,
+        exported_states,
+        moving_scene,
+        require_usd,
+        splats_of,
+        write_glb,
+        write_splats,
+        write_usd,
+    )
 
     format = arguments.format or "ply"
     if arguments.output is not None:

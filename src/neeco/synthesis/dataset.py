@@ -24,7 +24,6 @@ from neeco.labels.annotation import keypoint_names
 from neeco.labels.labellers import Labeller, ThresholdLabels, instruments_of
 from neeco.labels.settings import LABELS
 from neeco.scene import GaussianScene
-from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.card import write_card, write_preview
 from neeco.synthesis.generator import (
@@ -38,6 +37,7 @@ from neeco.synthesis.generator import (
     draw_in_workers,
     format_counts,
 )
+from neeco.synthesis.other_tissue import ImageFolder
 from neeco.synthesis.samplers import SAMPLING, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
 from neeco.synthesis.writers import Writer, WrittenImages

@@ -39,7 +39,6 @@ from neeco.raster.devices import readable_failures
 from neeco.raster.native import keep_freed_memory, set_threads, threads
 from neeco.scene import GaussianScene
 from neeco.scene.io import load_gaussians
-from neeco.synthesis.backgrounds import ALL_AS_RECORDED, Appearance, Appearances, ImageFolder, split
 from neeco.synthesis.camera_effects import (
     CameraEffects,
     RecordedMotion,
@@ -50,7 +49,15 @@ from neeco.synthesis.camera_effects import (
     subframes,
 )
 from neeco.synthesis.contact import labels_of
-from neeco.synthesis.mixing import MixedSampler, Mixture
+from neeco.synthesis.other_tissue import (
+    ALL_AS_RECORDED,
+    Appearance,
+    Appearances,
+    ImageFolder,
+    MixedSampler,
+    Mixture,
+    split,
+)
 from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler, states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Settings
 from neeco.synthesis.writers.folder import Encoded, Record, encoded_sample, skipped_sample

@@ -20,7 +20,7 @@ from neeco.viewer.views import IMAGE, Controls, InstrumentControls, Picture, sli
 if TYPE_CHECKING:
     import viser
 
-    from neeco.viewer.viser_scene import Overlays
+    from neeco.viewer.views import Overlays
 
 
 @dataclass(frozen=True, kw_only=True)

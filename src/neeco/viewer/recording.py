@@ -19,7 +19,7 @@ from neeco.viewer.access import HOST, PORT
 from neeco.viewer.panel import message_html
 from neeco.viewer.runs import VIEW, median_distance
 from neeco.viewer.server import ViserPage
-from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, stands_at, wxyz_of
+from neeco.viewer.views import Overlays, aspect_of, browser_camera, fitting_view, jump, stands_at, wxyz_of
 
 if TYPE_CHECKING:
     import viser

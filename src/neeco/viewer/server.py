@@ -32,15 +32,18 @@ from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 from neeco.viewer.access import HOST, PORT, Access, controlled_sockets
 from neeco.viewer.panel import Panel, message_html, status_html
 from neeco.viewer.runs import LoadedRun, SavedStates, ViewedRun, score_frame
-from neeco.viewer.views import Controls, controlled_state, interpolated_state, render_run
-from neeco.viewer.viser_scene import (
+from neeco.viewer.views import (
+    Controls,
     Overlays,
     aspect_of,
     browser_camera,
+    controlled_state,
     field_of_view,
     fitting_view,
+    interpolated_state,
     jump,
     pose_of,
+    render_run,
     stands_at,
     upward,
 )
