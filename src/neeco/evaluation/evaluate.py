@@ -101,22 +101,18 @@ class Coverage:
             if len(unseen) == 0:
                 break
             views = torch.arange(len(self.depths))[start::chunks]
-            observed[unseen] = self._observed_by(points[unseen], views).any(dim=0)
+            pose = self.camera_from_world[views]
+            local = torch.einsum("vij,mj->vmi", pose[:, :3, :3], points[unseen]) + pose[:, None, :3, 3]  # [V', M, 3]
+            depth, nearest = local[..., 2], SETTINGS.nearest_mm
+            fx, fy, cx, cy = self.intrinsics[views].T[..., None]  # each [V', 1]
+            column, row = (place.floor().long() for place in project(local, fx, fy, cx, cy, nearest=nearest))
+            width, height = self.sizes[views].T[..., None]
+            inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+            index = (row * self.depths.shape[2] + column).clamp(0, self.depths[0].numel() - 1)
+            surface = self.depths[views].flatten(1).gather(1, index)  # [V', M]
+            seen = inside & (depth <= surface * (1 + SETTINGS.tolerance) + SETTINGS.tolerance_mm)
+            observed[unseen] = seen.any(dim=0)
         return observed
-
-    def _observed_by(self, points: Tensor, views: Tensor) -> Tensor:
-        """Return bool [V', M] for the views with these indices."""
-        pose = self.camera_from_world[views]
-        local = torch.einsum("vij,mj->vmi", pose[:, :3, :3], points) + pose[:, None, :3, 3]  # [V', M, 3]
-        depth = local[..., 2]
-        fx, fy, cx, cy = self.intrinsics[views].T[..., None]  # each [V', 1]
-        column, row = (place.floor().long() for place in project(local, fx, fy, cx, cy, nearest=SETTINGS.nearest_mm))
-        width, height = self.sizes[views].T[..., None]
-        inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        stride = self.depths.shape[2]
-        index = (row * stride + column).clamp(0, self.depths[0].numel() - 1)
-        surface = self.depths[views].flatten(1).gather(1, index)  # [V', M]
-        return inside & (depth <= surface * (1 + SETTINGS.tolerance) + SETTINGS.tolerance_mm)
 
 
 @torch.no_grad()

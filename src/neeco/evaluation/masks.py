@@ -309,14 +309,6 @@ def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str
     return Masks(path, files, names, notes)
 
 
-def read_truth(path: Path) -> Capture | Path:
-    """Read the capture in a folder; return the folder itself where it holds masks alone. Raises NeecoError."""
-    if not path.is_dir():
-        raise NeecoError(f"{path}: no such folder; give a capture or a folder of masks")
-    is_capture = any((path / name).exists() for name in ("transforms.json", "truth", REFERENCE_FOLDER))
-    return read_capture(path) if is_capture else path
-
-
 def open_truth(
     truth: Capture | Path, classes: Mapping[int, str] | None = None, splits: Sequence[str] | None = None
 ) -> Masks:
@@ -374,7 +366,12 @@ def score_masks(
     NeecoError for what cannot be read or compared.
     """
     predictions = open_masks(predicted, classes)
-    source = read_truth(truth) if isinstance(truth, Path) else truth
+    source = truth
+    if isinstance(truth, Path):
+        if not truth.is_dir():
+            raise NeecoError(f"{truth}: no such folder; give a capture or a folder of masks")
+        if any((truth / name).exists() for name in ("transforms.json", "truth", REFERENCE_FOLDER)):
+            source = read_capture(truth)
     truths = open_truth(source, truth_classes, None if isinstance(source, Capture) else splits)
     all_names = set(truths.files)
     if isinstance(source, Capture):

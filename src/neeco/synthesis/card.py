@@ -148,7 +148,18 @@ def write_preview(root: Path, records: Sequence[Record], names: Pairs, bones: Pa
 
 def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: Pairs = ()) -> Figure:
     """Draw images, each plain and with parts, boxes and keypoints, which `bones` join."""
-    captions = [[textwrap.wrap(text, PREVIEW.characters) for text in _captions(record)] for record in records]
+    captions = []  # of the plain image (joint values), and of the labelled one (the instruments' visible shares)
+    for record in records:
+        joints = [
+            f"{joint.removesuffix('_mm')} {value:.1f} mm"
+            if joint.endswith("_mm")
+            else f"{joint} {math.degrees(value):.0f}°"
+            for instrument in record["instruments"]
+            for joint, value in instrument["joints"].items()
+        ]
+        seen = [f"{label['name']} {label['visibility']:.0%} seen" for label in record["labels"]]
+        texts = " · ".join([f"{record['index']:06d}", record["split"], *joints]), " · ".join(seen)
+        captions.append([textwrap.wrap(text, PREVIEW.characters) for text in texts])
     columns, wide = min(PREVIEW.columns, len(records)), PREVIEW.width
     high = round(wide * records[0]["height"] / records[0]["width"])
     above = PREVIEW.line * max(len(lines) for pair in captions for lines in pair) + PREVIEW.gap
@@ -191,16 +202,3 @@ def _draw_label(axes: Axes, label: dict[str, Any], bones: Pairs, corner: np.ndar
     for (x, y), visibility in points.values():
         color = PREVIEW.hidden if visibility == OCCLUDED else PREVIEW.box
         axes.plot(x, y, "o", color=color, markeredgecolor=PREVIEW.bone)
-
-
-def _captions(record: Record) -> tuple[str, str]:
-    """Return captions for the plain image (joint values) and the labelled one (the instruments' visible shares)."""
-    joints = [
-        f"{joint.removesuffix('_mm')} {value:.1f} mm"
-        if joint.endswith("_mm")
-        else f"{joint} {math.degrees(value):.0f}°"
-        for instrument in record["instruments"]
-        for joint, value in instrument["joints"].items()
-    ]
-    seen = [f"{label['name']} {label['visibility']:.0%} seen" for label in record["labels"]]
-    return " · ".join([f"{record['index']:06d}", record["split"], *joints]), " · ".join(seen)

@@ -1,4 +1,4 @@
-"""Instruments over other tissue than they were recorded over, in its light: images of another operation, or another run's.
+"""Instruments over other tissue than they were recorded over, in its light: of images, or of another run.
 
 Images: half of a data set's images keep the scene's tissue, and half its colours (of other frames), so that both are
 learned. Mixed scenes: the tissue of one run under the instruments of others. An instrument is placed relative to the

@@ -11,7 +11,6 @@ import base64
 import hashlib
 import json
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -163,14 +162,18 @@ def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
     scene = require_gaussians(scene, "--export")
     canonical = scene.canonical
     degree = min(sh_degree, scene.sh_degree)
-    means, boxes = _in_boxes(canonical.means, canonical.counts)
+    rows, boxes = [], []  # positions relative to the box of each body, and the boxes' corners
+    for body in torch.split(canonical.means, list(canonical.counts)):
+        low, high = (body.amin(0), body.amax(0)) if len(body) else (body.new_zeros(3), body.new_ones(3))
+        rows.append(_rounded((body - low) / (high - low).clamp_min(1e-9) * EXPORT.position_steps))
+        boxes.append([low.tolist(), high.tolist()])
     scales, scale_range = _quantized(motion.log_scales.clamp_min(float(np.log(EXPORT.thinnest_mm))), 255)
     base, base_range = _quantized(canonical.sh_dc[:, 0] * SH_C0 + 0.5, 65535)
     turns = [_quantized(column[:, None], 65535) for column in motion.amounts.flatten(1).unbind(1)]
     none = np.zeros((len(canonical), 0), np.int64)  # where nothing turns
     harmonics, bands = _harmonics(canonical.sh_rest, degree)
     fields = (  # name, whole numbers [N, K], type
-        ("mean", means, "uint24"),
+        ("mean", np.concatenate(rows), "uint24"),
         ("quat", _rounded(normalize(canonical.quats, dim=1) * 127), "int8"),
         ("scale", scales, "uint8"),
         ("opacity", _rounded(torch.sigmoid(canonical.opacity_logits)[:, None] * 255), "uint8"),
@@ -216,16 +219,6 @@ def _harmonics(rest: Tensor, degree: int) -> tuple[np.ndarray, list[float]]:
         blocks.append(_rounded(band / largest * 127).reshape(len(rest), -1))
         bands.append(largest)
     return np.concatenate(blocks, 1), bands
-
-
-def _in_boxes(means: Tensor, counts: Sequence[int]) -> tuple[np.ndarray, list[list[list[float]]]]:
-    """Return positions [N, 3] relative to the box of each body, and the boxes' corners."""
-    rows, boxes = [], []
-    for body in torch.split(means, list(counts)):
-        low, high = (body.amin(0), body.amax(0)) if len(body) else (means.new_zeros(3), means.new_ones(3))
-        rows.append(_rounded((body - low) / (high - low).clamp_min(1e-9) * EXPORT.position_steps))
-        boxes.append([low.tolist(), high.tolist()])
-    return np.concatenate(rows), boxes
 
 
 def _quantized(values: Tensor, steps: int) -> tuple[np.ndarray, list[float]]:

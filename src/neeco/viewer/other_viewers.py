@@ -375,8 +375,22 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") 
                 if clock is not None and np.ptp(values, axis=0).max() > 0:
                     samplers.append({"input": clock, "output": document.add(values), "interpolation": "LINEAR"})
                     channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": target}})
-        if item.splats is not None:
-            _add_mesh(document, node, item.splats)
+        if (splats := item.splats) is not None:  # in the node's frame
+            colors = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, splats.opacities[:, None]], 1)
+            columns = {"SCALE": np.exp(splats.log_scales) * document.per_mm, "OPACITY": splats.opacities}
+            for degree in range(splats.degree + 1):
+                for order in range(2 * degree + 1):
+                    columns[f"SH_DEGREE_{degree}_COEF_{order}"] = splats.sh[:, degree**2 + order]
+            attributes = {"POSITION": document.add((splats.means * document.per_mm).astype(np.float32), bounds=True)}
+            attributes["COLOR_0"] = document.add(to_uint8(255 * colors))
+            turned = np.rint(splats.quats[:, [1, 2, 3, 0]] * np.iinfo(np.int16).max).astype(np.int16)  # to 0.002 deg
+            attributes[f"{EXTENSION}:ROTATION"] = document.add(turned)
+            attributes |= {f"{EXTENSION}:{name}": document.add(v.astype(np.float32)) for name, v in columns.items()}
+            settings = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+            primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: settings}}
+            meshes = document.content["meshes"]
+            meshes.append({"name": item.name, "primitives": [primitive]})
+            document.nodes[node]["mesh"] = len(meshes) - 1
     pose = camera.world_from_camera.double().cpu()
     lens = {
         "yfov": 2 * math.atan(camera.height / (2 * camera.fy)),
@@ -393,25 +407,6 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") 
     if channels:
         document.content["animations"] = [{"name": "states", "channels": channels, "samplers": samplers}]
     write_atomically(path, lambda temporary: temporary.write_bytes(document.packed()))
-
-
-def _add_mesh(document: _Document, node: int, splats: Splats) -> None:
-    """Give a node its Gaussians, in its own frame, mm."""
-    colors = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, splats.opacities[:, None]], 1)
-    columns = {"SCALE": np.exp(splats.log_scales) * document.per_mm, "OPACITY": splats.opacities}
-    for degree in range(splats.degree + 1):
-        for order in range(2 * degree + 1):
-            columns[f"SH_DEGREE_{degree}_COEF_{order}"] = splats.sh[:, degree**2 + order]
-    attributes = {"POSITION": document.add((splats.means * document.per_mm).astype(np.float32), bounds=True)}
-    attributes["COLOR_0"] = document.add(to_uint8(255 * colors))
-    rotations = np.rint(splats.quats[:, [1, 2, 3, 0]] * np.iinfo(np.int16).max).astype(np.int16)  # to .002 degrees
-    attributes[f"{EXTENSION}:ROTATION"] = document.add(rotations)
-    attributes |= {f"{EXTENSION}:{name}": document.add(v.astype(np.float32)) for name, v in columns.items()}
-    settings = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: settings}}
-    meshes = document.content["meshes"]
-    meshes.append({"name": document.nodes[node]["name"], "primitives": [primitive]})
-    document.nodes[node]["mesh"] = len(meshes) - 1
 
 
 def _rotations(poses: np.ndarray) -> np.ndarray:

@@ -169,28 +169,25 @@ class RenderThread:
                 except Exception:
                     log.exception("a session failed")
                     self.remove(session.key)
-            if self._do_most_urgent() or _attempted(self._when_idle, False):
+            now = time.perf_counter()
+            with self._lock:  # the most urgent: a job, or a picture
+                job = self._jobs.pop(0) if self._jobs else None
+                due = [(sharp, when, key) for key, (sharp, when) in self._due.items() if when <= now]
+                if job is None and due:
+                    sharp, _, key = min(due)
+                    job = partial(self._sessions[key].render, sharp)
+                    del self._due[key]
+                    if not sharp:
+                        self._due[key] = True, now + VIEWER.settled_s
+            if job is not None:
+                _attempted(job, None)
+                continue
+            if _attempted(self._when_idle, False):
                 continue
             with self._lock:
                 moments += [when for _, when in self._due.values()]
             now = time.perf_counter()
             self._wake.wait(max(0.0, min([VIEWER.idle_s, *(moment - now for moment in moments)])))
-
-    def _do_most_urgent(self) -> bool:
-        """Run a job or render a picture; return whether there was one."""
-        now = time.perf_counter()
-        with self._lock:
-            job = self._jobs.pop(0) if self._jobs else None
-            due = [(sharp, when, key) for key, (sharp, when) in self._due.items() if when <= now]
-            if job is None and due:
-                sharp, _, key = min(due)
-                job = partial(self._sessions[key].render, sharp)
-                del self._due[key]
-                if not sharp:
-                    self._due[key] = True, now + VIEWER.settled_s
-        if job is not None:
-            _attempted(job, None)
-        return job is not None
 
 
 def _attempted(work: Callable[[], T], otherwise: T) -> T:

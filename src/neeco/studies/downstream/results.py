@@ -86,12 +86,42 @@ def box_scores(
 ) -> dict[str, float | None]:
     """Return COCO's box AP: mean over IoU 0.5 to 0.95, at 0.5 and at 0.75; for several classes the mean, and
     `CLASS.ap`. None if the ground truth has no box."""
-    labelled = [example.boxes() for example in truth]
-    per_class = {}
+    from pycocotools.coco import COCO
+    from pycocotools.cocoeval import COCOeval
+
+    def box_of(image: int, box: np.ndarray) -> dict[str, object]:
+        x0, y0, x1, y1 = map(float, box)
+        bbox = [x0, y0, x1 - x0, y1 - y0]
+        return {"image_id": image, "bbox": bbox, "area": bbox[2] * bbox[3], "category_id": 1}
+
+    per_class: dict[str, list[float]] = {}
+    true_boxes = [example.boxes() for example in truth]
     for number, name in enumerate(classes, 1):
-        true = [boxes[numbers == number] for boxes, numbers in labelled]
-        if any(len(boxes) for boxes in true):
-            per_class[name] = _coco_ap([each.of_class(number) for each in predictions], true)
+        labelled = [
+            box_of(image, box)
+            for image, (boxes, numbers) in enumerate(true_boxes, 1)
+            for box in boxes[numbers == number]
+        ]
+        detections = [
+            box_of(image, box) | {"score": float(score)}
+            for image, each in enumerate(predictions, 1)
+            for box, score in zip(*each.of_class(number), strict=True)
+        ]
+        if not labelled:
+            continue
+        per_class[name] = [0.0, 0.0, 0.0]
+        if detections:
+            with contextlib.redirect_stdout(io.StringIO()):
+                true = COCO()
+                images = [{"id": image} for image in range(1, len(truth) + 1)]
+                annotations = [box | {"id": number, "iscrowd": 0} for number, box in enumerate(labelled, 1)]
+                true.dataset = {"info": {}, "images": images, "categories": [{"id": 1}], "annotations": annotations}
+                true.createIndex()
+                evaluation = COCOeval(true, true.loadRes(detections), "bbox")
+                evaluation.evaluate()
+                evaluation.accumulate()
+                evaluation.summarize()
+            per_class[name] = evaluation.stats[:3].tolist()
     if not per_class:
         return dict.fromkeys(BOX_SCORES)
     means = np.mean(list(per_class.values()), axis=0).tolist()
@@ -109,37 +139,6 @@ def box_iou(detections: Detections, truth: Example) -> float:
         areas = [np.prod(corners[2:] - corners[:2]) for corners in (best, box)]
         values.append(float(both / (sum(areas) - both)))
     return mean_of(values)
-
-
-def _coco_ap(detected: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.ndarray]) -> list[float]:
-    """Return the AP over IoU 0.5 to 0.95, at 0.5 and at 0.75, by pycocotools."""
-    from pycocotools.coco import COCO
-    from pycocotools.cocoeval import COCOeval
-
-    def box_of(image: int, box: np.ndarray) -> dict[str, object]:
-        x0, y0, x1, y1 = map(float, box)
-        bbox = [x0, y0, x1 - x0, y1 - y0]
-        return {"image_id": image, "bbox": bbox, "area": bbox[2] * bbox[3], "category_id": 1}
-
-    labelled = [box_of(image, box) for image, boxes in enumerate(true, 1) for box in boxes]
-    detections = [
-        box_of(image, box) | {"score": float(score)}
-        for image, (boxes, scores) in enumerate(detected, 1)
-        for box, score in zip(boxes, scores, strict=True)
-    ]
-    if not detections:
-        return [0.0, 0.0, 0.0]
-    with contextlib.redirect_stdout(io.StringIO()):
-        truth = COCO()
-        images = [{"id": image} for image in range(1, len(true) + 1)]
-        boxes_of = [box | {"id": number, "iscrowd": 0} for number, box in enumerate(labelled, 1)]
-        truth.dataset = {"info": {}, "images": images, "categories": [{"id": 1}], "annotations": boxes_of}
-        truth.createIndex()
-        evaluation = COCOeval(truth, truth.loadRes(detections), "bbox")
-        evaluation.evaluate()
-        evaluation.accumulate()
-        evaluation.summarize()
-    return evaluation.stats[:3].tolist()
 
 
 class Arm(NamedTuple):
