@@ -367,6 +367,16 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
         offset = f"{clock.seconds * 1000:+.1f}".replace("-", "−")
         rate = "1" if clock.rate == 1 else f"{clock.rate:.5f} ±{clock.rate_sd:.5f}"
         clocks.append([name, offset, sd, rate, cost, clock.source])
+    alike: dict[str, list[tuple[int, str]]] = {}  # reasons that differ only in a number are merged
+    for frame, reason in result.dropped:
+        alike.setdefault(_NUMBER.sub("…", reason.why), []).append((frame, reason.why))
+    dropped = []  # reason, count and frames
+    for pattern, members in sorted(alike.items(), key=lambda group: -len(group[1])):
+        reasons = {why for _, why in members}
+        frames = np.array(sorted(frame for frame, _ in members))
+        runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
+        ranges = ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
+        dropped.append([reasons.pop() if len(reasons) == 1 else pattern, str(len(members)), ranges])
     write_page(
         path,
         "ingest.html",
@@ -384,7 +394,7 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
         clocks=clocks,
         **_frames(result, capture),
         **_coverage(capture),
-        dropped=_dropped(result),
+        dropped=dropped,
     )
 
 
@@ -446,18 +456,3 @@ def _coverage(capture: Capture) -> dict[str, Any]:
             for item in capture.instruments
         ],
     }
-
-
-def _dropped(result: IngestResult) -> list[list[str]]:
-    """Return rows of reason, count and frames; reasons that differ only in a number are merged."""
-    groups: dict[str, list[tuple[int, str]]] = {}
-    for frame, reason in result.dropped:
-        groups.setdefault(_NUMBER.sub("…", reason.why), []).append((frame, reason.why))
-    rows = []
-    for pattern, members in sorted(groups.items(), key=lambda group: -len(group[1])):
-        reasons = {why for _, why in members}
-        frames = np.array(sorted(frame for frame, _ in members))
-        runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
-        ranges = ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
-        rows.append([reasons.pop() if len(reasons) == 1 else pattern, str(len(members)), ranges])
-    return rows

@@ -119,6 +119,16 @@ def write_report(
         curve(rows, "loss", "loss (log scale)", logarithmic=True),
         curve(rows, "num_gaussians", "Gaussians"),
     ]
+    kinds = {kind: evaluation[kind] for kind in KINDS if kind in evaluation}
+    all_numbers = [numbers for splits in kinds.values() for numbers in splits.values()]
+    tables = []  # of image scores and of label scores: columns with any value, and for every kind its splits with cells
+    for scores in (IMAGE_SCORES, LABEL_SCORES):
+        columns = [score for score in scores if any(numbers.get(score.key) is not None for numbers in all_numbers)]
+        groups = [
+            (KINDS[kind], [(split, [score.written(numbers) for score in columns]) for split, numbers in splits.items()])
+            for kind, splits in kinds.items()
+        ]
+        tables += [(columns, groups)] if columns else []
     config = run_path / "config.yaml"
     return write_page(
         run_path / REPORT_FILE,
@@ -132,7 +142,7 @@ def write_report(
         trained=len(capture.split("train")),
         train_scored="train" in evaluation["given"],
         tiles=_tiles(evaluation, kind),
-        tables=_tables(evaluation),
+        tables=tables,
         notes=[*(f"Doubtful: {doubt}" for doubt in evaluation.get("doubts", ())), *evaluation.get("notes", ())],
         figures=frame_figures(evaluation, capture, scene, kind),
         pose_kind=KIND_NAMES[kind],
@@ -225,22 +235,6 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
         if first["num_gaussians"] is not None:
             tiles.append((f"{first['num_gaussians']:,}", "Gaussians of the scene"))
     return tiles
-
-
-def _tables(evaluation: dict[str, Any]) -> list[Any]:
-    """Return the tables of image scores and of label scores: columns with any value, and rows (title of the kind, its
-    splits with their cells)."""
-    kinds = {kind: evaluation[kind] for kind in KINDS if kind in evaluation}
-    all_numbers = [numbers for splits in kinds.values() for numbers in splits.values()]
-    tables = []
-    for scores in (IMAGE_SCORES, LABEL_SCORES):
-        columns = [score for score in scores if any(numbers.get(score.key) is not None for numbers in all_numbers)]
-        groups = [
-            (KINDS[kind], [(split, [score.written(numbers) for score in columns]) for split, numbers in splits.items()])
-            for kind, splits in kinds.items()
-        ]
-        tables += [(columns, groups)] if columns else []
-    return tables
 
 
 def _tints(scene: DrawableScene) -> list[tuple[str, str]]:

@@ -214,7 +214,24 @@ class SampleGenerator:
         """
         rng = self._rng(index, EFFECTS_STREAM)
         effects = {} if self.effects is None else self.effects.draw(rng)
-        drawing, refused = self._first_acceptable(index, effects)
+        settings, sampling, refused = self.settings, self._rng(index), Counter[str]()
+        for _ in range(1 if self.sampler.fixed(index) else settings.max_attempts):
+            state, camera = self.sampler(index, sampling)
+            drawing = draw_layers(self.scene, self.labeller, state, self.cameras(camera), settings.min_component)
+            if "field_of_view" in effects:
+                drawing = _within_circle(drawing, effects["field_of_view"])
+            if (reason := self.acceptance.refusal(drawing)) is None:
+                break
+            refused[reason] += 1
+        else:
+            counts = format_counts(refused)
+            if self.sampler.prescribed:
+                raise StatesRefused(f"image {index}: its given state was refused ({counts})", refused)
+            raise StatesRefused(
+                f"image {index}: no acceptable state in {settings.max_attempts} attempts ({counts}); use --states "
+                "interpolate, a smaller --margin, --no-tissue-check or more --max-attempts (and --resume)",
+                refused,
+            )
         height, width = drawing.depth.shape
         appearance = self.appearances.draw(self._rng(index, APPEARANCE_STREAM), width, height)
         image = self._image(drawing.state, drawing.camera, drawing.image, drawing.share, appearance)
@@ -227,27 +244,6 @@ class SampleGenerator:
         if self.appearances.backgrounds is not None:
             facts["background"] = appearance.source
         return LabelledSample(index, self._through_camera(drawing, effects, rng, appearance), labels, refused, facts)
-
-    def _first_acceptable(self, index: int, effects: Mapping[str, float]) -> tuple[LayeredDrawing, Counter[str]]:
-        settings, rng = self.settings, self._rng(index)
-        refused: Counter[str] = Counter()
-        for _ in range(1 if self.sampler.fixed(index) else settings.max_attempts):
-            state, camera = self.sampler(index, rng)
-            camera = self.cameras(camera)
-            drawing = draw_layers(self.scene, self.labeller, state, camera, settings.min_component)
-            if "field_of_view" in effects:
-                drawing = _within_circle(drawing, effects["field_of_view"])
-            reason = self.acceptance.refusal(drawing)
-            if reason is None:
-                return drawing, refused
-            refused[reason] += 1
-        if self.sampler.prescribed:
-            raise StatesRefused(f"image {index}: its given state was refused ({format_counts(refused)})", refused)
-        raise StatesRefused(
-            f"image {index}: no acceptable state in {settings.max_attempts} attempts ({format_counts(refused)}); "
-            "use --states interpolate, a smaller --margin, --no-tissue-check or more --max-attempts (and --resume)",
-            refused,
-        )
 
     def _rng(self, *numbers: int) -> Generator:
         return np.random.default_rng(np.random.SeedSequence([self.settings.seed, *numbers]))

@@ -128,9 +128,7 @@ class Colors:
         return np.clip((image - colors.mean) * gains + self.mean, 0, 1).astype(np.float32)
 
 
-@lru_cache(maxsize=4096)
-def _colors_of_file(file: Path) -> Colors:
-    return Colors.of(read_image_bytes(file).astype(np.float32) / 255)
+_COLORS = lru_cache(maxsize=4096)(lambda file: Colors.of(read_image_bytes(file).astype(np.float32) / 255))
 
 
 @dataclass(frozen=True)
@@ -178,7 +176,7 @@ class Appearances:
         appearance = Appearance()
         if self.frames is not None and matched < IMAGES.replaced:
             file = self.frames.files[int(frame * len(self.frames.files))]
-            appearance = replace(appearance, colors=_colors_of_file(file))
+            appearance = replace(appearance, colors=_COLORS(file))
         if self.backgrounds is None or replaced >= IMAGES.replaced:
             return appearance
         number = int(place * len(self.backgrounds.files))

@@ -171,7 +171,13 @@ def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
     base, base_range = _quantized(canonical.sh_dc[:, 0] * SH_C0 + 0.5, 65535)
     turns = [_quantized(column[:, None], 65535) for column in motion.amounts.flatten(1).unbind(1)]
     none = np.zeros((len(canonical), 0), np.int64)  # where nothing turns
-    harmonics, bands = _harmonics(canonical.sh_rest, degree)
+    rest = canonical.sh_rest  # harmonics [N, 15, 3] without the first, in -127 to 127 of the maximum of every degree
+    harmonics, bands = [none], []
+    for d in range(1, degree + 1):
+        band = rest[:, d * d - 1 : (d + 1) ** 2 - 1]
+        largest = max(float(band.abs().max()) if band.numel() else 0.0, 1e-9)
+        harmonics.append(_rounded(band / largest * 127).reshape(len(rest), -1))
+        bands.append(largest)
     fields = (  # name, whole numbers [N, K], type
         ("mean", np.concatenate(rows), "uint24"),
         ("quat", _rounded(normalize(canonical.quats, dim=1) * 127), "int8"),
@@ -180,7 +186,7 @@ def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
         ("base", base, "uint16"),
         ("turn", np.concatenate([none, *(numbers for numbers, _ in turns)], 1), "uint16"),
         ("label", _rounded(scene.label_channels() * 255), "uint8"),
-        ("sh", harmonics, "int8"),
+        ("sh", np.concatenate(harmonics, 1), "int8"),
     )
     turn_ranges = [ends for _, ends in turns]
     lamps = zip(scene.shadow_offsets.tolist(), scene.shadow_strengths.clamp(0, 1).tolist(), strict=True)
@@ -207,18 +213,6 @@ def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
         split = np.ascontiguousarray(numbers.T, "<i4")[..., None].view(np.uint8)  # [K, N, 4]
         planes.append(np.ascontiguousarray(split[..., : BYTES[kind]].transpose(2, 0, 1)).tobytes())
     return header, b"".join(planes)
-
-
-def _harmonics(rest: Tensor, degree: int) -> tuple[np.ndarray, list[float]]:
-    """Return [N, 3 K] in -127 to 127 of harmonics [N, 15, 3], without the first, and the value of 127 for every degree:
-    its maximum."""
-    blocks, bands = [np.zeros((len(rest), 0), np.int64)], []
-    for d in range(1, degree + 1):
-        band = rest[:, d * d - 1 : (d + 1) ** 2 - 1]
-        largest = max(float(band.abs().max()) if band.numel() else 0.0, 1e-9)
-        blocks.append(_rounded(band / largest * 127).reshape(len(rest), -1))
-        bands.append(largest)
-    return np.concatenate(blocks, 1), bands
 
 
 def _quantized(values: Tensor, steps: int) -> tuple[np.ndarray, list[float]]:

@@ -1,7 +1,7 @@
-"""What a browser's window shows: slider values as a state (a position in the recording, and each instrument's departure
-from it), viser's camera and scene (conversion from and to ours, recorded cameras, sparse points, gizmos), and the views
-of a scene in a state (image, labels, depth, ...).
+"""Content of a browser's window: slider values as a state, viser's camera and scene, and views of a state.
 
+Slider values are a position in the recording, and each instrument's departure from it; viser's camera and scene are
+converted from and to ours, with recorded cameras, sparse points and gizmos; views are image, labels, depth, ...
 viser keeps depth up to 168 of its units and sees 1000 far, so mm do not fit; a `unit` is how many of them a mm is.
 """
 

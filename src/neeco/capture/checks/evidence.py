@@ -67,36 +67,38 @@ def read_pictures(parsed: Parsed) -> list[Picture]:
     """Decode the image and the mask of every frame."""
     compared = set(compared_rows(parsed).tolist())
     points = measured_sample(parsed.points)
-    return in_threads(partial(_read, parsed, compared, points), range(len(parsed.frames)))
+
+    def read(row: int) -> Picture:
+        frame, picture, pixels = parsed.frames[row], Picture(), None
+        try:
+            pixels = frame.load_pixels()
+            picture.digest = hashlib.blake2b(pixels.tobytes(), digest_size=16).digest()
+            picture.uniform = bool((pixels[0] == pixels[0, 0]).all() and (pixels == pixels[0, 0]).all())
+            if row in compared:
+                picture.image = resized(byte_pixels(pixels), reduced_size(frame))
+        except NeecoError as error:
+            picture.image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
+        try:
+            counted = frame.load_mask()
+            mask = None if counted is None else counted.numpy()
+            if mask is not None and not mask.any():
+                picture.mask_error = "ignores every pixel; invert it (black is ignored), or write 255 instead of 1"
+            elif mask is not None and pixels is not None:
+                camera = None if row in parsed.without_camera else frame.camera
+                picture.hidden = measure_hidden(pixels, mask, camera, points)
+                picture.mask = resized(mask.astype(np.float32), reduced_size(frame)) if row in compared else None
+        except NeecoError as error:
+            picture.mask_error = str(error).replace(
+                str(frame.mask_path), frame.mask_path.name if frame.mask_path else ""
+            )
+        return picture
+
+    return in_threads(read, range(len(parsed.frames)))
 
 
 def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Return an image area-averaged to (width, height)."""
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-
-
-def _read(parsed: Parsed, compared: set[int], points: np.ndarray, row: int) -> Picture:
-    frame, picture, pixels = parsed.frames[row], Picture(), None
-    try:
-        pixels = frame.load_pixels()
-        picture.digest = hashlib.blake2b(pixels.tobytes(), digest_size=16).digest()
-        picture.uniform = bool((pixels[0] == pixels[0, 0]).all() and (pixels == pixels[0, 0]).all())
-        if row in compared:
-            picture.image = resized(byte_pixels(pixels), reduced_size(frame))
-    except NeecoError as error:
-        picture.image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
-    try:
-        counted = frame.load_mask()
-        mask = None if counted is None else counted.numpy()
-        if mask is not None and not mask.any():
-            picture.mask_error = "ignores every pixel; invert it (black is ignored), or write 255 instead of 1"
-        elif mask is not None and pixels is not None:
-            camera = None if row in parsed.without_camera else frame.camera
-            picture.hidden = measure_hidden(pixels, mask, camera, points)
-            picture.mask = resized(mask.astype(np.float32), reduced_size(frame)) if row in compared else None
-    except NeecoError as error:
-        picture.mask_error = str(error).replace(str(frame.mask_path), frame.mask_path.name if frame.mask_path else "")
-    return picture
 
 
 def reduced_size(frame: Frame) -> tuple[int, int]:
@@ -167,10 +169,6 @@ class CameraArrays:
             u, v = project(local, fx, fy, cx, cy, nearest=MIN_DEPTH)
             u, v = (u, v) if pixels is None else pixels(u, v, width, height)
             return u, v, (local[..., 2] > MIN_DEPTH) & (u > 0) & (u < width) & (v > 0) & (v < height)
-
-    def sees(self, points: np.ndarray) -> np.ndarray:
-        """Return which of points [F, P, 3] or [1, P, 3] each camera has in its image, bool [F, P]."""
-        return self.project(points)[2]
 
 
 class ColorEvidence:

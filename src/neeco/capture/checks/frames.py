@@ -148,9 +148,8 @@ def _is_same(one: Frame, two: Frame) -> bool:
 def check_states(parsed: Parsed) -> None:
     """Report missing instruments and joints, exceeded limits, degrees for radians, and states that never change."""
     for instrument in parsed.instruments:
-        frames = zip(parsed.frames, parsed.places, strict=True)
-        without = [place for frame, place in frames if instrument.name not in frame.state.instruments]
-        name = printable(instrument.name)
+        name, pairs = printable(instrument.name), zip(parsed.frames, parsed.places, strict=True)
+        without = [place for frame, place in pairs if instrument.name not in frame.state.instruments]
         if len(without) == len(parsed.frames):
             message = f"instrument {name} is declared, but not in any frame"
             parsed.header("instruments").error(message, "remove it or give its poses")
@@ -167,7 +166,28 @@ def check_states(parsed: Parsed) -> None:
         if 2 * unknown > len(stated):  # from video, it cannot be learned
             message = f"the roll of {name} is unknown in {unknown} of {len(stated)} frames"
             parsed.header("frames").warning(message, "log it, or pose frames by hand: neeco view CAPTURE --annotate")
-    _check_changes(parsed)
+    # states that are the same in every frame: motion cannot be learned from them
+    frames, moving, still = parsed.header("frames"), False, []
+    for instrument in parsed.instruments:
+        states, name = [state for _, state in parsed.states_of(instrument.name)], printable(instrument.name)
+        if len(states) < 2:
+            continue
+        travels = float(np.ptp(np.stack([state.pose.numpy() for state in states]), axis=0).max()) > MIN_DEVIATION
+        values = {joint: [one.joints[joint] for one in states if joint in one.joints] for joint in instrument.joints}
+        moves = {joint: max(series) - min(series) > MIN_DEVIATION for joint, series in values.items() if series}
+        moving = moving or travels or any(moves.values())
+        if travels:
+            for joint in (joint for joint, moved in moves.items() if not moved):
+                message = f"joint {printable(joint)} of {name} is always {values[joint][0]:g}"
+                frames.warning(message, "its other values cannot be learned")
+        elif any(moves.values()):
+            frames.warning(f"the pose of {name} never changes", "check the connection of its tracker")
+        else:
+            still.append(name)
+    for name in still:
+        message = f"the state of {name} never changes: pose and joints are the same in every frame"
+        remedy = "check the connection of its tracker, or remove the instrument if it is fixed"
+        (frames.warning if moving else frames.error)(message, remedy)
 
 
 def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
@@ -226,28 +246,3 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
         if explained > SETTINGS.max_explained:
             message = f"joint {printable(joint)} of {name} follows from the others ({explained:.1%} of its variance)"
             place.warning(message, "also move joints one at a time, to separate their axes")
-
-
-def _check_changes(parsed: Parsed) -> None:
-    """Report states that are the same in every frame: motion cannot be learned from them."""
-    frames, moving, still = parsed.header("frames"), False, []
-    for instrument in parsed.instruments:
-        states, name = [state for _, state in parsed.states_of(instrument.name)], printable(instrument.name)
-        if len(states) < 2:
-            continue
-        travels = float(np.ptp(np.stack([state.pose.numpy() for state in states]), axis=0).max()) > MIN_DEVIATION
-        values = {joint: [one.joints[joint] for one in states if joint in one.joints] for joint in instrument.joints}
-        moves = {joint: max(series) - min(series) > MIN_DEVIATION for joint, series in values.items() if series}
-        moving = moving or travels or any(moves.values())
-        if travels:
-            for joint in (joint for joint, moved in moves.items() if not moved):
-                message = f"joint {printable(joint)} of {name} is always {values[joint][0]:g}"
-                frames.warning(message, "its other values cannot be learned")
-        elif any(moves.values()):
-            frames.warning(f"the pose of {name} never changes", "check the connection of its tracker")
-        else:
-            still.append(name)
-    for name in still:
-        message = f"the state of {name} never changes: pose and joints are the same in every frame"
-        remedy = "check the connection of its tracker, or remove the instrument if it is fixed"
-        (frames.warning if moving else frames.error)(message, remedy)

@@ -286,9 +286,23 @@ ALL_IN_MM = "give all lengths in mm"
 
 def check_placement(parsed: Parsed, verdicts: ImageVerdicts) -> None:
     """Check points, cameras against points, then instruments against both (unless the cameras are wrong)."""
-    report = parsed.places[0].report
-    before = len(errors_only(report.problems))
-    points, placed = _usable_points(parsed), parsed.with_cameras()
+    report, placed = parsed.places[0].report, parsed.with_cameras()
+    before, place = len(errors_only(report.problems)), parsed.points_place
+    assert place is not None  # there are frames
+    points = None  # the measured ones [P, 3] float64; None where there are none, or all coincide
+    if parsed.points is None or not parsed.points.measured:
+        if not place.reported:
+            place.warning("no sparse points", "training starts from random points, with a poorer result")
+    elif not len(points := parsed.points.positions.astype(np.float64)):
+        place.error("contains no points", "add SfM points or remove ply_file_path")
+        points = None
+    else:
+        if len(points) < SETTINGS.few_points:
+            message = f"few sparse points: {len(points)}, fewer than {SETTINGS.few_points}"
+            place.warning(message, "use the complete SfM point cloud if possible")
+        if _radius(points) < 1e-9:
+            place.error("all points coincide", "repair the point cloud")
+            points = None
     if not placed.frames:
         return
     if not parsed.registered and parsed.instruments:
@@ -302,27 +316,6 @@ def check_placement(parsed: Parsed, verdicts: ImageVerdicts) -> None:
             _check_instrument(placed, instrument, points, verdicts)
 
 
-def _usable_points(parsed: Parsed) -> np.ndarray | None:
-    """Return the measured points [P, 3] float64; None, and reported, if there are none or all coincide. Reports few."""
-    place = parsed.points_place
-    assert place is not None  # there are frames
-    if parsed.points is None or not parsed.points.measured:
-        if not place.reported:
-            place.warning("no sparse points", "training starts from random points, with a poorer result")
-        return None
-    points = parsed.points.positions.astype(np.float64)
-    if len(points) == 0:
-        place.error("contains no points", "add SfM points or remove ply_file_path")
-        return None
-    if len(points) < SETTINGS.few_points:
-        message = f"few sparse points: {len(points)}, fewer than {SETTINGS.few_points}"
-        place.warning(message, "use the complete SfM point cloud if possible")
-    if _radius(points) < 1e-9:
-        place.error("all points coincide", "repair the point cloud")
-        return None
-    return points
-
-
 def _radius(points: np.ndarray) -> float:
     """Return the 90 % quantile of distances, mm, of points [P, 3] to their median."""
     return float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
@@ -334,7 +327,7 @@ def _check_cameras(parsed: Parsed, points: np.ndarray, verdicts: ImageVerdicts) 
     cameras = CameraArrays.of([frame.camera for frame in parsed.frames])
     distances = np.linalg.norm(cameras.centers - np.median(points, axis=0), axis=1)
     distance, radius = float(np.median(distances)), _radius(points)
-    visible = cameras.sees(sampled(points)[None]).mean(axis=1)  # [F] share of the points in each image
+    visible = cameras.project(sampled(points)[None])[2].mean(axis=1)  # [F] share of the points in each image
     too_near = bool(parsed.instruments) and distance < SETTINGS.min_distance_mm
     if too_near or distance > SETTINGS.far_distance * radius:
         message = f"cameras are {distance:.4g} mm from the points, which span {2 * radius:.4g} mm: probably metres"
@@ -371,7 +364,7 @@ def _check_instrument(
     if not parsed.registered or farthest < SETTINGS.min_distance_mm:
         return
     cameras = CameraArrays.of([frame.camera for frame in parsed.frames if instrument.name in frame.state.instruments])
-    visible = cameras.sees(origins[:, None])[:, 0]  # [I]
+    visible = cameras.project(origins[:, None])[2][:, 0]  # [I]
     outside = "every image" if not visible.any() else f"{len(visible) - int(visible.sum())} of {len(visible)} images"
     out_of_view = visible.mean() < SETTINGS.min_visible
     verdict = verdicts.instruments[instrument.name] if out_of_view else None
@@ -396,19 +389,15 @@ def _check_instrument(
             remedy = "probably a tracker drop-out or a wrong unit: repair the pose or drop the frame"
             places[index].child("pose").warning(message, remedy)
     elif verdict is not None and verdict.status == "undecided":
-        behind = visible.any() or _body_visible(cameras, poses) > SETTINGS.min_body_visible
+        behind = bool(visible.any())
+        if not behind:  # whether most images show the instrument-fixed point nearest to all optical axes
+            across = across_projectors(cameras.poses[:, :3, 2])
+            rows = (across @ poses[:, :3, :3]).reshape(-1, 3)
+            target = (across @ (cameras.centers - poses[:, :3, 3])[:, :, None]).reshape(-1)
+            point = np.linalg.lstsq(rows, target, rcond=1e-6)[0]
+            world = np.einsum("fij,j->fi", poses[:, :3, :3], point) + poses[:, :3, 3]
+            shown = cameras.project(world[:, None])[2].mean() > SETTINGS.min_body_visible
+            behind = bool(shown and np.linalg.norm(point) < SETTINGS.sensor_reach_mm)
         remedy = "correct only if its sensor is far behind the tip"
         remedy += "" if behind else "; world_from_instrument in mm, in the cameras' world, is expected"
         (all_poses.warning if behind else all_poses.error)(f"the origin of {name} is outside {outside}", remedy)
-
-
-def _body_visible(cameras: CameraArrays, poses: np.ndarray) -> float:
-    """Return the share of images that show the instrument-fixed point nearest to all optical axes; 0 if it is beyond a
-    sensor's reach."""
-    across = across_projectors(cameras.poses[:, :3, 2])
-    rows = (across @ poses[:, :3, :3]).reshape(-1, 3)
-    target = (across @ (cameras.centers - poses[:, :3, 3])[:, :, None]).reshape(-1)
-    point = np.linalg.lstsq(rows, target, rcond=1e-6)[0]
-    world = np.einsum("fij,j->fi", poses[:, :3, :3], point) + poses[:, :3, 3]
-    reached = np.linalg.norm(point) < SETTINGS.sensor_reach_mm
-    return float(cameras.sees(world[:, None])[:, 0].mean()) if reached else 0.0
