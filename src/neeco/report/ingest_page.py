@@ -67,17 +67,6 @@ class FigureSettings:
 SETTINGS = FigureSettings()
 
 
-def axis_length(capture: Capture) -> float:
-    """Return a round number of mm that spans about `axis_share` of the image at the instruments' median depth."""
-    sizes = []
-    for frame in capture.frames:
-        for state in frame.state.instruments.values():
-            _, (depth,) = _project(ORIGIN, state.pose, frame.camera)
-            if depth > SETTINGS.min_depth_mm:
-                sizes.append(SETTINGS.axis_share * frame.camera.width / frame.camera.fx * depth)
-    return round_length(float(np.median(sizes)) if sizes else 10.0)
-
-
 def in_view(capture: Capture, name: str) -> float:
     """Return the share of an instrument's frames in which its tracked origin lies inside the image."""
     frames = [frame for frame in capture.frames if name in frame.state.instruments]
@@ -401,7 +390,13 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
 def _frames(result: IngestResult, capture: Capture) -> dict[str, Any]:
     """Return sample frames as (picture, picture before registration or "", frame, its time, its split), and the legend
     of the overlays."""
-    length = axis_length(capture)
+    sizes = []  # mm that span `axis_share` of the image at the instruments' depths
+    for frame in capture.frames:
+        for state in frame.state.instruments.values():
+            _, (depth,) = _project(ORIGIN, state.pose, frame.camera)
+            if depth > SETTINGS.min_depth_mm:
+                sizes.append(SETTINGS.axis_share * frame.camera.width / frame.camera.fx * depth)
+    length = round_length(float(np.median(sizes)) if sizes else 10.0)
     rows = {time: row for row, time in enumerate(np.round(result.selected_times, 6).tolist())}
     start = min(frame.state.time for frame in capture.frames)
     samples, shown_before = [], 0

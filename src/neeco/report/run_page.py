@@ -305,6 +305,28 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
     recorded image cannot be read or the page cannot be written.
     """
     ranked = sorted(range(len(records)), key=lambda k: records[k]["trust"]["value"])
+    figures = []
+    for k in ranked[: SETTINGS.max_frames]:  # each with the contours of its labels, and its confidence
+        record, frame = records[k], capture.frames[k]
+        trust, moved = record["trust"], record["moved"]
+        image = Image.fromarray(to_bytes(frame.load_image().numpy()))
+        pen = ImageDraw.Draw(image)
+        for number, label in enumerate(record["labels"]):
+            for polygon in label.get("polygons", ()):
+                points = [tuple(point) for point in polygon]
+                color = SETTINGS.outlines[number % len(SETTINGS.outlines)]
+                pen.line([*points, points[0]], fill=color, width=1)
+        figures.append(
+            {
+                "name": frame.name,
+                "split": record["recorded_split"],
+                "written": not record.get("skipped"),
+                "trust": f"{trust['value']:.3f}",
+                "votes": f"{trust['against']:.1%} of the label contradicted by the image, {trust['missed']:.1%} missed",
+                "moved": ", ".join(f"{body} {by['mm']:.2f} mm, {by['deg']:.2f}°" for body, by in moved.items()),
+                "picture": jpeg(np.asarray(image)),
+            }
+        )
     written = sum(not record.get("skipped") for record in records)
     return write_page(
         output / PAGE,
@@ -318,33 +340,13 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
             (f"{median(record['trust']['value'] for record in records):.3f}", "trust, median"),
             (f"{min_trust:g}", "minimum trust"),
         ],
-        figures=[_annotated_figure(records[k], capture.frames[k]) for k in ranked[: SETTINGS.max_frames]],
+        figures=figures,
         total=len(records),
         instruments=[
             ("#{:02x}{:02x}{:02x}".format(*SETTINGS.outlines[k % len(SETTINGS.outlines)]), item.name)
             for k, item in enumerate(capture.instruments)
         ],
     )
-
-
-def _annotated_figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:
-    """Return one frame: its image with the contours of its labels, and its confidence."""
-    trust, moved = record["trust"], record["moved"]
-    image = Image.fromarray(to_bytes(frame.load_image().numpy()))
-    pen = ImageDraw.Draw(image)
-    for k, label in enumerate(record["labels"]):
-        for polygon in label.get("polygons", ()):
-            points = [tuple(point) for point in polygon]
-            pen.line([*points, points[0]], fill=SETTINGS.outlines[k % len(SETTINGS.outlines)], width=1)
-    return {
-        "name": frame.name,
-        "split": record["recorded_split"],
-        "written": not record.get("skipped"),
-        "trust": f"{trust['value']:.3f}",
-        "votes": f"{trust['against']:.1%} of the label contradicted by the image, {trust['missed']:.1%} missed",
-        "moved": ", ".join(f"{body} {by['mm']:.2f} mm, {by['deg']:.2f}°" for body, by in moved.items()),
-        "picture": jpeg(np.asarray(image)),
-    }
 
 
 HOWS = {

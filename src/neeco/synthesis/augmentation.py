@@ -61,7 +61,18 @@ def augment(planes: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     grid = functional.affine_grid(given_from_made, [count, 1, height, width], align_corners=False)
     planes = functional.grid_sample(planes, grid, align_corners=False)
     colors, labels = planes[:, :3], planes[:, 3:]
-    colors = torch.where(random.some(CHANGES.relit)[:, None, None, None] > 0, _relight(colors, random), colors)
+    relit = random.some(CHANGES.relit)[:, None, None, None] > 0  # in exposure, gamma, tint, saturation and lamps
+    angle, slope = random.uniform(-math.pi, math.pi), random.some(0.5) * random.uniform(0, CHANGES.slope)
+    across, down = (torch.linspace(-0.5, 0.5, side, device=colors.device) for side in (width, height))
+    ramp = (slope * angle.cos())[:, None, None] * across + (slope * angle.sin())[:, None, None] * down[:, None]
+    gain = 2 ** random.uniform(-CHANGES.exposure, CHANGES.exposure)
+    tint = random.uniform(1 - CHANGES.tint, 1 + CHANGES.tint, 3) * gain[:, None]
+    grey = colors.mean(1, keepdim=True)
+    saturation = random.uniform(1 - CHANGES.saturation, 1 + CHANGES.saturation)
+    lit = grey + (colors - grey) * saturation[:, None, None, None]
+    lit = (lit * tint[..., None, None] * (1 + ramp[:, None])).clamp(1e-4, 1)
+    lit = lit ** (2 ** random.uniform(-CHANGES.gamma, CHANGES.gamma))[:, None, None, None]
+    colors = torch.where(relit, lit, colors)
     colors = _blur(colors, random.some(0.3) * random.uniform(0.2, CHANGES.blur))
     noise = torch.randn(colors.shape, generator=rng, device=planes.device)
     strength = random.some(0.5) * random.uniform(0, CHANGES.noise)
@@ -120,21 +131,6 @@ class _Random:
     def some(self, chance: float) -> Tensor:
         """Return [B]: 1 with this probability, else 0."""
         return (self.uniform(0, 1) < chance).float()
-
-
-def _relight(colors: Tensor, random: _Random) -> Tensor:
-    """Change exposure, gamma, tint, saturation and lamps."""
-    height, width = colors.shape[2:]
-    angle, slope = random.uniform(-math.pi, math.pi), random.some(0.5) * random.uniform(0, CHANGES.slope)
-    across, down = (torch.linspace(-0.5, 0.5, side, device=colors.device) for side in (width, height))
-    ramp = (slope * angle.cos())[:, None, None] * across + (slope * angle.sin())[:, None, None] * down[:, None]
-    gain = 2 ** random.uniform(-CHANGES.exposure, CHANGES.exposure)
-    tint = random.uniform(1 - CHANGES.tint, 1 + CHANGES.tint, 3) * gain[:, None]
-    grey = colors.mean(1, keepdim=True)
-    saturation = random.uniform(1 - CHANGES.saturation, 1 + CHANGES.saturation)
-    colors = grey + (colors - grey) * saturation[:, None, None, None]
-    colors = (colors * tint[..., None, None] * (1 + ramp[:, None])).clamp(1e-4, 1)
-    return colors ** (2 ** random.uniform(-CHANGES.gamma, CHANGES.gamma))[:, None, None, None]
 
 
 def _blur(colors: Tensor, deviations: Tensor) -> Tensor:

@@ -17,7 +17,6 @@ import matplotlib
 import numpy as np
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
@@ -28,7 +27,7 @@ from neeco.capture.model import evenly_spaced
 from neeco.evaluation.image_metrics import overlay_parts, part_color
 from neeco.labels.annotation import OCCLUDED
 from neeco.synthesis.settings import ImageSettings, Settings
-from neeco.synthesis.writers.folder import Record, split_of, stem
+from neeco.synthesis.writers import Record, split_of, stem
 from neeco.synthesis.writers.hub import SPLITS, ImageFolder, WebDataset
 
 CARD = "README.md"
@@ -177,8 +176,22 @@ def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: P
             x = (2 * column + side) * (wide + PREVIEW.gap)
             sheet[y : y + high, x : x + wide] = cv2.resize(image, (wide, high), interpolation=cv2.INTER_AREA)
             axes.text(x, y - 4, "\n".join(captions[k][side]), fontsize=PREVIEW.font)
+        corner, scale = np.array([x, y]), wide / record["width"]  # of the labelled image
         for label in record["labels"]:
-            _draw_label(axes, label, bones, np.array([x, y]), wide / record["width"])
+            if label["area"] > 0:
+                left, top, width, height = (value * scale for value in label["box"])
+                box = (left + corner[0], top + corner[1]), width, height
+                axes.add_patch(Rectangle(*box, fill=False, color=PREVIEW.box))
+                rectangle = corner + scale * np.array(label["rectangle"])
+                axes.add_patch(Polygon(rectangle, fill=False, color=PREVIEW.rectangle))
+                tag = {"facecolor": PREVIEW.box, "edgecolor": PREVIEW.box, "pad": 1}
+                axes.text(box[0][0], box[0][1] - 2, label["name"], fontsize=PREVIEW.font, bbox=tag)
+            points = {k: (corner + scale * np.array([x, y]), v) for k, (x, y, v) in label["keypoints"].items() if v > 0}
+            for a, b in (bone for bone in bones if {*bone} <= points.keys()):
+                axes.plot(*np.stack([points[a][0], points[b][0]], 1), color=PREVIEW.bone)
+            for place, visibility in points.values():
+                color = PREVIEW.hidden if visibility == OCCLUDED else PREVIEW.box
+                axes.plot(*place, "o", color=color, markeredgecolor=PREVIEW.bone)
     axes.imshow(sheet)
     keys: list[Any] = [Patch(color=part_color(number), label=" ".join(name)) for number, name in enumerate(names, 1)]
     dot = partial(Line2D, [], [], marker="o", linestyle="", markeredgecolor=PREVIEW.bone)
@@ -186,19 +199,3 @@ def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: P
     keys += [dot(color=PREVIEW.box, label="keypoint seen"), dot(color=PREVIEW.hidden, label="keypoint occluded")]
     axes.legend(handles=keys, loc="upper left", ncols=5, fontsize=PREVIEW.font)
     return figure
-
-
-def _draw_label(axes: Axes, label: dict[str, Any], bones: Pairs, corner: np.ndarray, scale: float) -> None:
-    """Draw a label over its image, whose upper left corner [2] px is there, `scale` times its size."""
-    if label["area"] > 0:
-        x, y, width, height = (value * scale for value in label["box"])
-        axes.add_patch(Rectangle((x + corner[0], y + corner[1]), width, height, fill=False, color=PREVIEW.box))
-        axes.add_patch(Polygon(corner + scale * np.array(label["rectangle"]), fill=False, color=PREVIEW.rectangle))
-        tag = {"facecolor": PREVIEW.box, "edgecolor": PREVIEW.box, "pad": 1}
-        axes.text(x + corner[0], y + corner[1] - 2, label["name"], fontsize=PREVIEW.font, bbox=tag)
-    points = {name: (corner + scale * np.array([x, y]), v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
-    for a, b in (bone for bone in bones if {*bone} <= points.keys()):
-        axes.plot(*np.stack([points[a][0], points[b][0]], 1), color=PREVIEW.bone)
-    for (x, y), visibility in points.values():
-        color = PREVIEW.hidden if visibility == OCCLUDED else PREVIEW.box
-        axes.plot(x, y, "o", color=color, markeredgecolor=PREVIEW.bone)

@@ -40,13 +40,14 @@ from neeco.synthesis.generator import (
 from neeco.synthesis.other_tissue import ImageFolder
 from neeco.synthesis.samplers import SAMPLING, states_fingerprint
 from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
-from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import (
+from neeco.synthesis.writers import (
     DEPTH_MM_PER_COUNT,
     FOLDERS,
     IGNORED,
     SHARE_PER_COUNT,
     Record,
+    Writer,
+    WrittenImages,
     load_record,
     record_path,
     write_states,

@@ -60,7 +60,7 @@ from neeco.synthesis.other_tissue import (
 )
 from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler, states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Settings
-from neeco.synthesis.writers.folder import Encoded, Record, encoded_sample, skipped_sample
+from neeco.synthesis.writers import Encoded, Record, encoded_sample, skipped_sample
 
 # separate random streams per image: camera effects and appearances do not affect the sampled state and view
 EFFECTS_STREAM, APPEARANCE_STREAM = 1, 2

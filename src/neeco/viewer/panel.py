@@ -169,8 +169,16 @@ class InstrumentPanel:
         # unit of the sliders of a reading: degrees (revolute) or mm (prismatic)
         self._per_unit = {joint: 1.0 if instrument.slides(joint) else math.degrees(1.0) for joint in instrument.joints}
         with gui.add_folder(f"Instrument {self.name}"):
-            spans = self._ranges.items()
-            self._joints = {joint: _joint_slider(gui, joint, span, self._per_unit[joint]) for joint, span in spans}
+            self._joints: dict[str, viser.GuiSliderHandle[float]] = {}
+            for joint, span in self._ranges.items():  # ends rounded outwards; a reading outside is rendered at its end
+                per_unit = self._per_unit[joint]
+                lower, upper = per_unit * span.lower, per_unit * span.upper
+                digits = max(0, 1 - math.floor(math.log10((upper - lower) / 5)))
+                step = 10.0**-digits
+                lower = round(math.floor(lower / step) * step, digits)
+                upper = round(math.ceil(upper / step) * step, digits)
+                unit, begin = "mm" if per_unit == 1 else "°", min(max(0.0, lower), upper)
+                self._joints[joint] = gui.add_slider(f"{joint} ({unit})", lower, upper, step, begin)
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
             end, angle = "About the shaft's end.", PANEL.yaw_deg
             self._moves = [  # slide in mm; roll, yaw and pitch in degrees
@@ -239,17 +247,6 @@ class InstrumentPanel:
 def _by_user(action: Callable[[], None]) -> Callable[[viser.GuiEvent[Any]], None]:
     """Wrap `action` to run only when a user, not the program, moved a control."""
     return lambda event: None if event.client is None else action()
-
-
-def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: float) -> viser.GuiSliderHandle[float]:
-    """Add a slider in mm where `per_unit` is 1, else in degrees. Ends are rounded outwards; a reading outside is
-    rendered at its end."""
-    lower, upper = per_unit * span.lower, per_unit * span.upper
-    digits = max(0, 1 - math.floor(math.log10((upper - lower) / 5)))
-    step = 10.0**-digits
-    lower, upper = round(math.floor(lower / step) * step, digits), round(math.ceil(upper / step) * step, digits)
-    unit = "mm" if per_unit == 1 else "°"
-    return gui.add_slider(f"{joint} ({unit})", lower, upper, step, min(max(0.0, lower), upper))
 
 
 def status_html(

@@ -35,7 +35,7 @@ from neeco.scene.gaussian_scene import is_gaussian, require_gaussians
 from neeco.synthesis.contact import labels_of
 from neeco.synthesis.samplers import DrawnCameras, Shaft, moved_camera, shafts_of
 from neeco.synthesis.settings import RECORDED_SIZE, Settings, SizeSettings
-from neeco.synthesis.writers.folder import encoded_sample, load_record, record_path
+from neeco.synthesis.writers import encoded_sample, load_record, record_path
 from neeco.training.run import SCENE_FILE, checkpoint_path, read_checkpoint, read_config
 
 

@@ -25,8 +25,7 @@ from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import INTRINSICS
 from neeco.labels.annotation import bounding_box
 from neeco.labels.drawing import extended_silhouettes
-from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import DEPTH_MM_PER_COUNT, Record, link, stem
+from neeco.synthesis.writers import DEPTH_MM_PER_COUNT, Record, Writer, WrittenImages, link, stem
 
 SCENE = "000000"
 NOWHERE = [-1, -1, -1, -1]

@@ -22,8 +22,7 @@ import numpy as np
 import yaml
 
 from neeco.base.files import write_text, write_unsynced
-from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import link, stem
+from neeco.synthesis.writers import Writer, WrittenImages, link, stem
 
 Row = Callable[[dict[str, Any], np.ndarray], list[float]]  # (label, image size [2]) -> numbers after the class
 MAX_SHARE = 1.01  # of the image's width and height: Ultralytics rejects labels that extend further
