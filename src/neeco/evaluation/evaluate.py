@@ -17,13 +17,14 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import finite, require_inside, write_json
 from neeco.capture.checks.frames import SHADOW_FOLDER
 from neeco.capture.images import read_mask
 from neeco.capture.model import Capture, Frame, State, evenly_spaced
-from neeco.evaluation.image_metrics import COMPARISON, WEIGHTS_VARIABLE, Lpips, psnr, resize_mask, ssim
+from neeco.evaluation.image_metrics import COMPARISON, WEIGHTS_VARIABLE, Lpips, psnr, ssim
 from neeco.evaluation.masks import (
     PartTally,
     dice,
@@ -150,8 +151,10 @@ def unobserved_tissue(coverage: Coverage, scene: DrawableScene, frame: Frame) ->
     points = unproject_world(centers, _filled(rendering), camera)  # [h, w, 3]
     unobserved = torch.zeros_like(tissue)
     unobserved[tissue] = ~coverage.observed(points[tissue])
-    size = (frame.camera.width, frame.camera.height)
-    return resize_mask(unobserved, *size), resize_mask(tissue, *size)
+    size = (frame.camera.height, frame.camera.width)
+    masks = torch.stack([unobserved, tissue])[None].float()
+    whole = interpolate(masks, size=size, mode="nearest-exact")[0] > 0.5
+    return whole[0], whole[1]
 
 
 def _small(camera: Camera) -> Camera:

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from safetensors.torch import load_file
 from scipy.ndimage import binary_erosion
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, conv2d, interpolate, max_pool2d, relu
+from torch.nn.functional import adaptive_avg_pool2d, conv2d, max_pool2d, relu
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import require_content
@@ -273,8 +273,3 @@ def _colored(fraction: np.ndarray) -> Pixels:
 def to_uint8(pixels: np.ndarray) -> Pixels:
     """Round values in [0, 255], clipped, to 8 bits."""
     return np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
-
-
-def resize_mask(mask: Tensor, width: int, height: int) -> Tensor:
-    """Resize a bool mask [H, W] by nearest neighbours."""
-    return interpolate(mask[None, None].float(), size=(height, width), mode="nearest-exact")[0, 0] > 0.5

@@ -98,53 +98,38 @@ def posed_picture(
     camera = Camera(frame.camera.world_from_camera, fx, fy, cx, cy, *size)
     image = Image.fromarray(to_bytes(frame.load_image().numpy())).resize(size, Image.Resampling.BICUBIC)
     for name, pose in poses.items():
-        if name in shapes:
-            _draw_outline(image, shapes[name], pose, camera)
+        if name in shapes:  # the outline of the shape's points, each as large as its grid cell
+            mask = Image.new("L", image.size)
+            painter = ImageDraw.Draw(mask)
+            for (x, y), z in zip(*_project(shapes[name].points, pose, camera), strict=True):
+                radius = 0.75 * shapes[name].spacing * camera.fx / z if z > SETTINGS.min_depth_mm else 0.0
+                if radius and -radius < x < image.width + radius and -radius < y < image.height + radius:
+                    painter.ellipse((x - radius, y - radius, x + radius, y + radius), fill=255)
+            edge = Image.fromarray(outline(np.asarray(mask) > 0).astype(np.uint8) * 255)
+            image.paste(OUTLINE_COLOR, (0, 0), edge.filter(ImageFilter.MaxFilter(3)))
         painter = ImageDraw.Draw(image)
-        if name in shafts:
-            _draw_shaft(painter, shafts[name], pose, camera)
-        _draw_frame(painter, pose, camera, length)
+        if name in shafts:  # its two contours, and its end
+            diameter, z_axis = shafts[name], np.array([0.0, 0.0, 1.0])
+            along = np.linspace(-SETTINGS.shaft_diameters, 0, 61)[:, None] * diameter * z_axis  # [61, 3]
+            centre = np.linalg.inv(pose.numpy()) @ camera.world_from_camera.double().numpy()[:, 3]  # [4] mm
+            aside = np.cross(centre[:3] - along, z_axis)
+            aside *= diameter / 2 / np.linalg.norm(aside, axis=1, keepdims=True)
+            lines = [
+                [tuple(place) for place, z in zip(places, depths, strict=True) if z > SETTINGS.min_depth_mm]
+                for places, depths in (_project(along + side * aside, pose, camera) for side in (-1, 1))
+            ]
+            for line in (*lines, [line[-1] for line in lines if line]):
+                if len(line) > 1:
+                    painter.line(line, fill=OUTLINE_COLOR, width=4)
+        pixels, depth = _project(np.concatenate([ORIGIN, length * np.eye(3)]), pose, camera)
+        if depth[0] > SETTINGS.min_depth_mm:  # its frame
+            x, y = start = tuple(pixels[0])
+            for width, colors in ((10, ("#000000",) * 3), (6, AXIS_COLORS)):
+                for end, z, color in zip(pixels[1:], depth[1:], colors, strict=True):
+                    if z > SETTINGS.min_depth_mm:
+                        painter.line([start, tuple(end)], fill=color, width=width)
+            painter.ellipse((x - 7, y - 7, x + 7, y + 7), fill="#ffffff", outline="#000000", width=2)
     return jpeg(np.asarray(image))
-
-
-def _draw_outline(image: Image.Image, shape: RoughShape, pose: Tensor, camera: Camera) -> None:
-    """Draw the outline of the shape's points, each as large as its grid cell."""
-    mask = Image.new("L", image.size)
-    painter = ImageDraw.Draw(mask)
-    for (x, y), z in zip(*_project(shape.points, pose, camera), strict=True):
-        radius = 0.75 * shape.spacing * camera.fx / z if z > SETTINGS.min_depth_mm else 0.0
-        if radius and -radius < x < image.width + radius and -radius < y < image.height + radius:
-            painter.ellipse((x - radius, y - radius, x + radius, y + radius), fill=255)
-    edge = Image.fromarray(outline(np.asarray(mask) > 0).astype(np.uint8) * 255).filter(ImageFilter.MaxFilter(3))
-    image.paste(OUTLINE_COLOR, (0, 0), edge)
-
-
-def _draw_shaft(painter: ImageDraw.ImageDraw, diameter: float, pose: Tensor, camera: Camera) -> None:
-    """Draw the two contours of a shaft and its end."""
-    along = np.linspace(-SETTINGS.shaft_diameters, 0, 61)[:, None] * diameter * np.array([0.0, 0.0, 1.0])  # [61, 3]
-    centre = np.linalg.inv(pose.numpy()) @ camera.world_from_camera.double().numpy()[:, 3]  # of the camera, [4] mm
-    aside = np.cross(centre[:3] - along, [0.0, 0.0, 1.0])
-    aside *= diameter / 2 / np.linalg.norm(aside, axis=1, keepdims=True)
-    pixels, depth = zip(*(_project(along + side * aside, pose, camera) for side in (-1, 1)), strict=True)
-    lines = [
-        [tuple(place) for place, z in zip(places, depths, strict=True) if z > SETTINGS.min_depth_mm]
-        for places, depths in zip(pixels, depth, strict=True)
-    ]
-    for line in (*lines, [line[-1] for line in lines if line]):
-        if len(line) > 1:
-            painter.line(line, fill=OUTLINE_COLOR, width=4)
-
-
-def _draw_frame(painter: ImageDraw.ImageDraw, pose: Tensor, camera: Camera, length: float) -> None:
-    pixels, depth = _project(np.concatenate([ORIGIN, length * np.eye(3)]), pose, camera)
-    if depth[0] <= SETTINGS.min_depth_mm:
-        return
-    x, y = start = tuple(pixels[0])
-    for width, colors in ((10, ("#000000",) * 3), (6, AXIS_COLORS)):
-        for end, z, color in zip(pixels[1:], depth[1:], colors, strict=True):
-            if z > SETTINGS.min_depth_mm:
-                painter.line([start, tuple(end)], fill=color, width=width)
-    painter.ellipse((x - 7, y - 7, x + 7, y + 7), fill="#ffffff", outline="#000000", width=2)
 
 
 def _project(points: np.ndarray, pose: Tensor, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

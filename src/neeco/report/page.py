@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -262,6 +261,17 @@ SPLITS = {  # meaning of the usual split names
 }
 
 
+TEMPLATES = Environment(
+    loader=PackageLoader("neeco.report"),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+TEMPLATES.globals["SPLITS"] = SPLITS
+TEMPLATES.filters["base64"] = lambda text: base64.b64encode(text.encode("utf-8")).decode("ascii")
+
+
 @dataclass(frozen=True)
 class Images:
     """Images of one method as data URIs, in one column."""
@@ -301,7 +311,7 @@ def write_page(path: Path, template: str, **data: Any) -> Path:
 
     Every page has `title` and for its header `name`, `subtitle` and `stamps`: facts shown with time and version.
     """
-    page = _templates().get_template(template)
+    page = TEMPLATES.get_template(template)
     made_at = f"{now():%Y-%m-%d %H:%M %Z}"
     write_text(path, page.render({"made_at": made_at, "version": neeco.__version__, "stamps": [], **data}) + "\n")
     return path
@@ -340,17 +350,3 @@ def _data_uri(image: Image.Image, form: str, **options: Any) -> str:
 def to_bytes(image: np.ndarray) -> np.ndarray:
     """Convert an image in [0, 1] to uint8 [H, W, 3]."""
     return to_uint8(image * 255)
-
-
-@cache
-def _templates() -> Environment:
-    templates = Environment(
-        loader=PackageLoader("neeco.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    templates.globals["SPLITS"] = SPLITS
-    templates.filters["base64"] = lambda text: base64.b64encode(text.encode("utf-8")).decode("ascii")
-    return templates

@@ -7,7 +7,6 @@ them, cameras in orbit around the tissue.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,6 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.base.files import read_bytes
 from neeco.capture.model import Instrument, InstrumentState, RecordedStates, State, evenly_spaced
 from neeco.capture.readers import read_states
 from neeco.geometry.camera import Camera
@@ -32,7 +30,7 @@ from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
 from neeco.scene import DrawableScene, GaussianScene, Recorded
 from neeco.scene.gaussian_scene import is_gaussian
-from neeco.synthesis.settings import PATH_PREFIX, RECORDED_SIZE, SAMPLERS, ImageSettings, SizeSettings, Views
+from neeco.synthesis.settings import PATH_PREFIX, RECORDED_SIZE, ImageSettings, SizeSettings, Views
 
 ZERO_SHARE = 0.05  # share of a joint's range: values beyond 0 by less are sensor noise
 JITTER_SHARE = 0.02  # share of the recorded spread: jitter off the exact line between two recorded states
@@ -416,14 +414,6 @@ def states_file(states: str) -> Path:
     if path.is_dir() or (not path.suffix and not path.exists()):
         raise NeecoError(f"--states: {states!r} is neither interpolate, extrapolate, grid, path:FILE.jsonl nor a file")
     return path
-
-
-def states_fingerprint(states: str) -> str | None:
-    """Return the sha256 of the file named by `--states`; None if it names a sampler."""
-    if states in SAMPLERS:
-        return None
-    missing = "no such file; --states takes interpolate, extrapolate, grid, path:FILE.jsonl or FILE.jsonl"
-    return hashlib.sha256(read_bytes(states_file(states), "a file of states", missing)).hexdigest()
 
 
 @torch.no_grad()

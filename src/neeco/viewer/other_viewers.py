@@ -437,7 +437,7 @@ def write_usd(scene: MovingScene, path: Path) -> None:
 
     Raises NeecoError where OpenUSD is missing or too old, or the disk refuses."""
     require_usd()
-    from pxr import Gf, Tf, Usd, UsdGeom
+    from pxr import Gf, Tf, Usd, UsdGeom, UsdSemantics, UsdVol, Vt
 
     codes = scene.times * MOVING.codes_per_second
     stage = Usd.Stage.CreateInMemory()
@@ -458,7 +458,21 @@ def write_usd(scene: MovingScene, path: Path) -> None:
             prim = UsdGeom.Xform.Define(stage, places[-1])
             prim.GetPrim().SetCustomDataByKey("neeco:instrument", node.name)
         else:
-            prim = _define_field(stage, places[-1], node.splats, node.name)
+            splats = node.splats  # in its own frame
+            prim = getattr(UsdVol, SCHEMA).Define(stage, places[-1])
+            scales = np.exp(splats.log_scales)
+            reach = MOVING.extent_sd * scales.max(1, keepdims=True)
+            extent = np.stack([(splats.means - reach).min(0), (splats.means + reach).max(0)])
+            quats = np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])  # w last
+            coefficients = np.ascontiguousarray(splats.sh.reshape(-1, 3))
+            prim.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(splats.means))
+            prim.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(quats))
+            prim.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
+            prim.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(splats.opacities))
+            prim.CreateRadianceSphericalHarmonicsDegreeAttr(splats.degree)
+            prim.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(coefficients))
+            prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
+            UsdSemantics.LabelsAPI.Apply(prim.GetPrim(), "class").CreateLabelsAttr([node.name])
         if node.poses is not None:
             operation = prim.AddTransformOp()
             matrices = [Gf.Matrix4d(*pose.T.ravel().tolist()) for pose in node.poses]  # USD multiplies rows
@@ -475,23 +489,3 @@ def write_usd(scene: MovingScene, path: Path) -> None:
             raise OSError(f"OpenUSD: {str(error).splitlines()[-1]}") from error
 
     write_atomically(path, write)
-
-
-def _define_field(stage: Any, path: str, splats: Splats, label: str) -> Any:
-    """Return a new prim with these Gaussians in its own frame, of the semantic class `label`."""
-    from pxr import UsdSemantics, UsdVol, Vt
-
-    field = getattr(UsdVol, SCHEMA).Define(stage, path)
-    scales = np.exp(splats.log_scales)
-    reach = MOVING.extent_sd * scales.max(1, keepdims=True)
-    extent = np.stack([(splats.means - reach).min(0), (splats.means + reach).max(0)])
-    field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(splats.means))
-    field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])))  # w last
-    field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
-    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(splats.opacities))
-    field.CreateRadianceSphericalHarmonicsDegreeAttr(splats.degree)
-    coefficients = np.ascontiguousarray(splats.sh.reshape(-1, 3))
-    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(coefficients))
-    field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
-    UsdSemantics.LabelsAPI.Apply(field.GetPrim(), "class").CreateLabelsAttr([label])
-    return field

@@ -33,7 +33,6 @@ from neeco.viewer.access import HOST, PORT, Access, controlled_sockets
 from neeco.viewer.panel import Panel, message_html, status_html
 from neeco.viewer.runs import LoadedRun, SavedStates, ViewedRun, score_frame
 from neeco.viewer.views import (
-    Controls,
     Overlays,
     aspect_of,
     browser_camera,
@@ -245,7 +244,15 @@ class ClientSession:
             self._shape, recorded = shape, current.recorded.cameras[self._camera_frame]
             if stands_at(browser_camera(window, unit, VIEWER.min_px), recorded, self._run.distance):
                 window.fov = fitting_view(recorded, shape)
-        controls = self._follow_recording()
+        controls, panel = self._panel.controls(self.overlays), self._panel  # of before sliders follow the recording
+        state = interpolated_state(current.recorded.states, controls.frame)
+        for instrument in panel.instruments:
+            instrument.follow(state.instruments[instrument.name])
+        frame = round(controls.frame)
+        if panel.follows.value and frame != self._followed:
+            self._jump_to(frame)
+        self._followed = frame if panel.follows.value else None
+        self.overlays.show(panel.cameras.value, panel.points.value)
         height = self._resolution.height(sharp, window.image_height, aspect_of(window))
         camera = browser_camera(window, unit, height)
         try:
@@ -302,7 +309,12 @@ class ClientSession:
         self.overlays = Overlays(self._client, cameras, points, unit, self._go_to, self._request)
         self._loaded = loaded
         self._panel: Panel = Panel(self._client, loaded, self._request, self._go_to, self._toggle_gizmo)
-        self._panel.keep.on_click(lambda _: self._save_state())
+
+        def keep() -> str:
+            count = self._saved.add(self._loaded, self._state(), self._pose())
+            return f"kept: {count} in {self._saved.states_path}"
+
+        self._panel.keep.on_click(lambda _: self._report(keep))
         self._panel.save.on_click(lambda _: self._save_image())
 
     def _go_to(self, frame: int) -> None:
@@ -313,20 +325,6 @@ class ClientSession:
         self._camera_frame = frame
         camera = self._loaded.recorded.cameras[frame]
         jump(self._client, camera, self._run.unit, self._run.distance)
-
-    def _follow_recording(self) -> Controls:
-        """Return the sliders' values, after sliders and camera have followed the recording."""
-        panel = self._panel
-        controls = panel.controls(self.overlays)
-        recorded = interpolated_state(self._loaded.recorded.states, controls.frame)
-        for instrument in panel.instruments:
-            instrument.follow(recorded.instruments[instrument.name])
-        frame = round(controls.frame)
-        if panel.follows.value and frame != self._followed:
-            self._jump_to(frame)
-        self._followed = frame if panel.follows.value else None
-        self.overlays.show(panel.cameras.value, panel.points.value)
-        return controls
 
     def _state(self) -> State:
         """Return the displayed state."""
@@ -345,10 +343,6 @@ class ClientSession:
         pose = to_numpy(self._state().instruments[name].pose)
         self.overlays.add_gizmo(name, number, pose)
         self._panel.instruments[number].straighten()
-
-    def _save_state(self) -> None:
-        saved, loaded = self._saved, self._loaded
-        self._report(lambda: f"kept: {saved.add(loaded, self._state(), self._pose())} in {saved.states_path}")
 
     def _save_image(self) -> None:
         if self._saving:  # or a page that asks a thousand times would be served long after it has gone
