@@ -34,13 +34,13 @@ def still_the_clocks() -> None:
 
     from neeco.evaluation import evaluate
     from neeco.report import page
-    from neeco.studies import training_job
+    from neeco.studies import sweep
     from neeco.training import train
 
     ticks = iter(range(10**12))
     ticking = SimpleNamespace(perf_counter=lambda: next(ticks) / 1024)  # differences are exact
     evaluate.time = ticking  # type: ignore[assignment]
-    training_job.CLOCKS.update(wall=lambda: 0.0, processor=lambda: 0.0)
+    sweep.CLOCKS.update(wall=lambda: 0.0, processor=lambda: 0.0)
     train.train.__kwdefaults__["clock"] = lambda: 0.0
     page.now = lambda: datetime(2026, 1, 1, tzinfo=UTC)
 

@@ -37,7 +37,7 @@ from torch import Tensor
 
 from neeco.capture import read_capture, write_capture
 from neeco.capture.model import Frame, InstrumentState, State
-from neeco.evaluation.mask_folders import load_reference
+from neeco.evaluation.masks import load_reference
 from neeco.geometry.camera import Camera
 from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.projection import project

@@ -14,26 +14,26 @@ from source_trees import module_paths, module_trees
 
 # lines of Python: the limit, and the aim
 ROOMS = {
-    "cli": (1786, 1700),
-    "viewer": (3097, 2100),
-    "report": (1590, 1500),
-    "studies": (2999, 2600),
+    "cli": (1785, 1700),
+    "viewer": (2855, 2100),
+    "report": (1523, 1500),
+    "studies": (2978, 2600),
     "ingest": (16_309, 10_500),
     "tracking": (1373, 1200),
-    "synthesis": (4329, 3200),
-    "evaluation": (1390, 1200),
-    "labels": (909, 800),
+    "synthesis": (4168, 3200),
+    "evaluation": (1326, 1200),
+    "labels": (892, 800),
     "methods": (5192, 3500),
     "training": (2021, 1700),
     "states": (3270, 2600),
     "evidence": (1001, 1200),
     "scene": (1956, 1800),
-    "capture": (4722, 3900),
+    "capture": (4620, 3900),
     "raster": (3990, 3800),
     "geometry": (983, 1000),
-    "base": (1580, 1500),
+    "base": (1554, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (308, 240), (3414, 3000), (284, 300)
+FILES, FUNCTIONS, NUMBERS = (285, 240), (3330, 3000), (284, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

@@ -48,7 +48,7 @@ from neeco.ingest.readers import read_table
 from neeco.ingest.readers.plus import PlusSequence
 from neeco.ingest.readers.video import open_video
 from neeco.scene.io import load_scene, save_tensors
-from neeco.synthesis.writers.folder import link
+from neeco.synthesis.writers import link
 
 HOLD = """\
 import sys, time

@@ -356,7 +356,7 @@ def track(
         tracked = neeco.track("runs/sample", "footage", "tracked", start="first")
         print(tracked.verdict, tracked.written, len(neeco.read_capture(tracked.output).frames))
     """
-    from neeco.report.track_page import write_track_page
+    from neeco.report.run_page import write_track_page
     from neeco.tracking.track import LEARN_TISSUE, track_footage
 
     output, report = Path(output), progress or _silent

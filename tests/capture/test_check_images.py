@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neeco.capture.checks.pictures import read_pictures
+from neeco.capture.checks.evidence import read_pictures
 from neeco.capture.checks.verdicts import ImageVerdicts
 from neeco.capture.documents import Node, ProblemReport
 from neeco.capture.model import Frame, State

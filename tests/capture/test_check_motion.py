@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture import check_capture
 from neeco.capture.checks import read_checked
-from neeco.capture.checks.evidence import Candidate
-from neeco.capture.checks.pictures import read_pictures
+from neeco.capture.checks.evidence import Candidate, read_pictures
 from neeco.capture.checks.verdicts import ImageVerdicts, instrument_candidates, likeliest
 from neeco.capture.documents import ProblemReport
 from neeco.capture.kinematics import KinematicTree, Link

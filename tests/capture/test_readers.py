@@ -33,7 +33,7 @@ from neeco.capture.model import (
 )
 from neeco.capture.points import points_in_view, read_ply
 from neeco.capture.writer import fingerprint
-from neeco.evaluation.mask_folders import load_reference
+from neeco.evaluation.masks import load_reference
 from neeco.geometry.lens import Lens
 from neeco.raster import Camera
 

@@ -6,9 +6,9 @@ import io
 
 from rich.console import Console
 
-from neeco.capture.checks.truth import USUAL_NAMES
+from neeco.capture.checks.frames import USUAL_NAMES
 from neeco.cli.evaluate import evaluation_table
-from neeco.evaluation.mask_metrics import part_scores
+from neeco.evaluation.masks import part_scores
 from neeco.report.run_page import SCORES
 
 

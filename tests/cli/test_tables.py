@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from neeco.cli._output import fitted
-from neeco.studies.tables import Cell, Column, ResultTable, Row
+from neeco.studies.configurations import Cell, Column, ResultTable, Row
 
 
 @pytest.mark.parametrize("width", [22, 60])

@@ -2,7 +2,7 @@
 
 import torch
 
-from neeco.evaluation.coverage import observed_depths, unobserved_tissue
+from neeco.evaluation.evaluate import observed_depths, unobserved_tissue
 
 
 def test_tissue_outside_every_training_view_is_unseen_and_the_rest_is_not(world, tmp_path):

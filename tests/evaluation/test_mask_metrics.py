@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from neeco.base.errors import NeecoError
-from neeco.capture.checks.truth import USUAL_NAMES
-from neeco.evaluation.mask_folders import truth_file
-from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, pairs_of, truth_table
+from neeco.capture.checks.frames import USUAL_NAMES
+from neeco.evaluation.masks import PartTally, dice, iou, mean_of, pairs_of, truth_file, truth_table
 from neeco.labels.labellers import composited_labels
 from neeco.raster.types import Rendering
 

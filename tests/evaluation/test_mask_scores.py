@@ -12,9 +12,7 @@ from PIL import Image
 
 from neeco import cli
 from neeco.base.errors import NeecoError
-from neeco.evaluation.mask_folders import parse_classes, read_ids
-from neeco.evaluation.mask_metrics import boundary_f, boundary_pixels
-from neeco.evaluation.mask_scores import score_masks
+from neeco.evaluation.masks import boundary_f, boundary_pixels, parse_classes, read_ids, score_masks
 
 TINY_MASKS = arrays(bool, st.tuples(st.integers(2, 9), st.integers(2, 9)))
 

@@ -17,9 +17,8 @@ from viewer_world import grasper_scene, write_recorded_images, write_run
 from neeco.base.errors import NeecoError
 from neeco.cli import main
 from neeco.scene.gaussian_scene import GaussianScene
-from neeco.viewer.controls import Controls
 from neeco.viewer.runs import ViewedRun, score_frame
-from neeco.viewer.views import IMAGE, render_run, views_of
+from neeco.viewer.views import IMAGE, Controls, render_run, views_of
 
 slowly = pytest.mark.parametrize("word", SLOW_ON_CPU, indirect=True)
 Call = Callable[..., None]

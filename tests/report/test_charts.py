@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neeco.report.charts import Series, legend, line_chart
+from neeco.report.page import Series, legend, line_chart
 
 
 def test_charts_tell_methods_apart_without_colour():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
-from neeco.report.charts import Series, line_chart
-from neeco.report.downstream_page import picture, score_chart, write_downstream_report
+from neeco.report.page import Series, line_chart
+from neeco.report.study_pages import picture, score_chart, write_downstream_report
 from neeco.studies.downstream import DownstreamRequest
 from neeco.studies.downstream.experiment import DownstreamPlan, held_out_samples, write_predictions
 from neeco.studies.downstream.results import Detections, box_iou, findings, rows_of, summarise

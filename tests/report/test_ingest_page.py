@@ -31,7 +31,7 @@ from neeco.ingest.result import LIMITS, IngestResult, assess_ingest
 from neeco.ingest.timing.clock_search import ClockOffset
 from neeco.ingest.timing.episodes import Contradiction
 from neeco.report import ingest_page
-from neeco.report.ingest_figures import degrees_of_freedom, in_view, posed_picture, round_length, unvisited
+from neeco.report.ingest_page import degrees_of_freedom, in_view, posed_picture, round_length, unvisited
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
 VOID = {"meta", "img", "br", "path", "rect"}

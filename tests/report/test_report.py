@@ -9,7 +9,7 @@ import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.evaluation.evaluate import evaluate_run
-from neeco.report.charts import Series, line_chart
+from neeco.report.page import Series, line_chart
 from neeco.report.run_page import chosen_rows, curve, read_metrics, write_report
 
 VOID = {"meta", "img", "br", "link"}

@@ -12,11 +12,10 @@ import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.capture import write_capture
-from neeco.report import sweep_page
-from neeco.report.sweep_page import write_sweep_report
-from neeco.studies.configurations import Configuration, Study, SweepRequest, Table, TableRow
+from neeco.report import study_pages
+from neeco.report.study_pages import write_sweep_report
+from neeco.studies.configurations import Configuration, Study, SweepRequest, Table, TableRow, csv_text
 from neeco.studies.sweep import COLUMNS, SweepPlan, plan_sweep
-from neeco.studies.tables import csv_text
 
 VOID = {"meta", "img", "br", "path", "circle", "link"}
 REASON = "config.yaml: <field>: wrong"
@@ -30,7 +29,7 @@ def plan(world, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SweepPlan:
     def open_run(folder):
         return nullcontext(world.TinyRun(folder, scenes.get(folder.name.split("-seed")[0], scenes["3dgs"]), None))
 
-    monkeypatch.setattr(sweep_page, "open_run", open_run)
+    monkeypatch.setattr(study_pages, "open_run", open_run)
     capture = tmp_path / "capture <b>"
     write_capture(world.make_capture(capture, world.TinyScene(), ("train",) * 4 + ("test", "test", "unseen")), capture)
     configurations = {name: Configuration(method="3dgs") for name in ("kinematic", "3dgs", "lost")}

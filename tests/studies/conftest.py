@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from neeco.studies.training_job import TrainingJob
+from neeco.studies.sweep import TrainingJob
 from neeco.training.config import training_config
 
 

@@ -29,7 +29,7 @@ from neeco.capture import read_capture
 from neeco.scene.training_session import UNLIMITED
 from neeco.studies import study
 from neeco.studies.study import JobEvent, check_workers, run_jobs, threads_per_worker
-from neeco.studies.training_job import Curve, phase_1_psnr, psnr_at
+from neeco.studies.sweep import Curve, phase_1_psnr, psnr_at
 from neeco.training import train as train_module
 from neeco.training.run import checkpoint_path, write_config
 

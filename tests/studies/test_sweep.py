@@ -20,9 +20,17 @@ from neeco.base.settings import plain
 from neeco.cli import main
 from neeco.raster.devices import fast_bfloat16
 from neeco.scene.method_registry import method_settings
-from neeco.studies.configurations import Configuration, Study, SweepRequest, Table, TableRow, ablations, read_study
+from neeco.studies.configurations import (
+    Configuration,
+    ResultTable,
+    Study,
+    SweepRequest,
+    Table,
+    TableRow,
+    ablations,
+    read_study,
+)
 from neeco.studies.sweep import direction, plan_sweep, run_sweep, tables_of
-from neeco.studies.tables import ResultTable
 
 TWO = """\
 title: Two ways

@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from neeco.cli._output import fitted
+from neeco.studies.configurations import Column, ResultTable, csv_text, summary_table
 from neeco.studies.study import spread
-from neeco.studies.tables import Column, ResultTable, csv_text, summary_table
 
 COLUMNS = (
     Column("psnr", "PSNR", 2, "high"),

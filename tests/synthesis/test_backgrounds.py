@@ -20,9 +20,9 @@ from neeco.base.errors import NeecoError
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene import GaussianScene
-from neeco.synthesis.backgrounds import Appearance, ImageFolder, Layers, split
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import SampleGenerator
+from neeco.synthesis.other_tissue import Appearance, ImageFolder, Layers, split
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.torch_datasets import LabelledImages
 

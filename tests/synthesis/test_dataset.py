@@ -21,9 +21,8 @@ from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import SampleGenerator, draw_encoded
 from neeco.synthesis.rendered_views import render, split_views, state_views
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.writers import WrittenImages
+from neeco.synthesis.writers import WrittenImages, load_record
 from neeco.synthesis.writers.coco import Coco, run_lengths
-from neeco.synthesis.writers.folder import load_record
 
 COUNT = 6
 SETTINGS = Settings(count=COUNT, seed=3, tissue_tolerance_mm=2.0)

@@ -21,7 +21,6 @@ from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene import GaussianScene
 from neeco.synthesis import camera_effects
-from neeco.synthesis.backgrounds import Appearance
 from neeco.synthesis.camera_effects import (
     EFFECTS,
     CameraEffects,
@@ -38,6 +37,7 @@ from neeco.synthesis.camera_effects import (
 )
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import SampleGenerator
+from neeco.synthesis.other_tissue import Appearance
 from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.settings import Settings
 

@@ -14,14 +14,19 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.capture.readers import read_states
 from neeco.capture.writer import state_to_json
 from neeco.geometry.rotations import rigid
-from neeco.synthesis.samplers import SAMPLING, OrbitViews, PerturbedViews, RecordedViews, make_sampler, shafts_of
-from neeco.synthesis.states import (
+from neeco.synthesis.samplers import (
+    SAMPLING,
     ExtrapolatedStates,
     GridStates,
     InterpolatedStates,
     JointRange,
+    OrbitViews,
     PathStates,
+    PerturbedViews,
+    RecordedViews,
     interpolate_pose,
+    make_sampler,
+    shafts_of,
     turn_about,
     with_poses,
 )

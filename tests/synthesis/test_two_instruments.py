@@ -12,7 +12,7 @@ from neeco.labels.labellers import CompositedLabels, ThresholdLabels
 from neeco.labels.settings import LABELS
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.deformation import UNPERTURBED, Deformation, Posed
-from neeco.synthesis.states import InterpolatedStates
+from neeco.synthesis.samplers import InterpolatedStates
 
 WALL, BAR = 300, 40
 

@@ -20,7 +20,7 @@ from neeco.capture.images import write_image
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Capture, State
 from neeco.evaluation.trust import TypicalErrors
-from neeco.report.track_page import write_track_page
+from neeco.report.run_page import write_track_page
 from neeco.states.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer, color_matched, view_of
 from neeco.states.fitter import loose_prior
 from neeco.states.parameters import DEG

@@ -13,10 +13,9 @@ from viewer_world import grasper_scene, write_recorded_images, write_run
 
 from neeco.base.errors import NeecoError
 from neeco.viewer.access import Access, is_loopback
-from neeco.viewer.controls import Controls
 from neeco.viewer.panel import message_html, status_html
 from neeco.viewer.runs import ViewedRun
-from neeco.viewer.views import Picture
+from neeco.viewer.views import Controls, Picture
 
 pytest.importorskip("viser")
 from websockets.datastructures import Headers

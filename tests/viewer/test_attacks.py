@@ -20,8 +20,7 @@ from safetensors.torch import save_file
 
 from neeco.base.errors import NeecoError
 from neeco.viewer.access import MAX_MESSAGE
-from neeco.viewer.server import ViewerServer
-from neeco.viewer.session import RenderThread
+from neeco.viewer.server import RenderThread, ViewerServer
 
 viser = pytest.importorskip("viser")
 import msgspec  # noqa: E402

@@ -24,11 +24,22 @@ from neeco.geometry.camera import Camera
 from neeco.labels.drawing import to_numpy
 from neeco.scene.io import save_scene
 from neeco.synthesis.samplers import shafts_of
-from neeco.viewer.controls import Controls, InstrumentControls, controlled_state
 from neeco.viewer.runs import ViewedRun
 from neeco.viewer.server import ViewerServer
-from neeco.viewer.views import DEPTH, DIFFERENCE, IMAGE, OVERLAY, PARTS, UNOBSERVED, picture, views_of
-from neeco.viewer.viser_scene import fitting_view
+from neeco.viewer.views import (
+    DEPTH,
+    DIFFERENCE,
+    IMAGE,
+    OVERLAY,
+    PARTS,
+    UNOBSERVED,
+    Controls,
+    InstrumentControls,
+    controlled_state,
+    fitting_view,
+    picture,
+    views_of,
+)
 
 pytestmark = pytest.mark.browser
 pytest.importorskip("viser")

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from viewer_world import LIMITS, grasper_scene
 
 from neeco.capture.model import Instrument, InstrumentState, State
-from neeco.synthesis.samplers import shafts_of
-from neeco.synthesis.states import Shaft
-from neeco.viewer.controls import Controls, InstrumentControls, controlled_state, interpolated_state, slider_ranges
+from neeco.synthesis.samplers import Shaft, shafts_of
+from neeco.viewer.views import Controls, InstrumentControls, controlled_state, interpolated_state, slider_ranges
 
 NAME = "grasper"
 TILTED = Shaft(np.array([1.0, 2.0, 3.0]), np.array([0.6, 0.0, 0.8]), True)

@@ -24,8 +24,8 @@ from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussian
 from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.synthesis.samplers import shafts_of
-from neeco.viewer.controls import Controls, InstrumentControls, controlled_state
 from neeco.viewer.export import pack, page_of
+from neeco.viewer.views import Controls, InstrumentControls, controlled_state
 
 pytestmark = pytest.mark.browser
 

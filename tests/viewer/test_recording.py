@@ -23,7 +23,7 @@ from neeco.labels.drawing import to_numpy
 
 pytest.importorskip("viser")
 from neeco.viewer.recording import RecordingServer, image_behind
-from neeco.viewer.viser_scene import fitting_view
+from neeco.viewer.views import fitting_view
 
 
 @pytest.fixture(scope="module")

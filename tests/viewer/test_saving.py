@@ -19,10 +19,9 @@ from neeco.base.errors import NeecoError
 from neeco.labels.drawing import draw
 from neeco.synthesis.samplers import make_sampler, moved_camera
 from neeco.synthesis.settings import SizeSettings
-from neeco.synthesis.writers.folder import LABELS, load_record
-from neeco.viewer.controls import Controls, InstrumentControls, controlled_state
-from neeco.viewer.runs import LoadedRun, ViewedRun
-from neeco.viewer.saving import SavedStates
+from neeco.synthesis.writers import LABELS, load_record
+from neeco.viewer.runs import LoadedRun, SavedStates, ViewedRun
+from neeco.viewer.views import Controls, InstrumentControls, controlled_state
 
 
 @pytest.fixture

@@ -16,11 +16,9 @@ from urllib.request import url2pathname
 
 import pytest
 
-from neeco.base.errors import NeecoError
+from neeco.base.errors import NeecoError, install_hint
 from neeco.cli import main
-from neeco.viewer import server
-from neeco.viewer.server import ViewerServer
-from neeco.viewer.session import VIEWER, AdaptiveResolution, RenderThread
+from neeco.viewer.server import VIEWER, AdaptiveResolution, RenderThread, ViewerServer
 
 viser = pytest.importorskip("viser")
 from viser import _messages as messages  # noqa: E402
@@ -107,7 +105,7 @@ def test_a_server_that_the_guard_does_not_see_is_not_left_running(made_run, monk
 def test_without_viser_it_says_what_to_install(made_run: Path, uninstalled, capsys) -> None:
     uninstalled("viser")
     assert main(["view", str(made_run), "--no-browser"]) == 1
-    assert capsys.readouterr().err == f"neeco: error: {server.MISSING}\n"
+    assert capsys.readouterr().err == f"neeco: error: view: needs viser 1.1; {install_hint('view')}\n"
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import errno
 import os
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 # what libraries without a MemoryError of their own say: PyTorch, safetensors, OpenCV, the dynamic linker, threads
 MEMORY_MESSAGES = re.compile(
@@ -90,7 +90,14 @@ def memory_failure(error: BaseException) -> str | None:
         return None
     asked = re.search(r"allocate (\d+(?:\.\d+)?)\.? (\w+)", str(cause))
     numbers = [f"{_size(asked[1], asked[2])} more were asked for"] if asked else []
-    numbers += [f"this process may use {_size(str(limit), 'bytes')}"] if (limit := _memory_limit()) else []
+    with suppress(ImportError):  # Windows
+        import resource
+
+        # the limit set for this process, else the machine's memory
+        limits = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA)]
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        least = min([memory, *(limit for limit in limits if limit != resource.RLIM_INFINITY)])
+        numbers.append(f"this process may use {_size(str(least), 'bytes')}")
     details = f" ({', '.join(numbers)})" if numbers else ""
     return (
         f"{TOO_LITTLE}{details}: close other programs or raise the limit (ulimit -v), take smaller images "
@@ -102,17 +109,6 @@ def _is_memory_failure(error: BaseException) -> bool:
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
     return not isinstance(error, NeecoError) and bool(MEMORY_MESSAGES.search(str(error)))
-
-
-def _memory_limit() -> int | None:
-    """Return the bytes that this process may use: the limit set for it, else the machine's memory; None: unknown."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    limits = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA)]
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return min([memory, *(limit for limit in limits if limit != resource.RLIM_INFINITY)])
 
 
 def _size(number: str, unit: str) -> str:

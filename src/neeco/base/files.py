@@ -55,8 +55,8 @@ def require_replaceable(path: Path) -> None:
             raise NeecoError(f"{path}: is {kind}, not a file, and is not replaced; give another path, or remove it")
 
 
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write(temporary_path)` produce a file next to `path`, sync it to disk and rename it to `path`.
+def write_atomically(path: Path, write: Callable[[Path], object], *, synced: bool = True) -> None:
+    """Let `write(temporary_path)` produce a file next to `path`, sync it to disk (if `synced`) and rename it to `path`.
 
     The user's umask decides who may read and write it. On any failure the temporary file is removed, and `path` holds
     what it did, or all of the new content. Raises NeecoError naming `path` when the disk refuses.
@@ -74,10 +74,12 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     try:
         write(temporary)
         temporary.chmod(mode)  # some libraries replace the file
-        with open(temporary, "rb") as stream:
-            os.fsync(stream.fileno())
+        if synced:
+            with open(temporary, "rb") as stream:
+                os.fsync(stream.fileno())
         os.replace(temporary, path)
-        _sync_folder(path.parent)
+        if synced:
+            _sync_folder(path.parent)
     except OSError as error:
         raise cannot_write(path, error) from error
     finally:
@@ -93,27 +95,7 @@ def write_unsynced(path: Path, content: bytes) -> None:
     For the many files of a folder that counts as complete only after `sync_disk`: a killed process leaves each complete
     or absent, a power failure may leave some empty. Raises NeecoError naming `path` when the disk refuses.
     """
-    require_replaceable(path)
-    try:
-        try:
-            temporary, handle = begin_file(path)
-        except FileNotFoundError:
-            _make_folders(path.parent)
-            temporary, handle = begin_file(path)
-        try:
-            with os.fdopen(handle, "wb") as stream:
-                stream.write(content)
-                if LOCKING:  # while its lock is held
-                    stream.flush()
-                    os.replace(temporary, path)
-            if not LOCKING:
-                os.replace(temporary, path)
-        except BaseException:
-            with contextlib.suppress(FileNotFoundError):
-                temporary.unlink()
-            raise
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    write_atomically(path, lambda temporary: temporary.write_bytes(content), synced=False)
 
 
 def sync_disk() -> None:

@@ -160,20 +160,22 @@ class Processes:
         self._idle: list[_Worker] = []
         self.running: dict[Any, tuple[_Worker, int]] = {}  # by connection: who does which task
 
-    def start_worker(self) -> _Worker:
-        """Return another worker, started."""
-        context = multiprocessing.get_context("spawn")  # a forked one would share threads' locks
-        parent_end, child_end = context.Pipe()
-        slot = self._slots.pop(0)
-        gpu = _visible_gpu(slot % (self._workers.shared_gpus or self.capacity)) if self._workers.gpu else None
-        process = context.Process(target=_serve, args=(*self._arguments, child_end, gpu), daemon=True)
-        process.start()
-        child_end.close()
-        return _Worker(process, parent_end, slot)
-
     def submit(self, index: int, task: Any) -> None:
         """Give the task to an idle worker or a new one."""
-        worker = self._idle.pop() if self._idle else self.start_worker()
+        if self._idle:
+            worker = self._idle.pop()
+        else:
+            context = multiprocessing.get_context("spawn")  # a forked one would share threads' locks
+            parent_end, child_end = context.Pipe()
+            slot, gpu = self._slots.pop(0), None
+            if self._workers.gpu:  # what CUDA_VISIBLE_DEVICES is to be
+                number = slot % (self._workers.shared_gpus or self.capacity)
+                visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+                gpu = visible[number] if visible else str(number)
+            process = context.Process(target=_serve, args=(*self._arguments, child_end, gpu), daemon=True)
+            process.start()
+            child_end.close()
+            worker = _Worker(process, parent_end, slot)
         self.running[worker.connection] = worker, index
         with contextlib.suppress(OSError):  # it died: `finished` notices
             worker.connection.send(task)
@@ -214,12 +216,6 @@ class Processes:
         worker.connection.close()
         worker.process.join()
         self._slots.append(worker.slot)
-
-
-def _visible_gpu(slot: int) -> str:
-    """Return what CUDA_VISIBLE_DEVICES is to be for the worker with this number."""
-    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
-    return visible[slot] if visible else str(slot)
 
 
 def _serve(function: TaskFunction, shared: Any, threads: int, connection: Connection, gpu: str | None) -> None:

@@ -114,14 +114,16 @@ def has_alpha(path: Path) -> bool:
 def write_image(path: Path, image: Tensor, quality: int | None = None) -> None:
     """Write an image [H, W, 3] in [0, 1] (clipped, rounded to 8 bits), atomically: as JPEG of `quality`, 1 to 100, or
     where that is None as PNG. Raises NeecoError."""
-    _write(path, encoded_image(image, quality))
+    content = encoded_image(image, quality)
+    write_atomically(Path(path), lambda temporary: temporary.write_bytes(content))
 
 
 def write_labels(path: Path, labels: Tensor) -> None:
     """Write part ids (or a 0/255 mask), uint8 [H, W], as grey PNG, atomically. Raises NeecoError."""
     if labels.dtype != torch.uint8 or labels.ndim != 2:
         raise ValueError(f"labels must be uint8 [H, W], got {labels.dtype} {tuple(labels.shape)}")
-    _write(path, encoded_png(labels.detach().cpu().numpy()))
+    content = encoded_png(labels.detach().cpu().numpy())
+    write_atomically(Path(path), lambda temporary: temporary.write_bytes(content))
 
 
 def encoded_image(image: Tensor, quality: int | None = None) -> bytes:
@@ -175,10 +177,6 @@ def is_repeated(before: np.ndarray, picture: np.ndarray) -> bool:
         return False
     change = cv2.absdiff(before, picture)
     return bool(change.mean() < PIXELS.repeated_mean and change.max() < PIXELS.repeated_max)
-
-
-def _write(path: Path, content: bytes) -> None:
-    write_atomically(Path(path), lambda temporary: temporary.write_bytes(content))
 
 
 @contextmanager

@@ -67,7 +67,34 @@ class KinematicTree:
     pose_of: str | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "links", _parents_first(self.links))
+        links = self.links
+        names = [link.name for link in links]
+        if not links:
+            raise NeecoError("there are no links; give at least the root")
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise NeecoError(f"{twice[0]!r} is defined twice; give every link a unique name")
+        roots = [link for link in links if link.parent is None]
+        if len(roots) != 1:
+            root_names = ", ".join(repr(link.name) for link in roots) or "none"
+            raise NeecoError(f"one link has no parent, the root; found {root_names}")
+        for link in links:
+            if link.parent is not None and link.parent not in names:
+                raise NeecoError(
+                    f"{link.name!r}: its parent {link.parent!r} is no link; name one of {', '.join(names)}"
+                )
+            if link.type == FIXED and link.value:
+                raise NeecoError(f"{link.name!r}: readings drive a fixed joint; make it revolute or prismatic")
+            if link.parent is None and link.type != FIXED:
+                raise NeecoError(f"{link.name!r}: the root has no parent to move against; leave its type out")
+            if (fault := rigid_fault(link.origin)) is not None:
+                raise NeecoError(f"{link.name!r}: origin: {fault[0]}; {fault[1]}")
+        ordered = list(roots)
+        for link in ordered:  # grows as it is gone through
+            ordered += [child for child in links if child.parent == link.name]
+        if len(ordered) < len(links):
+            circle = sorted(set(names) - {link.name for link in ordered})
+            raise NeecoError(f"the links form a cycle: {', '.join(map(repr, circle))}; connect every link to the root")
+        object.__setattr__(self, "links", tuple(ordered))  # the root first
         if self.pose_of is not None and self.pose_of not in self._index:
             raise NeecoError(f"pose_of: there is no link {self.pose_of!r}; name one of {', '.join(self._index)}")
 
@@ -157,45 +184,14 @@ class KinematicTree:
 
     def to_json(self) -> dict[str, Any]:
         """The `kinematics` block that `neeco.capture.readers.kinematics` reads."""
-        written: dict[str, Any] = {"links": [_link_to_json(link) for link in self.links]}
-        return written if self.pose_of is None else {"pose_of": self.pose_of} | written
-
-
-def _link_to_json(link: Link) -> dict[str, Any]:
-    shifted_only = np.array_equal(link.origin[:3, :3], np.eye(3))
-    written: dict[str, Any] = {"name": link.name}
-    written |= {} if link.parent is None else {"parent": link.parent}
-    written |= {"type": link.type, "origin": (link.origin[:3, 3] if shifted_only else link.origin).tolist()}
-    if link.type != FIXED:
-        written |= {"axis": link.axis.tolist(), "value": dict(link.value), "offset": link.offset}
-    written |= {} if link.limits is None else {"limits": list(link.limits)}
-    return written if link.body else written | {"body": False}
-
-
-def _parents_first(links: tuple[Link, ...]) -> tuple[Link, ...]:
-    """The links of a tree, its root first. Raises NeecoError where they are none."""
-    names = [link.name for link in links]
-    if not links:
-        raise NeecoError("there are no links; give at least the root")
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise NeecoError(f"{twice[0]!r} is defined twice; give every link a unique name")
-    roots = [link for link in links if link.parent is None]
-    if len(roots) != 1:
-        root_names = ", ".join(repr(link.name) for link in roots) or "none"
-        raise NeecoError(f"one link has no parent, the root; found {root_names}")
-    for link in links:
-        if link.parent is not None and link.parent not in names:
-            raise NeecoError(f"{link.name!r}: its parent {link.parent!r} is no link; name one of {', '.join(names)}")
-        if link.type == FIXED and link.value:
-            raise NeecoError(f"{link.name!r}: readings drive a fixed joint; make it revolute or prismatic")
-        if link.parent is None and link.type != FIXED:
-            raise NeecoError(f"{link.name!r}: the root has no parent to move against; leave its type out")
-        if (fault := rigid_fault(link.origin)) is not None:
-            raise NeecoError(f"{link.name!r}: origin: {fault[0]}; {fault[1]}")
-    ordered = list(roots)
-    for link in ordered:  # grows as it is gone through
-        ordered += [child for child in links if child.parent == link.name]
-    if len(ordered) < len(links):
-        circle = sorted(set(names) - {link.name for link in ordered})
-        raise NeecoError(f"the links form a cycle: {', '.join(map(repr, circle))}; connect every link to the root")
-    return tuple(ordered)
+        written: dict[str, Any] = {} if self.pose_of is None else {"pose_of": self.pose_of}
+        written["links"] = links = []
+        for link in self.links:
+            shifted_only = np.array_equal(link.origin[:3, :3], np.eye(3))
+            entry: dict[str, Any] = {"name": link.name} | ({} if link.parent is None else {"parent": link.parent})
+            entry |= {"type": link.type, "origin": (link.origin[:3, 3] if shifted_only else link.origin).tolist()}
+            if link.type != FIXED:
+                entry |= {"axis": link.axis.tolist(), "value": dict(link.value), "offset": link.offset}
+            entry |= {} if link.limits is None else {"limits": list(link.limits)}
+            links.append(entry if link.body else entry | {"body": False})
+        return written

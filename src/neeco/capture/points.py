@@ -65,8 +65,25 @@ def read_ply(path: Path) -> PointCloud:
     Positions may hold NaN. Raises NeecoError when the file is missing, damaged or has no usable vertices.
     """
     path = Path(path)
-    content = read_bytes(path, "a point cloud as PLY")
-    vertices = _vertices(path, content)
+    encoding, count, properties, body = _parse_header(path, read_bytes(path, "a point cloud as PLY"))
+    short = NeecoError(f"{path}: holds fewer than the {count} vertices its header promises; it is truncated")
+    if encoding == "ascii":
+        # every value needs a digit and a separator, so this bounds what a wrong header can make us allocate
+        words = body.split() if count * len(properties) <= len(body) else []
+        if len(words) < count * len(properties):
+            raise short
+        try:
+            table = np.array(words[: count * len(properties)], dtype=np.float64).reshape(count, len(properties))
+        except ValueError:
+            raise NeecoError(f"{path}: a vertex value is not a number; repair the file") from None
+        with np.errstate(all="ignore"):
+            vertices = {name: table[:, column].astype(kind) for column, (name, kind) in enumerate(properties)}
+    else:
+        dtype = np.dtype([(name, _ORDERS[encoding] + kind) for name, kind in properties])
+        if len(body) < count * dtype.itemsize:
+            raise short
+        rows = np.frombuffer(body, dtype=dtype, count=count)
+        vertices = {name: rows[name] for name, _ in properties}
     if not {"x", "y", "z"} <= vertices.keys():
         raise NeecoError(f"{path}: vertex: has no x, y, z; write a point cloud with positions")
     positions = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
@@ -142,25 +159,3 @@ def _parse_header(path: Path, content: bytes) -> tuple[str, int, list[tuple[str,
     if len({name for name, _ in properties}) != len(properties):
         raise NeecoError(f"{path}: two vertex properties have one name; write each once")
     return encoding, count, properties, content[line_end + 1 :]
-
-
-def _vertices(path: Path, content: bytes) -> dict[str, np.ndarray]:
-    """Each vertex property as an array [count]."""
-    encoding, count, properties, body = _parse_header(path, content)
-    short = NeecoError(f"{path}: holds fewer than the {count} vertices its header promises; it is truncated")
-    if encoding == "ascii":
-        # every value needs a digit and a separator, so this bounds what a wrong header can make us allocate
-        words = body.split() if count * len(properties) <= len(body) else []
-        if len(words) < count * len(properties):
-            raise short
-        try:
-            table = np.array(words[: count * len(properties)], dtype=np.float64).reshape(count, len(properties))
-        except ValueError:
-            raise NeecoError(f"{path}: a vertex value is not a number; repair the file") from None
-        with np.errstate(all="ignore"):
-            return {name: table[:, column].astype(kind) for column, (name, kind) in enumerate(properties)}
-    dtype = np.dtype([(name, _ORDERS[encoding] + kind) for name, kind in properties])
-    if len(body) < count * dtype.itemsize:
-        raise short
-    vertices = np.frombuffer(body, dtype=dtype, count=count)
-    return {name: vertices[name] for name, _ in properties}

@@ -59,7 +59,20 @@ def write_capture(
     header["instrument_frame"] = "world" if capture.registered else "unregistered"
     if capture.still:
         header["camera_motion"] = "still"
-    header["instruments"] = [_instrument_to_json(instrument) for instrument in capture.instruments]
+    header["instruments"] = instruments = []
+    for item in capture.instruments:
+        joints: dict[str, dict[str, Any]] = {
+            joint: {} if limits is None else {"limits": list(limits)} for joint, limits in item.joints.items()
+        }
+        for joint in item.unrecorded:
+            joints[joint]["recorded"] = False
+        entry: dict[str, Any] = {"name": item.name, "joints": joints}
+        if item.kinematics is not None:
+            entry["kinematics"] = item.kinematics.to_json()
+        for name in ("from_video", "base_uncertainty"):
+            if (stated := getattr(item, name)) is not None:
+                entry[name] = asdict(stated)
+        instruments.append(entry)
     if capture.lens is not None:
         header["lens"] = capture.lens.to_json()
     pixels = [None] * len(names) if images is None else images
@@ -93,9 +106,8 @@ def fingerprint(capture: Capture) -> str:
             for name, state in frame.state.instruments.items()
             if state.uncertainty is not None
         }
-        description |= (
-            {"uncertainty": uncertainties} if uncertainties else {}
-        )  # captures without keep their older fingerprint
+        if uncertainties:  # captures without keep their older fingerprint
+            description["uncertainty"] = uncertainties
         digest.update(json.dumps(description).encode())
         for path in (frame.image_path, frame.mask_path):
             digest.update(b"-" if path is None else hashlib.sha256(read_bytes(path, "an image")).digest())
@@ -104,10 +116,9 @@ def fingerprint(capture: Capture) -> str:
     for item in capture.instruments:
         if item.kinematics is not None:  # captures without keep the fingerprint that older versions noted
             digest.update(json.dumps([item.kinematics.to_json(), item.unrecorded]).encode())
-        if item.from_video is not None:
-            digest.update(json.dumps(asdict(item.from_video)).encode())
-        if item.base_uncertainty is not None:
-            digest.update(json.dumps(asdict(item.base_uncertainty)).encode())
+        for stated in (item.from_video, item.base_uncertainty):
+            if stated is not None:
+                digest.update(json.dumps(asdict(stated)).encode())
     if capture.lens is not None:
         digest.update(json.dumps(capture.lens.to_json()).encode())
     if capture.still:
@@ -143,22 +154,6 @@ def uncertainty_to_json(uncertainty: Uncertainty) -> dict[str, Any]:
     return written | ({"joints_deg": joints} if joints else {})
 
 
-def _instrument_to_json(instrument: Instrument) -> dict[str, Any]:
-    joints: dict[str, dict[str, Any]] = {
-        joint: {} if limits is None else {"limits": list(limits)} for joint, limits in instrument.joints.items()
-    }
-    for joint in instrument.unrecorded:
-        joints[joint]["recorded"] = False
-    written: dict[str, Any] = {"name": instrument.name, "joints": joints}
-    if instrument.kinematics is not None:
-        written["kinematics"] = instrument.kinematics.to_json()
-    if instrument.from_video is not None:
-        written["from_video"] = asdict(instrument.from_video)
-    if instrument.base_uncertainty is not None:
-        written["base_uncertainty"] = asdict(instrument.base_uncertainty)
-    return written
-
-
 def _names(capture: Capture) -> list[str]:
     """Each frame's file stem: its own, with its split and folder before it where two images share one."""
     stems = Counter(frame.name for frame in capture.frames)
@@ -192,15 +187,12 @@ def _write_frame(
         | ({} if state.uncertainty is None else {"uncertainty": uncertainty_to_json(state.uncertainty)})
         for instrument, state in frame.state.instruments.items()
     ]
+    intrinsics = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    intrinsics |= {"w": camera.width, "h": camera.height}
     entry: dict[str, Any] = {
         "file_path": _write_image(frame, name, path, image),
         "transform_matrix": swap_camera_axes(world_from_camera).tolist(),
-        "fl_x": _number(camera.fx),
-        "fl_y": _number(camera.fy),
-        "cx": _number(camera.cx),
-        "cy": _number(camera.cy),
-        "w": _number(camera.width),
-        "h": _number(camera.height),
+        **{name: _number(value) for name, value in intrinsics.items()},
         "time": _number(frame.state.time),
         "split": frame.split,
     }

@@ -25,7 +25,7 @@ from neeco.base.files import finite, new_folder, require_replaceable, write_json
 from neeco.base.settings import described, field_texts, value_words
 
 if TYPE_CHECKING:
-    from neeco.studies.tables import ResultTable
+    from neeco.studies.configurations import ResultTable
 
 STANDARD_OUTPUT = Path("-")  # value of --json
 FILE_WIDTH = 1000  # maximum width of lines in files and pipes

@@ -39,7 +39,7 @@ def run(arguments: Arguments) -> int:
         problems, summary = checked.problems, checked.summary
         errors = len(errors_only(problems))
         report = {"capture": str(arguments.capture), "errors": errors, "warnings": len(problems) - errors}
-        report |= {"problems": [asdict(problem) for problem in problems], "summary": summary.as_json()}
+        report |= {"problems": [asdict(problem) for problem in problems], "summary": asdict(summary)}
         if not write_numbers(arguments.json, report):
             _print(problems, errors, summary)
     return 1 if errors else 0

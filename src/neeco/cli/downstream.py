@@ -9,7 +9,7 @@ from neeco.studies.downstream import DownstreamRequest
 def run(args: DownstreamRequest) -> int:
     """Train and test with progress bars; print tables, findings and file paths; return 1 if a training failed."""
     from neeco.cli._progress import Bars
-    from neeco.report.downstream_page import write_downstream_report
+    from neeco.report.study_pages import write_downstream_report
     from neeco.studies.downstream.experiment import plan_downstream, run_downstream
     from neeco.studies.downstream.results import failed_jobs, tables_of
 

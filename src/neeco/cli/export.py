@@ -40,10 +40,7 @@ def run(arguments: Arguments) -> int:
     from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run
-    from neeco.viewer.gltf import write_glb
-    from neeco.viewer.moving import exported_states, moving_scene
-    from neeco.viewer.splats import exported_state, splats_of, write_splats
-    from neeco.viewer.usd import require_usd, write_usd
+    from neeco.viewer import other_viewers as files
 
     format = arguments.format or "ply"
     if arguments.output is not None:
@@ -56,19 +53,22 @@ def run(arguments: Arguments) -> int:
     if arguments.unit != "m" and format != "glb":
         raise NeecoError("--unit: applies to glb only; remove it")
     if format == "usdc":
-        require_usd()
+        files.require_usd()
     with open_gaussian_run(arguments.run, "export", device_of(arguments.device)) as trained:
         scene, frames = trained.scene, len(trained.scene.recorded.states)
         if not 0 <= arguments.frame < frames:
             raise NeecoError(f"--frame: must be from 0 to {frames - 1}, the training frames (got {arguments.frame})")
-        state, camera = exported_state(scene, arguments.frame, arguments.states)
+        state, camera = files.exported_state(scene, arguments.frame, arguments.states)
         output = arguments.output or arguments.run / f"scene.{format}"
         if format == "glb" or format == "usdc":
-            moving = moving_scene(scene, exported_states(scene, state, arguments.states), camera)
-            write_glb(moving, camera, output, arguments.unit) if format == "glb" else write_usd(moving, output)
+            moving = files.moving_scene(scene, files.exported_states(scene, state, arguments.states), camera)
+            if format == "glb":
+                files.write_glb(moving, camera, output, arguments.unit)
+            else:
+                files.write_usd(moving, output)
             note = f"{len(moving.times)} states; {moving.blended:.0%} of the instruments' Gaussians blend links"
         else:
             note = "without joints and labels"
-            write_splats(splats_of(scene, state, camera), output, format, arguments.spz_version)
+            files.write_splats(files.splats_of(scene, state, camera), output, format, arguments.spz_version)
     print(f"{output}: {scene.num_gaussians:,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, {note}")
     return 0

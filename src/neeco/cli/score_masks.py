@@ -34,8 +34,7 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Score, print a table."""
     from neeco.cli._progress import counting
-    from neeco.evaluation.mask_folders import parse_classes
-    from neeco.evaluation.mask_scores import score_masks
+    from neeco.evaluation.masks import parse_classes, score_masks
 
     with ready_for_json(arguments.json), counting("score masks") as advance:
         scores = score_masks(

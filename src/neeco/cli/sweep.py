@@ -31,7 +31,7 @@ def run(args: Sweep) -> int:
 def run_study(request: SweepRequest, study: Study, source: Path | None = None) -> int:
     """Run a study with progress bars; print its tables and file paths; return 1 if a run failed."""
     from neeco.cli._progress import Bars
-    from neeco.report.sweep_page import write_sweep_report
+    from neeco.report.study_pages import write_sweep_report
     from neeco.studies.sweep import RESULTS_FILE, failures, plan_sweep, run_sweep, tables_of
 
     with Bars() as bars:

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from safetensors.torch import load_file
 from scipy.ndimage import binary_erosion
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, conv2d, interpolate, max_pool2d, relu
+from torch.nn.functional import adaptive_avg_pool2d, conv2d, max_pool2d, relu
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import require_content
@@ -225,7 +225,16 @@ def difference_map(
     """
     difference = np.abs(np.asarray(image, np.float64) - np.asarray(target, np.float64)).mean(axis=2)
     colored = _colored(difference / full_scale)
-    return np.concatenate([colored, _legend(colored.shape[1], full_scale)]) if legend else colored
+    if not legend:
+        return colored
+    width, height, margin = colored.shape[1], COMPARISON.legend_height, COMPARISON.legend_margin
+    strip = Image.new("RGB", (width, height))
+    strip.paste(Image.fromarray(_colored(np.linspace(0, 1, width)[None].repeat(4, 0))), (0, 1))
+    pen, font = ImageDraw.Draw(strip), ImageFont.load_default(COMPARISON.legend_font)
+    for place, anchor in ((0.0, "ls"), (0.5, "ms"), (1.0, "rs")):
+        across = round(margin + place * (width - 2 * margin))
+        pen.text((across, height - 2), f"{place * full_scale:.3g}", "white", font, anchor)
+    return np.concatenate([colored, np.asarray(strip)])
 
 
 def part_color(part: int) -> str:
@@ -261,28 +270,6 @@ def _colored(fraction: np.ndarray) -> Pixels:
     return np.ascontiguousarray(cv2.applyColorMap(to_uint8(fraction * 255), cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8)
 
 
-def _legend(width: int, full_scale: float) -> Pixels:
-    """Return a strip [H, width, 3]: the colour scale with its ends and middle labelled."""
-    height, margin = COMPARISON.legend_height, COMPARISON.legend_margin
-    strip = Image.new("RGB", (width, height))
-    strip.paste(Image.fromarray(_colored(np.linspace(0, 1, width)[None].repeat(4, 0))), (0, 1))
-    pen, font = ImageDraw.Draw(strip), ImageFont.load_default(COMPARISON.legend_font)
-    for place, anchor in ((0.0, "ls"), (0.5, "ms"), (1.0, "rs")):
-        pen.text(
-            (round(margin + place * (width - 2 * margin)), height - 2),
-            f"{place * full_scale:.3g}",
-            "white",
-            font,
-            anchor,
-        )
-    return np.asarray(strip)
-
-
 def to_uint8(pixels: np.ndarray) -> Pixels:
     """Round values in [0, 255], clipped, to 8 bits."""
     return np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
-
-
-def resize_mask(mask: Tensor, width: int, height: int) -> Tensor:
-    """Resize a bool mask [H, W] by nearest neighbours."""
-    return interpolate(mask[None, None].float(), size=(height, width), mode="nearest-exact")[0, 0] > 0.5

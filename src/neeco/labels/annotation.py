@@ -101,13 +101,24 @@ def annotate(
         ids = {part: k for k, (owner, part) in enumerate(names, 1) if owner == instrument}
         visible = shows_any(parts, tuple(ids.values()))
         pose = drawing.camera.camera_from_world @ to_numpy(drawn_at.instruments[instrument].pose)
+        alone = drawing.layers[instrument]
+        depths = [drawing.tissue_depth] + [layer.depth for name, layer in drawing.layers.items() if name != instrument]
+        keypoints = {}  # OUTSIDE where the instrument has no pixel, even alone
+        for name, point in drawing.keypoints.get(instrument, {}).items():
+            keypoints[name] = Keypoint(0.0, 0.0, OUTSIDE)
+            if alone.mask.any() and (place := place_in_image(point, drawing.camera)) is not None:
+                x, y, z = place
+                pixel = int(y), int(x)
+                hidden = any(0 < depth[pixel] < z - LABELS.occlusion_mm for depth in depths)
+                hidden |= 0 < alone.depth[pixel] < z - LABELS.self_occlusion_mm
+                keypoints[name] = Keypoint(round(x, 2), round(y, 2), OCCLUDED if hidden else VISIBLE)
         labels.append(
             InstrumentLabel(
                 name=instrument,
                 image=parts,
                 ids=ids,
-                visibility=visibility(visible, drawing.layers[instrument].mask),
-                keypoints=project_keypoints(drawing, instrument),
+                visibility=visibility(visible, alone.mask),
+                keypoints=keypoints,
                 camera_from_instrument=_rounded(pose, 6),
             )
         )
@@ -135,27 +146,6 @@ def place_in_image(point: np.ndarray, camera: Camera) -> tuple[float, float, flo
     x, y = project_local(local, camera, nearest=camera.near)
     inside = local[2] > camera.near and 0 <= x < camera.width and 0 <= y < camera.height
     return (float(x), float(y), float(local[2])) if inside else None
-
-
-def project_keypoints(drawing: LayeredDrawing, instrument: str) -> dict[str, Keypoint]:
-    """Project an instrument's keypoints (world mm) to the image and determine their visibility.
-
-    Keypoints of an instrument without any pixel, even alone, are OUTSIDE.
-    """
-    camera = drawing.camera
-    depths = [drawing.tissue_depth] + [layer.depth for name, layer in drawing.layers.items() if name != instrument]
-    absent = not drawing.layers[instrument].mask.any()
-    projected = {}
-    for name, point in drawing.keypoints.get(instrument, {}).items():
-        place = place_in_image(point, camera)
-        projected[name] = Keypoint(0.0, 0.0, OUTSIDE)
-        if not absent and place is not None:
-            x, y, z = place
-            pixel = int(y), int(x)
-            hidden = any(0 < depth[pixel] < z - LABELS.occlusion_mm for depth in depths)
-            hidden |= 0 < drawing.layers[instrument].depth[pixel] < z - LABELS.self_occlusion_mm
-            projected[name] = Keypoint(round(x, 2), round(y, 2), OCCLUDED if hidden else VISIBLE)
-    return projected
 
 
 @torch.no_grad()

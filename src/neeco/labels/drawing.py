@@ -97,7 +97,19 @@ def draw_layers(
     alone = [owners == k for k in instruments] + [owners < 0]
     rendering, parts, share = labeller.draw(gaussians, camera, owners, unobserved, alone)
     assert rendering.channels is not None
-    parts, share = _drop_small_components(parts.cpu(), share.clamp(0, 1).cpu(), labeller.names, min_component)
+    original = parts.cpu().numpy()
+    cleaned = np.zeros_like(original)
+    for instrument in instruments_of(labeller.names):
+        ids = [k + 1 for k, (owner, _) in enumerate(labeller.names) if owner == instrument]
+        mask = shows_any(original, ids)
+        x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
+        if width:
+            box = slice(y, y + height), slice(x, x + width)
+            large_parts = np.where(without_small_components(mask[box], min_component), original[box], 0)
+            large_parts = without_part_islands(large_parts, ids, min_component)
+            np.copyto(cleaned[box], large_parts, where=large_parts > 0)
+    remaining = cleaned > 0
+    shares = without_components(share.clamp(0, 1).cpu().numpy(), remaining, (original > 0) & ~remaining)
     threshold = threshold_of(scene)
     layers = {
         name: InstrumentLayer((single.alpha > threshold).cpu().numpy(), surface_depth(single))
@@ -106,8 +118,8 @@ def draw_layers(
     tissue = rasterize(gaussians.select(owners < 0), camera).color.clamp(0, 1).cpu() if tissue_image else None
     return LayeredDrawing(
         image=rendering.color.clamp(0, 1).cpu(),
-        parts=parts,
-        share=share,
+        parts=torch.from_numpy(cleaned),
+        share=torch.from_numpy(shares),
         state=state,
         posed=gaussians,
         camera=camera,
@@ -230,25 +242,6 @@ def without_components(share: np.ndarray, remaining: np.ndarray, dropped: np.nda
         return share
     fading = ~remaining & (share < LABELS.clear_shares[1]) & (distances_to(dropped) < distances_to(remaining))
     return np.where(dropped | fading, np.float32(0), share)
-
-
-def _drop_small_components(
-    parts: Tensor, share: Tensor, names: tuple[tuple[str, str], ...], min_component: float
-) -> tuple[Tensor, Tensor]:
-    original, cleaned = parts.numpy(), np.zeros_like(parts.numpy())
-    for instrument in instruments_of(names):
-        ids = [k + 1 for k, (owner, _) in enumerate(names) if owner == instrument]
-        mask = shows_any(original, ids)
-        x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
-        if not width:
-            continue
-        box = slice(y, y + height), slice(x, x + width)
-        large_parts = np.where(without_small_components(mask[box], min_component), original[box], 0)
-        large_parts = without_part_islands(large_parts, ids, min_component)
-        np.copyto(cleaned[box], large_parts, where=large_parts > 0)
-    remaining = cleaned > 0
-    dropped = (original > 0) & ~remaining
-    return torch.from_numpy(cleaned), torch.from_numpy(without_components(share.numpy(), remaining, dropped))
 
 
 def shows_any(parts: np.ndarray, ids: Sequence[int]) -> np.ndarray:

@@ -1,10 +1,11 @@
-"""The self-contained pages of a run: the report of `neeco evaluate`, the frames of `neeco annotate`."""
+"""The self-contained pages of a run: the report of `neeco evaluate`, the frames of `neeco annotate`, and those of
+`neeco track` with the states over time and their confidence."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -16,15 +17,26 @@ import torch
 from PIL import Image, ImageDraw
 
 from neeco.base.files import read_bytes
-from neeco.capture.model import Capture, Frame, State
+from neeco.capture.model import Capture, Frame, State, evenly_spaced
 from neeco.evaluation.image_metrics import COMPARISON, overlay_outline, overlay_parts, part_color
-from neeco.evaluation.mask_folders import load_reference
+from neeco.evaluation.masks import load_reference
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
-from neeco.report.charts import CHARTS, Series, line_chart, short
-from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
+from neeco.report.page import (
+    CHARTS,
+    REPORT_FILE,
+    Series,
+    difference,
+    jpeg,
+    line_chart,
+    short,
+    split_counts,
+    to_bytes,
+    write_page,
+)
 from neeco.scene import DrawableScene
-from neeco.studies.tables import UNKNOWN
+from neeco.studies.configurations import UNKNOWN
+from neeco.tracking.track import Tracked, state_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +45,9 @@ class RunPageSettings:
 
     max_points: int = 300  # limit on the points of a training curve
     max_frames: int = 60  # maximum number of frames, which limits the page's size
+    spread: int = 24  # number of frames spread over tracked footage
+    least_trusted: int = 12  # number of frames of least trust
+    band: float = 2.0  # half width of the bands of tracked joints in standard deviations
     # colours of the instruments' outlines
     outlines: tuple[tuple[int, int, int], ...] = ((255, 230, 0), (0, 230, 255), (255, 90, 200), (120, 255, 80))
 
@@ -104,6 +119,16 @@ def write_report(
         curve(rows, "loss", "loss (log scale)", logarithmic=True),
         curve(rows, "num_gaussians", "Gaussians"),
     ]
+    kinds = {kind: evaluation[kind] for kind in KINDS if kind in evaluation}
+    all_numbers = [numbers for splits in kinds.values() for numbers in splits.values()]
+    tables = []  # of image scores and of label scores: columns with any value, and for every kind its splits with cells
+    for scores in (IMAGE_SCORES, LABEL_SCORES):
+        columns = [score for score in scores if any(numbers.get(score.key) is not None for numbers in all_numbers)]
+        groups = [
+            (KINDS[kind], [(split, [score.written(numbers) for score in columns]) for split, numbers in splits.items()])
+            for kind, splits in kinds.items()
+        ]
+        tables += [(columns, groups)] if columns else []
     config = run_path / "config.yaml"
     return write_page(
         run_path / REPORT_FILE,
@@ -117,7 +142,7 @@ def write_report(
         trained=len(capture.split("train")),
         train_scored="train" in evaluation["given"],
         tiles=_tiles(evaluation, kind),
-        tables=_tables(evaluation),
+        tables=tables,
         notes=[*(f"Doubtful: {doubt}" for doubt in evaluation.get("doubts", ())), *evaluation.get("notes", ())],
         figures=frame_figures(evaluation, capture, scene, kind),
         pose_kind=KIND_NAMES[kind],
@@ -212,22 +237,6 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
     return tiles
 
 
-def _tables(evaluation: dict[str, Any]) -> list[Any]:
-    """Return the tables of image scores and of label scores: columns with any value, and rows (title of the kind, its
-    splits with their cells)."""
-    kinds = {kind: evaluation[kind] for kind in KINDS if kind in evaluation}
-    all_numbers = [numbers for splits in kinds.values() for numbers in splits.values()]
-    tables = []
-    for scores in (IMAGE_SCORES, LABEL_SCORES):
-        columns = [score for score in scores if any(numbers.get(score.key) is not None for numbers in all_numbers)]
-        groups = [
-            (KINDS[kind], [(split, [score.written(numbers) for score in columns]) for split, numbers in splits.items()])
-            for kind, splits in kinds.items()
-        ]
-        tables += [(columns, groups)] if columns else []
-    return tables
-
-
 def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
     """Return the colour and name of every part."""
     several = len({instrument for instrument, _ in scene.label_names}) > 1
@@ -296,6 +305,28 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
     recorded image cannot be read or the page cannot be written.
     """
     ranked = sorted(range(len(records)), key=lambda k: records[k]["trust"]["value"])
+    figures = []
+    for k in ranked[: SETTINGS.max_frames]:  # each with the contours of its labels, and its confidence
+        record, frame = records[k], capture.frames[k]
+        trust, moved = record["trust"], record["moved"]
+        image = Image.fromarray(to_bytes(frame.load_image().numpy()))
+        pen = ImageDraw.Draw(image)
+        for number, label in enumerate(record["labels"]):
+            for polygon in label.get("polygons", ()):
+                points = [tuple(point) for point in polygon]
+                color = SETTINGS.outlines[number % len(SETTINGS.outlines)]
+                pen.line([*points, points[0]], fill=color, width=1)
+        figures.append(
+            {
+                "name": frame.name,
+                "split": record["recorded_split"],
+                "written": not record.get("skipped"),
+                "trust": f"{trust['value']:.3f}",
+                "votes": f"{trust['against']:.1%} of the label contradicted by the image, {trust['missed']:.1%} missed",
+                "moved": ", ".join(f"{body} {by['mm']:.2f} mm, {by['deg']:.2f}°" for body, by in moved.items()),
+                "picture": jpeg(np.asarray(image)),
+            }
+        )
     written = sum(not record.get("skipped") for record in records)
     return write_page(
         output / PAGE,
@@ -309,7 +340,7 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
             (f"{median(record['trust']['value'] for record in records):.3f}", "trust, median"),
             (f"{min_trust:g}", "minimum trust"),
         ],
-        figures=[_annotated_figure(records[k], capture.frames[k]) for k in ranked[: SETTINGS.max_frames]],
+        figures=figures,
         total=len(records),
         instruments=[
             ("#{:02x}{:02x}{:02x}".format(*SETTINGS.outlines[k % len(SETTINGS.outlines)]), item.name)
@@ -318,21 +349,85 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
     )
 
 
-def _annotated_figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:
-    """Return one frame: its image with the contours of its labels, and its confidence."""
-    trust, moved = record["trust"], record["moved"]
-    image = Image.fromarray(to_bytes(frame.load_image().numpy()))
-    pen = ImageDraw.Draw(image)
-    for k, label in enumerate(record["labels"]):
-        for polygon in label.get("polygons", ()):
-            points = [tuple(point) for point in polygon]
-            pen.line([*points, points[0]], fill=SETTINGS.outlines[k % len(SETTINGS.outlines)], width=1)
+HOWS = {
+    "begun": "initialised from the given state",
+    "followed": "tracked from the neighbouring frame",
+    "beside": "detected near the predicted state",
+    "found": "detected again, without a prior",
+    "lost": "not detected",
+}
+
+
+def write_track_page(tracked: Tracked) -> Path:
+    """Write the self-contained track.html into the output folder and return its path. Raises NeecoError if an image
+    cannot be read or the page cannot be written."""
+    records = tracked.records
+    frames = sorted(tracked.footage.frames, key=lambda frame: frame.state.time)
+    values = [record["trust"]["value"] for record in records]
+    least = sorted(range(len(records)), key=lambda k: values[k])[: SETTINGS.least_trusted]
+    missing = sum(record["how"] == "lost" for record in records)
+    return write_page(
+        tracked.page,
+        "track.html",
+        title=f"{tracked.footage.root.name}: tracked",
+        name=tracked.footage.root.name,
+        subtitle="instruments tracked with a learned scene",
+        stamps=[tracked.output],
+        verdict=tracked.verdict,
+        tiles=[
+            (f"{tracked.written} of {len(records)}", f"frames with a trust of at least {tracked.min_trust:g}"),
+            (f"{median(values):.3f}", "trust, median"),
+            (str(missing), "frames without a detection"),
+            (str(sum(record["how"] in ("beside", "found") for record in records)), "re-detections"),
+        ],
+        charts=[chart for chart in _tracked_charts(tracked) if chart],
+        strip=[_tracked_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), SETTINGS.spread)],
+        least_trusted=[_tracked_figure(tracked, frames[k], records[k]) for k in least],
+    )
+
+
+def _tracked_charts(tracked: Tracked) -> list[str]:
+    """Return charts over time: trust and misfit, then every instrument's joints with bands of `band` deviations."""
+    records, first = tracked.records, tracked.records[0]["time"]
+    times = [record["time"] - first for record in records]
+    trust = Series(0, tuple(zip(times, (record["trust"]["value"] for record in records), strict=True)))
+    misfit = Series(1, tuple((t, r["misfit"]) for t, r in zip(times, records, strict=True) if r["how"] != "lost"))
+    charts = [
+        line_chart("trust", "s", [trust], levels=[(1, tracked.min_trust)], note="dashed: minimum", size=CHARTS.small),
+        line_chart("misfit of pixels", "s", [misfit], size=CHARTS.small),
+    ]
+    rows = [k for k, record in enumerate(records) if record["how"] != "lost"]
+    at = [times[k] for k in rows]
+    for item in tracked.scene.instruments:
+        states = [records[k]["instruments"][item.name] for k in rows]
+        for name in item.joints:
+            unit: Callable[[float], float] = float if item.slides(name) else math.degrees
+            values = [unit(one["joints"][name]) for one in states]
+            deviations = [unit(one["deviation"][f"joint.{name}"]) for one in states]
+            bands = tuple(
+                tuple((t, v + way * SETTINGS.band * d) for t, v, d in zip(at, values, deviations, strict=True))
+                for way in (-1, 1)
+            )
+            title = f"{item.name}: {name}, {'mm' if item.slides(name) else 'deg'}"
+            line = tuple(zip(at, values, strict=True))
+            charts.append(line_chart(title, "s", [Series(0, line, bands)], size=CHARTS.small))
+    return charts
+
+
+def _tracked_figure(tracked: Tracked, frame: Frame, record: dict[str, Any]) -> dict[str, Any]:
+    """Return one frame: its image, tinted by the rendered label."""
+    image, trust = frame.load_image().numpy(), record["trust"]
+    picture = to_bytes(image)
+    if record["how"] != "lost":
+        parts = draw(tracked.scene, state_of(record), frame.camera).parts
+        assert parts is not None
+        picture = overlay_parts(image, parts.numpy())
+    shares = ", ".join(f"{name} {value:.2f}" for name, value in trust.items() if name != "value" and value < 0.995)
     return {
         "name": frame.name,
-        "split": record["recorded_split"],
-        "written": not record.get("skipped"),
-        "trust": f"{trust['value']:.3f}",
-        "votes": f"{trust['against']:.1%} of the label contradicted by the image, {trust['missed']:.1%} missed",
-        "moved": ", ".join(f"{body} {by['mm']:.2f} mm, {by['deg']:.2f}°" for body, by in moved.items()),
-        "picture": jpeg(np.asarray(image)),
+        "trust": f"{trust['value']:.2f}",
+        "written": trust["value"] >= tracked.min_trust,
+        "how": HOWS[record["how"]],
+        "shares": shares if record["how"] != "lost" else "",
+        "picture": jpeg(picture),
     }

@@ -33,8 +33,6 @@ GO_ON = "run the same command again to continue; finished jobs are kept"
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", completed share in [0, 1], description
 Result = dict[str, Any]  # result that a job returns and writes; if it failed: identity, "error" and empty "splits"
-Reporter = Callable[[int, str, float, str], None]  # `JobProgress` of the job at an index
-Finisher = Callable[[int, Result], None]  # gets the result of the job at an index
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,9 +99,12 @@ def run_jobs(
     """Run every job and return their results, in their order.
 
     workers: 1: sequentially in this process; more, or with RAY_ADDRESS: that many parallel processes (scripts need
-    `if __name__ == "__main__"`), where a job whose worker dies is continued from its checkpoint. record: called with
-    all results after each job; finished: earlier results by job index. captures: already read captures by path. light:
-    small jobs, which reuse a worker and share GPUs. Raises NeecoError before any work if a job's folder belongs to
+    `if __name__ == "__main__"`), one process per job, where a job whose worker dies is continued from its checkpoint.
+    With RAY_ADDRESS they run on that cluster, whose machines must have access to capture and output. A job's device is
+    opened in its worker, which sees one exclusive GPU; on a cluster, whose machines may have GPUs that this one lacks,
+    each worker gets a GPU unless the jobs request the CPU. record: called with all results after each job; finished:
+    earlier results by job index. captures: already read captures by path. light: small jobs, which reuse a worker and
+    share GPUs. Raises NeecoError before any work if a job's folder belongs to
     another job or the cluster does not respond, and KeyboardInterrupt naming the stopped job.
     """
     device = device_of(jobs[0].device if jobs else "cpu", drawing=False)
@@ -124,18 +125,46 @@ def run_jobs(
 
     for job in jobs:
         job.check()
-    if workers > 1 or address():
-        return _run_in_workers(jobs, workers, device, report, finish, light=light)
-    results = []
-    for index, job in enumerate(jobs):
-        try:
-            results.append(attempt_job(job, partial(report, index), captures.get(job.capture)))
-        except KeyboardInterrupt as interrupt:
-            moment = " ".join(map(str, interrupt.args)).split(";")[0]
-            place = f"job {index + 1} of {len(jobs)} ({job.title}){', ' + moment if moment else ''}"
-            raise KeyboardInterrupt(f"{place}; {GO_ON}") from None
-        finish(index, results[-1])
-    return results
+    results: dict[int, Result] = {}
+    if workers == 1 and not address():
+        for index, job in enumerate(jobs):
+            try:
+                results[index] = attempt_job(job, partial(report, index), captures.get(job.capture))
+            except KeyboardInterrupt as interrupt:
+                moment = " ".join(map(str, interrupt.args)).split(";")[0]
+                place = f"job {index + 1} of {len(jobs)} ({job.title}){', ' + moment if moment else ''}"
+                raise KeyboardInterrupt(f"{place}; {GO_ON}") from None
+            finish(index, results[index])
+        return list(results.values())
+    folders = [job.folder.absolute().parent for job in jobs]
+    pool = Workers(
+        count=workers,
+        threads=None if address() else threads_per_worker(workers),
+        fresh=not light,
+        gpu=bool(jobs) and jobs[0].device != "cpu" and (bool(address()) or device.type != "cpu"),
+        shared_gpus=torch.cuda.device_count() if light else None,
+        stop_s=CHECKPOINT_S,
+        writes=Path(os.path.commonpath(folders)) / f"{TEMPORARY}probe" if folders else None,
+        reads=frozenset(job.capture.absolute() for job in jobs),
+    )
+    running: set[int] = set()
+    try:
+        with contextlib.closing(run_tasks(_run_in_worker, None, jobs, pool)) as events:
+            for event in events:
+                index, reason = event.index, event.value
+                running.add(index)
+                if event.stage in ("started", "died"):
+                    text = f"its worker died ({reason}); continuing from its checkpoint" if reason else ""
+                    report(index, "training", 0.0, text)
+                    continue
+                running.remove(index)
+                done = event.stage == "done"
+                results[index] = reason if done else _failed(jobs[index], f"its worker died: {reason}")
+                finish(index, results[index])
+    except KeyboardInterrupt:
+        names = "; ".join(jobs[index].title for index in sorted(running))
+        raise KeyboardInterrupt(f"while running {names}; {GO_ON}") from None
+    return [results[index] for index in range(len(jobs))]
 
 
 def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture | None = None) -> Result:
@@ -178,47 +207,6 @@ def spread(values: Iterable[float | None]) -> dict[str, Any]:
 
 def _failed(job: Job, error: str) -> Result:
     return job.identity() | {"error": error, "splits": {}}
-
-
-def _run_in_workers(
-    jobs: Sequence[Job], workers: int, device: torch.device, report: Reporter, finish: Finisher, *, light: bool
-) -> list[Result]:
-    """Run jobs as `run_jobs` in `workers` parallel processes, one process per job; light jobs reuse processes.
-
-    With RAY_ADDRESS they run on that cluster, whose machines must have access to capture and output. A job's device is
-    opened in its worker, which sees one exclusive GPU. On a cluster, whose machines may have GPUs that this one lacks,
-    each worker gets a GPU unless the jobs request the CPU.
-    """
-    folders = [job.folder.absolute().parent for job in jobs]
-    pool = Workers(
-        count=workers,
-        threads=None if address() else threads_per_worker(workers),
-        fresh=not light,
-        gpu=bool(jobs) and jobs[0].device != "cpu" and (bool(address()) or device.type != "cpu"),
-        shared_gpus=torch.cuda.device_count() if light else None,
-        stop_s=CHECKPOINT_S,
-        writes=Path(os.path.commonpath(folders)) / f"{TEMPORARY}probe" if folders else None,
-        reads=frozenset(job.capture.absolute() for job in jobs),
-    )
-    results: dict[int, Result] = {}
-    running: set[int] = set()
-    try:
-        with contextlib.closing(run_tasks(_run_in_worker, None, jobs, pool)) as events:
-            for event in events:
-                index, reason = event.index, event.value
-                running.add(index)
-                if event.stage in ("started", "died"):
-                    text = f"its worker died ({reason}); continuing from its checkpoint" if reason else ""
-                    report(index, "training", 0.0, text)
-                    continue
-                running.remove(index)
-                done = event.stage == "done"
-                results[index] = reason if done else _failed(jobs[index], f"its worker died: {reason}")
-                finish(index, results[index])
-    except KeyboardInterrupt:
-        names = "; ".join(jobs[index].title for index in sorted(running))
-        raise KeyboardInterrupt(f"while running {names}; {GO_ON}") from None
-    return [results[index] for index in range(len(jobs))]
 
 
 def _run_in_worker(_: None, job: Job, threads: int) -> Result:

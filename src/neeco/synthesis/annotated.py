@@ -34,7 +34,7 @@ from neeco.synthesis.contact import labels_of
 from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
 from neeco.synthesis.samplers import DrawnCameras
 from neeco.synthesis.settings import AS_RECORDED, DEFAULT_FORMATS, MIN_TRUST, ImageSettings, Settings, parse_class_names
-from neeco.synthesis.writers.folder import Record, encoded_sample, skipped_sample
+from neeco.synthesis.writers import Record, encoded_sample, skipped_sample
 from neeco.training.run import GaussianRun
 
 N_REFERENCE_FRAMES = 16  # training frames from which the usual errors are estimated

@@ -51,16 +51,37 @@ def augment(planes: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     """
     count, _, height, width = planes.shape
     random = _Random(rng, count, planes.device)
-    given_from_made = _placements(random, width / height)
+    # flips, rotations, zooms and shifts [B, 2, 3]
+    aspect, placed, flip = width / height, random.some(CHANGES.placed), 1 - 2 * random.some(0.5)
+    turn, zoom = placed * random.uniform(-CHANGES.turn, CHANGES.turn), CHANGES.zoom ** (placed * random.uniform(-1, 1))
+    cosine, sine = turn.cos() / zoom, turn.sin() / zoom
+    shift = placed[:, None] * random.uniform(-2 * CHANGES.shift, 2 * CHANGES.shift, 2)
+    numbers = (cosine * flip, -sine / aspect, shift[:, 0], sine * aspect * flip, cosine, shift[:, 1])
+    given_from_made = torch.stack(numbers, 1).reshape(-1, 2, 3)
     grid = functional.affine_grid(given_from_made, [count, 1, height, width], align_corners=False)
     planes = functional.grid_sample(planes, grid, align_corners=False)
     colors, labels = planes[:, :3], planes[:, 3:]
-    colors = torch.where(random.some(CHANGES.relit)[:, None, None, None] > 0, _relight(colors, random), colors)
+    relit = random.some(CHANGES.relit)[:, None, None, None] > 0  # in exposure, gamma, tint, saturation and lamps
+    angle, slope = random.uniform(-math.pi, math.pi), random.some(0.5) * random.uniform(0, CHANGES.slope)
+    across, down = (torch.linspace(-0.5, 0.5, side, device=colors.device) for side in (width, height))
+    ramp = (slope * angle.cos())[:, None, None] * across + (slope * angle.sin())[:, None, None] * down[:, None]
+    gain = 2 ** random.uniform(-CHANGES.exposure, CHANGES.exposure)
+    tint = random.uniform(1 - CHANGES.tint, 1 + CHANGES.tint, 3) * gain[:, None]
+    grey = colors.mean(1, keepdim=True)
+    saturation = random.uniform(1 - CHANGES.saturation, 1 + CHANGES.saturation)
+    lit = grey + (colors - grey) * saturation[:, None, None, None]
+    lit = (lit * tint[..., None, None] * (1 + ramp[:, None])).clamp(1e-4, 1)
+    lit = lit ** (2 ** random.uniform(-CHANGES.gamma, CHANGES.gamma))[:, None, None, None]
+    colors = torch.where(relit, lit, colors)
     colors = _blur(colors, random.some(0.3) * random.uniform(0.2, CHANGES.blur))
     noise = torch.randn(colors.shape, generator=rng, device=planes.device)
     strength = random.some(0.5) * random.uniform(0, CHANGES.noise)
     colors = (colors + noise * strength[:, None, None, None]).clamp(0, 1)
-    cut = _rectangles(random, height, width)
+    inside, chosen = [], random.some(0.5) > 0  # a rectangle in every second image
+    for side in (height, width):
+        places = (torch.arange(side, device=random.device) + 0.5) / side
+        inside.append((places - random.uniform(0, 1, 1)).abs() < random.uniform(0.1, CHANGES.cut, 1) / 2)
+    cut = (inside[0][:, :, None] & inside[1][:, None] & chosen[:, None, None])[:, None]  # [B, 1, h, w]
     colors = torch.where(cut, random.uniform(0, 1, 3)[..., None, None], colors)
     valid = labels[:, -1:] * ~cut
     return torch.cat([colors, labels[:, :-1], valid], 1), given_from_made
@@ -112,31 +133,6 @@ class _Random:
         return (self.uniform(0, 1) < chance).float()
 
 
-def _placements(random: _Random, aspect: float) -> Tensor:
-    """Return [B, 2, 3]: flips, rotations, zooms and shifts, as in `augment`. aspect: width over height."""
-    placed, flip = random.some(CHANGES.placed), 1 - 2 * random.some(0.5)
-    turn, zoom = placed * random.uniform(-CHANGES.turn, CHANGES.turn), CHANGES.zoom ** (placed * random.uniform(-1, 1))
-    cosine, sine = turn.cos() / zoom, turn.sin() / zoom
-    shift = placed[:, None] * random.uniform(-2 * CHANGES.shift, 2 * CHANGES.shift, 2)
-    numbers = (cosine * flip, -sine / aspect, shift[:, 0], sine * aspect * flip, cosine, shift[:, 1])
-    return torch.stack(numbers, 1).reshape(-1, 2, 3)
-
-
-def _relight(colors: Tensor, random: _Random) -> Tensor:
-    """Change exposure, gamma, tint, saturation and lamps."""
-    height, width = colors.shape[2:]
-    angle, slope = random.uniform(-math.pi, math.pi), random.some(0.5) * random.uniform(0, CHANGES.slope)
-    across, down = (torch.linspace(-0.5, 0.5, side, device=colors.device) for side in (width, height))
-    ramp = (slope * angle.cos())[:, None, None] * across + (slope * angle.sin())[:, None, None] * down[:, None]
-    gain = 2 ** random.uniform(-CHANGES.exposure, CHANGES.exposure)
-    tint = random.uniform(1 - CHANGES.tint, 1 + CHANGES.tint, 3) * gain[:, None]
-    grey = colors.mean(1, keepdim=True)
-    saturation = random.uniform(1 - CHANGES.saturation, 1 + CHANGES.saturation)
-    colors = grey + (colors - grey) * saturation[:, None, None, None]
-    colors = (colors * tint[..., None, None] * (1 + ramp[:, None])).clamp(1e-4, 1)
-    return colors ** (2 ** random.uniform(-CHANGES.gamma, CHANGES.gamma))[:, None, None, None]
-
-
 def _blur(colors: Tensor, deviations: Tensor) -> Tensor:
     """Blur each image [B, 3, h, w] by a Gaussian of its own standard deviation [B] px; 0: unchanged."""
     count = len(colors)
@@ -147,12 +143,3 @@ def _blur(colors: Tensor, deviations: Tensor) -> Tensor:
     flat = functional.pad(colors.reshape(1, 3 * count, *colors.shape[2:]), (radius,) * 4, mode="replicate")
     flat = functional.conv2d(flat, kernels[:, :, None], groups=3 * count)
     return functional.conv2d(flat, kernels[..., None], groups=3 * count).reshape(colors.shape)
-
-
-def _rectangles(random: _Random, height: int, width: int) -> Tensor:
-    """Return bool [B, 1, h, w]: True inside a rectangle, for every second image."""
-    inside, chosen = [], random.some(0.5) > 0
-    for side in (height, width):
-        places = (torch.arange(side, device=random.device) + 0.5) / side
-        inside.append((places - random.uniform(0, 1, 1)).abs() < random.uniform(0.1, CHANGES.cut, 1) / 2)
-    return (inside[0][:, :, None] & inside[1][:, None] & chosen[:, None, None])[:, None]

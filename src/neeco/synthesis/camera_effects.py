@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import parse_yaml, read_text
@@ -242,11 +243,18 @@ class RecordedMotion:
 
     def __init__(self, recorded: Recorded, instruments: Sequence[Recorded] = ()) -> None:
         order = sorted(range(len(recorded.states)), key=lambda k: recorded.states[k].time)
-        self._motions, states = [], []
+        self._motions, states = list[Motion](), []
         for first, second in pairwise(order):
             a, b = recorded.states[first], recorded.states[second]
             if 0 < b.time - a.time <= SETTINGS.max_gap_s and set(a.instruments) == set(b.instruments):
-                self._motions.append(motion_between(a, recorded.cameras[first], b, recorded.cameras[second]))
+                seconds, twists, joints = b.time - a.time, {}, {}  # at constant speeds
+                for name, item in a.instruments.items():
+                    later = b.instruments[name]
+                    twists[name] = _twist(item.pose, later.pose, seconds)
+                    rates = {joint: (later.joints[joint] - value) / seconds for joint, value in item.joints.items()}
+                    joints[name] = rates
+                start, end = (recorded.cameras[k].world_from_camera for k in (first, second))
+                self._motions.append(Motion(twists, joints, _twist(start, end, seconds)))
                 states.append(a)
         self._frames = SimilarFrames(states, len(states), joints=True)
         self._instruments = [RecordedMotion(each) for each in instruments]
@@ -284,20 +292,9 @@ def subframes(
     return [motion.advanced(drawing.state, drawing.camera, float(time)) for time in times]
 
 
-def motion_between(a: State, camera_a: Camera, b: State, camera_b: Camera) -> Motion:
-    """Return the constant speeds that lead from one recorded frame to a later one."""
-    seconds, twists, joints = b.time - a.time, {}, {}
-    for name, item in a.instruments.items():
-        later = b.instruments[name]
-        twists[name] = _twist(to_numpy(item.pose), to_numpy(later.pose), seconds)
-        joints[name] = {joint: (later.joints[joint] - value) / seconds for joint, value in item.joints.items()}
-    camera = _twist(to_numpy(camera_a.world_from_camera), to_numpy(camera_b.world_from_camera), seconds)
-    return Motion(twists, joints, camera)
-
-
-def _twist(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
+def _twist(start: Tensor, end: Tensor, seconds: float) -> np.ndarray:
     """Return the constant twist [6], in its own frame, that takes pose `start` [4, 4] to `end` in `seconds`."""
-    between = np.linalg.inv(start) @ end
+    between = np.linalg.inv(to_numpy(start)) @ to_numpy(end)
     turn = Rotation.from_matrix(between[:3, :3]).as_rotvec()
     return np.concatenate([turn, between[:3, 3]]) / seconds
 

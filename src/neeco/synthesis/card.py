@@ -16,7 +16,7 @@ import cv2
 import matplotlib
 import numpy as np
 import yaml
-from matplotlib.axes import Axes
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
@@ -27,7 +27,7 @@ from neeco.capture.model import evenly_spaced
 from neeco.evaluation.image_metrics import overlay_parts, part_color
 from neeco.labels.annotation import OCCLUDED
 from neeco.synthesis.settings import ImageSettings, Settings
-from neeco.synthesis.writers.folder import Record, split_of, stem
+from neeco.synthesis.writers import Record, split_of, stem
 from neeco.synthesis.writers.hub import SPLITS, ImageFolder, WebDataset
 
 CARD = "README.md"
@@ -35,50 +35,7 @@ MARK = "<!-- Written by neeco, which writes it anew with --resume. Remove this l
 SIZES = {"n<1K": 10**3, "1K<n<10K": 10**4, "10K<n<100K": 10**5, "100K<n<1M": 10**6, "1M<n<10M": 10**7}
 TASKS = ["image-segmentation", "object-detection", "keypoint-detection", "depth-estimation"]
 TAGS = ["surgical-instruments", "endoscopy", "6d-pose-estimation", "gaussian-splatting"]
-SYNTHETIC = """The images were rendered by a Gaussian-splatting model learned from a recording, in states of the
-instruments that were not recorded. Labels come from the same model: exact for what is rendered."""
-RECORDED = """The images were recorded. Their labels were rendered by a Gaussian-splatting model of the recording, at
-poses fitted to each image; images whose labels could not be trusted were left out. Files are numbered anew: the field
-`frame` of `states.jsonl` has the name that the frame has in its capture."""
-TEXT = """---
-{front}---
-
-{mark}
-
-# {title}
-
-{how}
-
-{images} images ({splits}). The publisher of the set states its license.
-
-## Classes
-
-| part id | instrument | part |
-|---|---|---|
-{classes}
-
-Keypoints, where an instrument has them: {keypoints}.
-
-## Files
-
-- `images`: the images, RGB
-- `masks`: instrument or not: 255 or 0
-- `soft`: share of a pixel that is instrument, in counts of 1/255
-- `ignore`: 255 where a loss had better ignore the pixel: uncertain edges, and what no training frame saw
-- `parts`: part ids, see above
-- `depth`: 16 bit, in counts of {mm_per_count} mm; 0 is none
-- `silhouettes`: bit k is set where instrument k would be visible if nothing else were there
-- `states.jsonl`: one line per image: instrument states (mm, rad), camera (OpenGL axes), intrinsics, labels
-- `dataset.json`: how the set was made, in full
-- `preview.png`: a look at the labels
-{formats}
-
-## How it was made
-
-By neeco {version}, of a scene with SHA-256 `{scene}`:
-
-    {command}
-"""
+PAGES = Environment(loader=PackageLoader("neeco.synthesis", "."), undefined=StrictUndefined, trim_blocks=True)
 
 
 def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) -> None:
@@ -114,28 +71,21 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
         "configs": [config],
     }
 
-    def named(instrument: str) -> str:
-        name = info["classes"].get(instrument, instrument)
-        return instrument if name == instrument else f"{instrument}: {name}"
-
-    text = TEXT.format(
+    instruments = [item.get("instrument", "") for item in info["ids"]]
+    names = [info["classes"].get(instrument, instrument) for instrument in instruments]
+    words = [a if a == b else f"{a}: {b}" for a, b in zip(instruments, names, strict=True)]
+    text = PAGES.get_template("card.md").render(
         front=yaml.safe_dump(front, sort_keys=False),
         mark=MARK,
         title=title,
-        how=RECORDED if annotated else SYNTHETIC,
-        images=info["images"],
+        annotated=annotated,
+        info=info,
         splits=", ".join(f"{count} {split}" for split, count in info["splits"].items()),
-        classes="\n".join(
-            f"| {item['id']} | {named(item.get('instrument', ''))} | {item['part']} |" for item in info["ids"]
-        ),
-        keypoints=", ".join(info["keypoints"]) or "none",
-        mm_per_count=info["depth"]["mm_per_count"],
-        formats="\n".join(f"- {formats[name]}" for name in info["formats"]),
-        version=info["version"],
-        scene=info["scene_sha256"],
+        classes=[(item["id"], word, item["part"]) for item, word in zip(info["ids"], words, strict=True)],
+        formats=[formats[name] for name in info["formats"]],
         command=_command(info),
     )
-    write_text(path, text)
+    write_text(path, text + "\n")
 
 
 def _command(info: Mapping[str, Any]) -> str:
@@ -197,7 +147,18 @@ def write_preview(root: Path, records: Sequence[Record], names: Pairs, bones: Pa
 
 def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: Pairs = ()) -> Figure:
     """Draw images, each plain and with parts, boxes and keypoints, which `bones` join."""
-    captions = [[textwrap.wrap(text, PREVIEW.characters) for text in _captions(record)] for record in records]
+    captions = []  # of the plain image (joint values), and of the labelled one (the instruments' visible shares)
+    for record in records:
+        joints = [
+            f"{joint.removesuffix('_mm')} {value:.1f} mm"
+            if joint.endswith("_mm")
+            else f"{joint} {math.degrees(value):.0f}°"
+            for instrument in record["instruments"]
+            for joint, value in instrument["joints"].items()
+        ]
+        seen = [f"{label['name']} {label['visibility']:.0%} seen" for label in record["labels"]]
+        texts = " · ".join([f"{record['index']:06d}", record["split"], *joints]), " · ".join(seen)
+        captions.append([textwrap.wrap(text, PREVIEW.characters) for text in texts])
     columns, wide = min(PREVIEW.columns, len(records)), PREVIEW.width
     high = round(wide * records[0]["height"] / records[0]["width"])
     above = PREVIEW.line * max(len(lines) for pair in captions for lines in pair) + PREVIEW.gap
@@ -215,8 +176,22 @@ def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: P
             x = (2 * column + side) * (wide + PREVIEW.gap)
             sheet[y : y + high, x : x + wide] = cv2.resize(image, (wide, high), interpolation=cv2.INTER_AREA)
             axes.text(x, y - 4, "\n".join(captions[k][side]), fontsize=PREVIEW.font)
+        corner, scale = np.array([x, y]), wide / record["width"]  # of the labelled image
         for label in record["labels"]:
-            _draw_label(axes, label, bones, np.array([x, y]), wide / record["width"])
+            if label["area"] > 0:
+                left, top, width, height = (value * scale for value in label["box"])
+                box = (left + corner[0], top + corner[1]), width, height
+                axes.add_patch(Rectangle(*box, fill=False, color=PREVIEW.box))
+                rectangle = corner + scale * np.array(label["rectangle"])
+                axes.add_patch(Polygon(rectangle, fill=False, color=PREVIEW.rectangle))
+                tag = {"facecolor": PREVIEW.box, "edgecolor": PREVIEW.box, "pad": 1}
+                axes.text(box[0][0], box[0][1] - 2, label["name"], fontsize=PREVIEW.font, bbox=tag)
+            points = {k: (corner + scale * np.array([x, y]), v) for k, (x, y, v) in label["keypoints"].items() if v > 0}
+            for a, b in (bone for bone in bones if {*bone} <= points.keys()):
+                axes.plot(*np.stack([points[a][0], points[b][0]], 1), color=PREVIEW.bone)
+            for place, visibility in points.values():
+                color = PREVIEW.hidden if visibility == OCCLUDED else PREVIEW.box
+                axes.plot(*place, "o", color=color, markeredgecolor=PREVIEW.bone)
     axes.imshow(sheet)
     keys: list[Any] = [Patch(color=part_color(number), label=" ".join(name)) for number, name in enumerate(names, 1)]
     dot = partial(Line2D, [], [], marker="o", linestyle="", markeredgecolor=PREVIEW.bone)
@@ -224,32 +199,3 @@ def preview_figure(root: Path, records: Sequence[Record], names: Pairs, bones: P
     keys += [dot(color=PREVIEW.box, label="keypoint seen"), dot(color=PREVIEW.hidden, label="keypoint occluded")]
     axes.legend(handles=keys, loc="upper left", ncols=5, fontsize=PREVIEW.font)
     return figure
-
-
-def _draw_label(axes: Axes, label: dict[str, Any], bones: Pairs, corner: np.ndarray, scale: float) -> None:
-    """Draw a label over its image, whose upper left corner [2] px is there, `scale` times its size."""
-    if label["area"] > 0:
-        x, y, width, height = (value * scale for value in label["box"])
-        axes.add_patch(Rectangle((x + corner[0], y + corner[1]), width, height, fill=False, color=PREVIEW.box))
-        axes.add_patch(Polygon(corner + scale * np.array(label["rectangle"]), fill=False, color=PREVIEW.rectangle))
-        tag = {"facecolor": PREVIEW.box, "edgecolor": PREVIEW.box, "pad": 1}
-        axes.text(x + corner[0], y + corner[1] - 2, label["name"], fontsize=PREVIEW.font, bbox=tag)
-    points = {name: (corner + scale * np.array([x, y]), v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
-    for a, b in (bone for bone in bones if {*bone} <= points.keys()):
-        axes.plot(*np.stack([points[a][0], points[b][0]], 1), color=PREVIEW.bone)
-    for (x, y), visibility in points.values():
-        color = PREVIEW.hidden if visibility == OCCLUDED else PREVIEW.box
-        axes.plot(x, y, "o", color=color, markeredgecolor=PREVIEW.bone)
-
-
-def _captions(record: Record) -> tuple[str, str]:
-    """Return captions for the plain image (joint values) and the labelled one (the instruments' visible shares)."""
-    joints = [
-        f"{joint.removesuffix('_mm')} {value:.1f} mm"
-        if joint.endswith("_mm")
-        else f"{joint} {math.degrees(value):.0f}°"
-        for instrument in record["instruments"]
-        for joint, value in instrument["joints"].items()
-    ]
-    seen = [f"{label['name']} {label['visibility']:.0%} seen" for label in record["labels"]]
-    return " · ".join([f"{record['index']:06d}", record["split"], *joints]), " · ".join(seen)

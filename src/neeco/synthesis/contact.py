@@ -25,9 +25,9 @@ from neeco.labels.drawing import LayeredDrawing, keypoint_arrays, surface_depth,
 from neeco.labels.settings import LABELS
 from neeco.raster import rasterize
 from neeco.scene import GaussianScene
-from neeco.synthesis.mixing import tissue_gaussians
+from neeco.synthesis.other_tissue import tissue_gaussians
 from neeco.synthesis.samplers import surface_points
-from neeco.synthesis.writers.folder import CONTACT as FIELDS
+from neeco.synthesis.writers import CONTACT as FIELDS
 
 NONE, TOUCHING, GRASPING = "none", "touching", "grasping"
 

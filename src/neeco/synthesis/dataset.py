@@ -7,6 +7,7 @@ and preview are written from the records of its images.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,14 +18,13 @@ from typing import Any
 
 import neeco
 from neeco.base.errors import NeecoError
-from neeco.base.files import own_folder, read_begun, require_same, sync_disk, write_json
+from neeco.base.files import own_folder, read_begun, read_bytes, require_same, sync_disk, write_json
 from neeco.base.registry import plugins
 from neeco.base.workers import address, check_workers
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.labellers import Labeller, ThresholdLabels, instruments_of
 from neeco.labels.settings import LABELS
 from neeco.scene import GaussianScene
-from neeco.synthesis.backgrounds import ImageFolder
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.card import write_card, write_preview
 from neeco.synthesis.generator import (
@@ -32,20 +32,31 @@ from neeco.synthesis.generator import (
     ENTERS_TISSUE,
     LEAVES_IMAGE,
     UNOBSERVED_TISSUE,
+    GeneratorSpec,
     SampleGenerator,
     draw_encoded,
+    draw_in_workers,
     format_counts,
 )
-from neeco.synthesis.parallel import GeneratorSpec, draw_in_workers
-from neeco.synthesis.samplers import SAMPLING, states_fingerprint
-from neeco.synthesis.settings import DEFAULT_FORMATS, WRITERS, ImageSettings, Settings, format_names, parse_class_names
-from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import (
+from neeco.synthesis.other_tissue import ImageFolder
+from neeco.synthesis.samplers import SAMPLING, states_file
+from neeco.synthesis.settings import (
+    DEFAULT_FORMATS,
+    SAMPLERS,
+    WRITERS,
+    ImageSettings,
+    Settings,
+    format_names,
+    parse_class_names,
+)
+from neeco.synthesis.writers import (
     DEPTH_MM_PER_COUNT,
     FOLDERS,
     IGNORED,
     SHARE_PER_COUNT,
     Record,
+    Writer,
+    WrittenImages,
     load_record,
     record_path,
     write_states,
@@ -103,10 +114,14 @@ def synthesize(
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
     folders = {name: ImageFolder.of(folder, name).digest() for name, folder in settings.image_folders().items()}
     check_formats(formats, settings)
-    recorded = scene.recorded.cameras[0]
+    recorded, states_sha256 = scene.recorded.cameras[0], None
+    if settings.states not in SAMPLERS:
+        absent = "no such file; --states takes interpolate, extrapolate, grid, path:FILE.jsonl or FILE.jsonl"
+        content = read_bytes(states_file(settings.states), "a file of states", absent)
+        states_sha256 = hashlib.sha256(content).hexdigest()
     identity = settings.identity() | {
         **settings.image_identity(recorded.width, recorded.height),
-        "states_sha256": states_fingerprint(settings.states),
+        "states_sha256": states_sha256,
         "similar_views": SAMPLING.n_similar,
         "camera_effects": effects,
         **folders,

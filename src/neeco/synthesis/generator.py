@@ -1,13 +1,21 @@
-"""Renderer of data set samples: sample a state and a view, render, check, apply camera effects, annotate.
+"""Renderer of data set samples: sample a state and a view, render, check, apply camera effects, annotate; in this
+process, or by several on this machine or on a Ray cluster.
 
-Sample `index` depends on scene, settings and index alone, whatever the process and order.
+Sample `index` depends on scene, settings and index alone, whatever the process and order. Each worker opens the scene
+itself. On one machine the workers map the same file and write to the same folder. A cluster needs nothing but an
+installed neeco: scene files are sent with the tasks, and image files are returned and written here.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import tempfile
+import weakref
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import combinations, product
 from pathlib import Path
 from types import MappingProxyType
@@ -19,14 +27,18 @@ from numpy.random import Generator
 from torch import Tensor
 
 from neeco.base.errors import NeecoError
+from neeco.base.files import read_bytes, sweep_unfinished
+from neeco.base.workers import Workers, address, run_tasks
 from neeco.capture.model import State, evenly_spaced
 from neeco.geometry.camera import Camera
 from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends_of
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
 from neeco.labels.settings import LABELS
+from neeco.raster.devices import readable_failures
+from neeco.raster.native import keep_freed_memory, set_threads, threads
 from neeco.scene import GaussianScene
-from neeco.synthesis.backgrounds import ALL_AS_RECORDED, Appearance, Appearances, split
+from neeco.scene.io import load_gaussians
 from neeco.synthesis.camera_effects import (
     CameraEffects,
     RecordedMotion,
@@ -37,10 +49,18 @@ from neeco.synthesis.camera_effects import (
     subframes,
 )
 from neeco.synthesis.contact import labels_of
-from neeco.synthesis.mixing import MixedSampler, Mixture
-from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler
-from neeco.synthesis.settings import Settings
-from neeco.synthesis.writers.folder import Encoded, encoded_sample, skipped_sample
+from neeco.synthesis.other_tissue import (
+    ALL_AS_RECORDED,
+    Appearance,
+    Appearances,
+    ImageFolder,
+    MixedSampler,
+    Mixture,
+    split,
+)
+from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler, states_file
+from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Settings
+from neeco.synthesis.writers import Encoded, Record, encoded_sample, skipped_sample
 
 # separate random streams per image: camera effects and appearances do not affect the sampled state and view
 EFFECTS_STREAM, APPEARANCE_STREAM = 1, 2
@@ -194,7 +214,24 @@ class SampleGenerator:
         """
         rng = self._rng(index, EFFECTS_STREAM)
         effects = {} if self.effects is None else self.effects.draw(rng)
-        drawing, refused = self._first_acceptable(index, effects)
+        settings, sampling, refused = self.settings, self._rng(index), Counter[str]()
+        for _ in range(1 if self.sampler.fixed(index) else settings.max_attempts):
+            state, camera = self.sampler(index, sampling)
+            drawing = draw_layers(self.scene, self.labeller, state, self.cameras(camera), settings.min_component)
+            if "field_of_view" in effects:
+                drawing = _within_circle(drawing, effects["field_of_view"])
+            if (reason := self.acceptance.refusal(drawing)) is None:
+                break
+            refused[reason] += 1
+        else:
+            counts = format_counts(refused)
+            if self.sampler.prescribed:
+                raise StatesRefused(f"image {index}: its given state was refused ({counts})", refused)
+            raise StatesRefused(
+                f"image {index}: no acceptable state in {settings.max_attempts} attempts ({counts}); use --states "
+                "interpolate, a smaller --margin, --no-tissue-check or more --max-attempts (and --resume)",
+                refused,
+            )
         height, width = drawing.depth.shape
         appearance = self.appearances.draw(self._rng(index, APPEARANCE_STREAM), width, height)
         image = self._image(drawing.state, drawing.camera, drawing.image, drawing.share, appearance)
@@ -207,27 +244,6 @@ class SampleGenerator:
         if self.appearances.backgrounds is not None:
             facts["background"] = appearance.source
         return LabelledSample(index, self._through_camera(drawing, effects, rng, appearance), labels, refused, facts)
-
-    def _first_acceptable(self, index: int, effects: Mapping[str, float]) -> tuple[LayeredDrawing, Counter[str]]:
-        settings, rng = self.settings, self._rng(index)
-        refused: Counter[str] = Counter()
-        for _ in range(1 if self.sampler.fixed(index) else settings.max_attempts):
-            state, camera = self.sampler(index, rng)
-            camera = self.cameras(camera)
-            drawing = draw_layers(self.scene, self.labeller, state, camera, settings.min_component)
-            if "field_of_view" in effects:
-                drawing = _within_circle(drawing, effects["field_of_view"])
-            reason = self.acceptance.refusal(drawing)
-            if reason is None:
-                return drawing, refused
-            refused[reason] += 1
-        if self.sampler.prescribed:
-            raise StatesRefused(f"image {index}: its given state was refused ({format_counts(refused)})", refused)
-        raise StatesRefused(
-            f"image {index}: no acceptable state in {settings.max_attempts} attempts ({format_counts(refused)}); "
-            "use --states interpolate, a smaller --margin, --no-tissue-check or more --max-attempts (and --resume)",
-            refused,
-        )
 
     def _rng(self, *numbers: int) -> Generator:
         return np.random.default_rng(np.random.SeedSequence([self.settings.seed, *numbers]))
@@ -326,3 +342,110 @@ def _within_circle(drawing: LayeredDrawing, radius: float) -> LayeredDrawing:
     height, width = drawing.depth.shape
     inside = torch.from_numpy(image_circle(height, width, radius) > 0.5)
     return replace(drawing, parts=drawing.parts.masked_fill(~inside, 0), share=drawing.share * inside)
+
+
+TASK_SIZE = 8  # images per task of a cluster
+
+
+@dataclass(frozen=True)
+class GeneratorSpec:
+    """Scene files and settings, small enough to be sent to another process; or `packed`, with all files' content."""
+
+    scenes: tuple[Path, ...]  # the tissue's, then those of the instruments rendered over it instead of its own
+    settings: Settings
+    device: str = "cpu"
+    files: Mapping[str, bytes] = field(default_factory=dict, compare=False)  # by path; packed: paths are relative
+    digest: str = ""  # of `files`
+
+    def packed(self) -> GeneratorSpec:
+        """Return a copy with the content of its files. Raises NeecoError if one cannot be read."""
+        files = {}
+
+        def pack(name: str, path: Path) -> Path:
+            if path.is_dir():
+                files.update(
+                    {f"{name}/{file.name}": read_bytes(file, "an image") for file in ImageFolder.of(path, name).files}
+                )
+            else:
+                files[name] = read_bytes(path, "a scene or settings file")
+            return Path(name)
+
+        spec, digest = self._moved(pack), hashlib.sha256()
+        for name in sorted(files):
+            digest.update(f"{name} {hashlib.sha256(files[name]).hexdigest()}".encode())
+        return replace(spec, files=files, digest=digest.hexdigest())
+
+    def open(self) -> SampleGenerator:
+        """Return the generator. Raises NeecoError where a file cannot be read or does not fit."""
+        if not self.files:
+            scene, *rest = (load_gaussians(path, "synthesize", torch.device(self.device)) for path in self.scenes)
+            return SampleGenerator.of(scene, self.settings, rest)
+        folder = tempfile.TemporaryDirectory()
+        for name, content in self.files.items():
+            file = Path(folder.name) / name
+            file.parent.mkdir(exist_ok=True)
+            file.write_bytes(content)
+        spec = replace(self, files={})._moved(lambda _, path: Path(folder.name) / path)
+        generator = spec.open()
+        weakref.finalize(generator, folder.cleanup)  # backgrounds are read on demand
+        return generator
+
+    def _moved(self, move: Callable[[str, Path], Path]) -> GeneratorSpec:
+        """Return a copy with other paths of files, by `move` of a name and a path."""
+        settings = self.settings
+        named = {"camera_effects": settings.camera_effects} | settings.image_folders()
+        moved: dict[str, Any] = {name: str(move(name, Path(path))) for name, path in named.items() if path is not None}
+        if settings.states not in SAMPLERS:
+            prefix = PATH_PREFIX if settings.states.startswith(PATH_PREFIX) else ""
+            moved["states"] = f"{prefix}{move('states.jsonl', states_file(settings.states))}"
+        scenes = tuple(move(f"scene{k}.safetensors", path) for k, path in enumerate(self.scenes))
+        return replace(self, scenes=scenes, settings=replace(settings, **moved))
+
+
+def limit_threads(threads: int) -> None:
+    """Set up a worker process: kernels use `threads` threads, torch one; freed memory is kept for the next sample."""
+    set_threads(threads)
+    torch.set_num_threads(1)
+    keep_freed_memory()
+
+
+def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], workers: int) -> Iterator[Record]:
+    """Yield the records of these images as they are rendered, in any order; the images are written to `output`.
+
+    Raises NeecoError with a worker's error, and if workers are killed repeatedly.
+    """
+    shared: tuple[GeneratorSpec, Path | None] = (spec, output)
+    size, each = 1, max(1, threads() // workers)
+    if address():
+        shared, size, each = (spec.packed(), None), TASK_SIZE, 1
+    tasks = [tuple(indices[k : k + size]) for k in range(0, len(indices), size)]
+    try:
+        with contextlib.closing(run_tasks(_draw, shared, tasks, Workers(count=workers, threads=each))) as events:
+            for event in events:
+                if event.stage == "failed":
+                    raise NeecoError(event.value)
+                if event.stage == "abandoned":
+                    problem = f"workers were killed repeatedly at image {tasks[event.index][0]} ({event.value})"
+                    raise NeecoError(f"--workers: {problem}; if memory ran out, use fewer workers (and --resume)")
+                for result in event.value if event.stage == "done" else ():
+                    yield result.write(output) if isinstance(result, Encoded) else result
+    finally:
+        sweep_unfinished(output)  # a worker's unfinished files
+
+
+def _draw(
+    shared: tuple[GeneratorSpec, Path | None], indices: tuple[int, ...], threads: int
+) -> list[Record] | list[Encoded]:
+    """Render these images in a worker; return their records if it can write to the output, else all files."""
+    spec, output = shared
+    with readable_failures():
+        generator = _opened(spec, threads)
+        encoded = (draw_encoded(generator, index) for index in indices)
+        return list(encoded) if output is None else [image.write(output) for image in encoded]
+
+
+@lru_cache(maxsize=1)
+def _opened(spec: GeneratorSpec, threads: int) -> SampleGenerator:
+    """Return the generator, opened once per worker."""
+    limit_threads(threads)
+    return spec.open()

@@ -14,7 +14,7 @@ import torch
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import write_atomically, write_json
 from neeco.capture import read_capture
-from neeco.capture.checks.truth import PARTS_FILE
+from neeco.capture.checks.frames import PARTS_FILE
 from neeco.capture.images import to_bytes, write_image, write_labels
 from neeco.capture.model import State
 from neeco.capture.readers import read_states
@@ -22,9 +22,8 @@ from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw, to_numpy
 from neeco.scene import DrawableScene
 from neeco.synthesis.dataset import part_ids
-from neeco.synthesis.samplers import DrawnCameras, moved_camera
+from neeco.synthesis.samplers import DrawnCameras, PathStates, interpolate_pose, moved_camera
 from neeco.synthesis.settings import AS_RECORDED, ImageSettings
-from neeco.synthesis.states import PathStates, interpolate_pose
 from neeco.training.run import TrainedRun
 
 STATES_FOLDER = "states"

@@ -45,8 +45,7 @@ from neeco.labels.labellers import instruments_of
 from neeco.raster.native import torch_threads
 from neeco.scene.gaussian_scene import GaussianScene, require_gaussians
 from neeco.scene.io import load_gaussians, save_scene
-from neeco.synthesis.generator import SampleGenerator
-from neeco.synthesis.parallel import GeneratorSpec, limit_threads
+from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, limit_threads
 from neeco.synthesis.samplers import make_sampler
 from neeco.synthesis.settings import LabelWay, Settings, Views
 from neeco.training.run import SCENE_FILE, load_run

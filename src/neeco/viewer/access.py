@@ -50,8 +50,18 @@ class Access:
     def at(cls, host: str, port: int) -> Access:
         """Return the access of a server on `host` and `port`, or the next free one, with a new token. Raises
         NeecoError."""
-        host = host.strip("[]")
-        return cls(host, _free_port(host, port), secrets.token_urlsafe(TOKEN_BYTES))
+        host, last = host.strip("[]"), None
+        if not 0 < port < 65536:
+            raise NeecoError(f"--port must be 1 to 65535 (got {port})")
+        for candidate in range(port, min(port + MAX_PORTS, 65536)):
+            try:
+                socket.create_server((host, candidate), family=family_of(host)).close()
+                return cls(host, candidate, secrets.token_urlsafe(TOKEN_BYTES))
+            except (socket.gaierror, UnicodeError) as error:
+                raise NeecoError(f"--host: {host!r} is unknown ({error}); give a name or address") from None
+            except OSError as error:
+                last = error
+        raise NeecoError(f"--host: {host}: --port {port} and the next ones: {last}; give others")
 
     @property
     def address(self) -> str:
@@ -146,19 +156,3 @@ def _page_headers(page: bytes, host: str) -> dict[str, str]:
         "X-Content-Type-Options": "nosniff",
         "Cache-Control": "no-store",
     }
-
-
-def _free_port(host: str, port: int) -> int:
-    """Return `port`, or the next free one on `host`. Raises NeecoError for an invalid host or port."""
-    if not 0 < port < 65536:
-        raise NeecoError(f"--port must be 1 to 65535 (got {port})")
-    last: Exception = OSError()
-    for candidate in range(port, min(port + MAX_PORTS, 65536)):
-        try:
-            socket.create_server((host, candidate), family=family_of(host)).close()
-            return candidate
-        except (socket.gaierror, UnicodeError) as error:
-            raise NeecoError(f"--host: {host!r} is unknown ({error}); give a name or address") from None
-        except OSError as error:
-            last = error
-    raise NeecoError(f"--host: {host}: --port {port} and the next ones: {last}; give others")

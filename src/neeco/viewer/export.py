@@ -11,7 +11,6 @@ import base64
 import hashlib
 import json
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -35,7 +34,7 @@ from neeco.scene.drawable import ArticulatedMotion
 from neeco.scene.gaussian_scene import require_gaussians
 from neeco.synthesis.samplers import shafts_of
 from neeco.training.run import TrainedRun, load_run
-from neeco.viewer.controls import slider_ranges
+from neeco.viewer.views import slider_ranges
 
 SCHEMA = "neeco-page/1"
 SCRIPTS = ("scene.js", "states.js", "drawing.js", "camera.js", "panel.js", "main.js")  # in this order, as one module
@@ -163,64 +162,57 @@ def pack(scene: DrawableScene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
     scene = require_gaussians(scene, "--export")
     canonical = scene.canonical
     degree = min(sh_degree, scene.sh_degree)
-    means, boxes = _in_boxes(canonical.means, canonical.counts)
+    rows, boxes = [], []  # positions relative to the box of each body, and the boxes' corners
+    for body in torch.split(canonical.means, list(canonical.counts)):
+        low, high = (body.amin(0), body.amax(0)) if len(body) else (body.new_zeros(3), body.new_ones(3))
+        rows.append(_rounded((body - low) / (high - low).clamp_min(1e-9) * EXPORT.position_steps))
+        boxes.append([low.tolist(), high.tolist()])
     scales, scale_range = _quantized(motion.log_scales.clamp_min(float(np.log(EXPORT.thinnest_mm))), 255)
     base, base_range = _quantized(canonical.sh_dc[:, 0] * SH_C0 + 0.5, 65535)
     turns = [_quantized(column[:, None], 65535) for column in motion.amounts.flatten(1).unbind(1)]
     none = np.zeros((len(canonical), 0), np.int64)  # where nothing turns
-    harmonics, bands = _harmonics(canonical.sh_rest, degree)
+    rest = canonical.sh_rest  # harmonics [N, 15, 3] without the first, in -127 to 127 of the maximum of every degree
+    harmonics, bands = [none], []
+    for d in range(1, degree + 1):
+        band = rest[:, d * d - 1 : (d + 1) ** 2 - 1]
+        largest = max(float(band.abs().max()) if band.numel() else 0.0, 1e-9)
+        harmonics.append(_rounded(band / largest * 127).reshape(len(rest), -1))
+        bands.append(largest)
     fields = (  # name, whole numbers [N, K], type
-        ("mean", means, "uint24"),
+        ("mean", np.concatenate(rows), "uint24"),
         ("quat", _rounded(normalize(canonical.quats, dim=1) * 127), "int8"),
         ("scale", scales, "uint8"),
         ("opacity", _rounded(torch.sigmoid(canonical.opacity_logits)[:, None] * 255), "uint8"),
         ("base", base, "uint16"),
         ("turn", np.concatenate([none, *(numbers for numbers, _ in turns)], 1), "uint16"),
         ("label", _rounded(scene.label_channels() * 255), "uint8"),
-        ("sh", harmonics, "int8"),
+        ("sh", np.concatenate(harmonics, 1), "int8"),
     )
     turn_ranges = [ends for _, ends in turns]
+    lamps = zip(scene.shadow_offsets.tolist(), scene.shadow_strengths.clamp(0, 1).tolist(), strict=True)
     header = {
         "schema": SCHEMA,
         "counts": list(canonical.counts),
         "degree": degree,
         "fields": [[name, numbers.shape[1], kind] for name, numbers, kind in fields],
         "ranges": {"mean": boxes, "scale": scale_range, "base": base_range, "turn": turn_ranges, "sh": bands},
-        "light": _light(scene),
+        "light": {
+            "falloff": scene.falloff.tolist(),
+            "vignette": scene.vignette.tolist(),
+            "background": scene.background,
+            "shadow_width": float(scene.shadow_width),
+            "lamps": [[*offset, strength] for offset, strength in lamps if strength > 0] if scene.casts_shadow else [],
+        },
         "threshold": threshold_of(scene),
         "labels": [list(name) for name in scene.label_names],
         "instruments": _instruments(scene, motion),
         "recorded": _recorded(scene, motion),
     }
-    return header, b"".join(_planes(numbers, kind) for _, numbers, kind in fields)
-
-
-def _planes(numbers: np.ndarray, kind: str) -> bytes:
-    """Return K planes of N numbers [N, K], all low bytes before the high ones."""
-    split = np.ascontiguousarray(numbers.T, "<i4")[..., None].view(np.uint8)  # [K, N, 4]
-    return np.ascontiguousarray(split[..., : BYTES[kind]].transpose(2, 0, 1)).tobytes()
-
-
-def _harmonics(rest: Tensor, degree: int) -> tuple[np.ndarray, list[float]]:
-    """Return [N, 3 K] in -127 to 127 of harmonics [N, 15, 3], without the first, and the value of 127 for every degree:
-    its maximum."""
-    blocks, bands = [np.zeros((len(rest), 0), np.int64)], []
-    for d in range(1, degree + 1):
-        band = rest[:, d * d - 1 : (d + 1) ** 2 - 1]
-        largest = max(float(band.abs().max()) if band.numel() else 0.0, 1e-9)
-        blocks.append(_rounded(band / largest * 127).reshape(len(rest), -1))
-        bands.append(largest)
-    return np.concatenate(blocks, 1), bands
-
-
-def _in_boxes(means: Tensor, counts: Sequence[int]) -> tuple[np.ndarray, list[list[list[float]]]]:
-    """Return positions [N, 3] relative to the box of each body, and the boxes' corners."""
-    rows, boxes = [], []
-    for body in torch.split(means, list(counts)):
-        low, high = (body.amin(0), body.amax(0)) if len(body) else (means.new_zeros(3), means.new_ones(3))
-        rows.append(_rounded((body - low) / (high - low).clamp_min(1e-9) * EXPORT.position_steps))
-        boxes.append([low.tolist(), high.tolist()])
-    return np.concatenate(rows), boxes
+    planes = []
+    for _, numbers, kind in fields:  # K planes of N numbers, all low bytes before the high ones
+        split = np.ascontiguousarray(numbers.T, "<i4")[..., None].view(np.uint8)  # [K, N, 4]
+        planes.append(np.ascontiguousarray(split[..., : BYTES[kind]].transpose(2, 0, 1)).tobytes())
+    return header, b"".join(planes)
 
 
 def _quantized(values: Tensor, steps: int) -> tuple[np.ndarray, list[float]]:
@@ -233,17 +225,6 @@ def _rounded(values: Tensor) -> np.ndarray:
     if not values.isfinite().all():
         raise NeecoError(NOT_FINITE)
     return np.rint(values.double().cpu().numpy()).astype(np.int64)
-
-
-def _light(scene: GaussianScene) -> dict[str, Any]:
-    lamps = zip(scene.shadow_offsets.tolist(), scene.shadow_strengths.clamp(0, 1).tolist(), strict=True)
-    return {
-        "falloff": scene.falloff.tolist(),
-        "vignette": scene.vignette.tolist(),
-        "background": scene.background,
-        "shadow_width": float(scene.shadow_width),
-        "lamps": [[*offset, strength] for offset, strength in lamps if strength > 0] if scene.casts_shadow else [],
-    }
 
 
 def _instruments(scene: GaussianScene, motion: ArticulatedMotion) -> list[dict[str, Any]]:

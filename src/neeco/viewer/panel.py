@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neeco.capture.model import Instrument, InstrumentState
-from neeco.synthesis.states import JointRange, Shaft
-from neeco.viewer.controls import Controls, InstrumentControls, slider_ranges
+from neeco.synthesis.samplers import JointRange, Shaft
 from neeco.viewer.runs import FrameScore, LoadedRun, Timeline
-from neeco.viewer.views import IMAGE, Picture, views_of
+from neeco.viewer.views import IMAGE, Controls, InstrumentControls, Picture, slider_ranges, views_of
 
 if TYPE_CHECKING:
     import viser
 
-    from neeco.viewer.viser_scene import Overlays
+    from neeco.viewer.views import Overlays
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,18 +53,44 @@ class Panel:
     ) -> None:
         """changed: called when the user moved something; go_to: with the frame whose camera is wanted; toggle_gizmo:
         with an instrument's name and number, and whether its gizmo appears."""
-        self._gui, self._loaded = client.gui, loaded
-        self._changed, self._go_to, self._toggle_gizmo = changed, go_to, toggle_gizmo
-        self._worst: list[int] = []
+        gui, scene, recorded = client.gui, loaded.scene, loaded.recorded
+        self._gui, self._loaded, self._go_to = gui, loaded, go_to
+        self._plot: Any = None
         self._plotted: tuple[Timeline, int] | None = None  # and the number of scored frames in it
         self._plotted_at = 0.0
-        self._gui.main_panel.dock_right()  # otherwise it would hide a part of the picture
-        self.status = self._gui.add_html("")
-        self._add_picture()
-        self._add_recording()
-        self.instruments = self._add_instruments()
-        self._add_timeline()
-        self._add_saving()
+        gui.main_panel.dock_right()  # otherwise it would hide a part of the picture
+        self.status = gui.add_html("")
+        with gui.add_folder("Picture"):
+            self.view = gui.add_dropdown("show", views_of(scene, bool(loaded.frames)), initial_value=IMAGE)
+        with gui.add_folder("Recording"):
+            hint = "Between two frames the state is interpolated."
+            self.frame = gui.add_slider("frame", 0.0, float(len(recorded.states) - 1), 0.1, 0.0, hint=hint)
+            self.play = gui.add_checkbox("play", False)
+            poses = [camera.world_from_camera for camera in recorded.cameras]
+            moves = any(not pose.equal(poses[0]) for pose in poses)
+            hint = "The camera goes along with the frames."
+            self.follows = gui.add_checkbox("camera of the frame", moves, hint=hint)
+            go = gui.add_button("go to this frame's camera")
+            self.cameras = gui.add_checkbox("recorded cameras", False, hint="Click one to stand there.")
+            self.points = gui.add_checkbox("sparse points", False, visible=loaded.capture is not None)
+        for control in (self.view, self.frame, self.play, self.follows, self.cameras, self.points):
+            control.on_update(_by_user(changed))
+        go.on_click(lambda _: go_to(round(self.place)))
+        ranges = slider_ranges(scene.instruments, recorded.states)
+        self.instruments = [
+            InstrumentPanel(gui, item, ranges, loaded.shafts[item.name], changed, partial(toggle_gizmo, item.name, k))
+            for k, item in enumerate(scene.instruments)
+        ]
+        self._timeline_folder = gui.add_folder("PSNR of every frame", visible=bool(loaded.frames))
+        with self._timeline_folder:
+            hint = "Go to that frame, state and camera."
+            self.worst = gui.add_dropdown("worst", (NONE_CHOSEN,), initial_value=NONE_CHOSEN, hint=hint)
+        self.worst.on_update(_by_user(self._worst_chosen))
+        with gui.add_folder("Keep"):
+            self.keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
+            hint = "As neeco synthesize writes one, from here."
+            self.save = gui.add_button("save labelled image", disabled=not scene.label_names, hint=hint)
+            self.saved = gui.add_html("")
 
     def controls(self, overlays: Overlays) -> Controls:
         """Return the values of the sliders."""
@@ -91,81 +116,32 @@ class Panel:
         # the names differ where the run has changed, and this panel not yet
         if timeline.loaded.recorded.names != names or len(scored) < 2:
             return
-        self._draw_plot((scored.astype(np.float64), psnr[scored]))
-        if self.worst.value == NONE_CHOSEN:
-            self._worst = timeline.worst()
-            options = [f"{frame}: {psnr[frame]:.1f} dB, {splits[frame]}, {names[frame]}" for frame in self._worst]
-            if (NONE_CHOSEN, *options) != tuple(self.worst.options):
-                self.worst.options = (NONE_CHOSEN, *options)
-
-    def _add_picture(self) -> None:
-        gui, views = self._gui, views_of(self._loaded.scene, bool(self._loaded.frames))
-        with gui.add_folder("Picture"):
-            self.view = gui.add_dropdown("show", views, initial_value=IMAGE)
-        self.view.on_update(_by_user(self._changed))
-
-    def _add_recording(self) -> None:
-        gui, last = self._gui, len(self._loaded.recorded.states) - 1
-        poses = [camera.world_from_camera for camera in self._loaded.recorded.cameras]
-        moves = any(not pose.equal(poses[0]) for pose in poses)
-        with gui.add_folder("Recording"):
-            hint = "Between two frames the state is interpolated."
-            self.frame = gui.add_slider("frame", 0.0, float(last), 0.1, 0.0, hint=hint)
-            self.play = gui.add_checkbox("play", False)
-            hint = "The camera goes along with the frames."
-            self.follows = gui.add_checkbox("camera of the frame", moves, hint=hint)
-            self.go = gui.add_button("go to this frame's camera")
-            self.cameras = gui.add_checkbox("recorded cameras", False, hint="Click one to stand there.")
-            self.points = gui.add_checkbox("sparse points", False, visible=self._loaded.capture is not None)
-        self.frame.on_update(_by_user(self._changed))
-        for control in (self.play, self.follows, self.cameras, self.points):
-            control.on_update(_by_user(self._changed))
-        self.go.on_click(lambda _: self._go_to(round(self.place)))
-
-    def _add_instruments(self) -> list[InstrumentPanel]:
-        loaded, panels = self._loaded, []
-        ranges = slider_ranges(loaded.scene.instruments, loaded.recorded.states)
-        for number, instrument in enumerate(loaded.scene.instruments):
-            shaft, toggle = loaded.shafts[instrument.name], partial(self._toggle_gizmo, instrument.name, number)
-            panels.append(InstrumentPanel(self._gui, instrument, ranges, shaft, self._changed, toggle))
-        return panels
-
-    def _add_timeline(self) -> None:
-        self._plot: Any = None
-        self._timeline_folder = self._gui.add_folder("PSNR of every frame", visible=bool(self._loaded.frames))
-        with self._timeline_folder:
-            hint = "Go to that frame, state and camera."
-            self.worst = self._gui.add_dropdown("worst", (NONE_CHOSEN,), initial_value=NONE_CHOSEN, hint=hint)
-        self.worst.on_update(_by_user(self._worst_chosen))
-
-    def _add_saving(self) -> None:
-        gui, labelled = self._gui, bool(self._loaded.scene.label_names)
-        with gui.add_folder("Keep"):
-            self.keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
-            hint = "As neeco synthesize writes one, from here."
-            self.save = gui.add_button("save labelled image", disabled=not labelled, hint=hint)
-            self.saved = gui.add_html("")
-
-    def _draw_plot(self, data: tuple[np.ndarray, ...]) -> None:
+        data = scored.astype(np.float64), psnr[scored]
         if self._plot is not None:
             self._plot.data = data
-            return
-        label = f"{self._loaded.name} (dB)"[: PANEL.line]
-        with self._timeline_folder:
-            self._plot = self._gui.add_uplot(
-                data,
-                ({"label": "frame"}, {"label": label, "stroke": PLOT_COLOR, "width": 1.5, "points": {"show": False}}),
-                scales={"x": {"time": False}, "y": {"auto": True}},
-                axes=({"size": 32}, {"size": 34}),
-                legend={"show": False},
-                height=PANEL.plot_height,
-                padding=(6, 8, 0, 0),
-            )
+        else:
+            label = f"{self._loaded.name} (dB)"[: PANEL.line]
+            line = {"label": label, "stroke": PLOT_COLOR, "width": 1.5, "points": {"show": False}}
+            with self._timeline_folder:
+                self._plot = self._gui.add_uplot(
+                    data,
+                    ({"label": "frame"}, line),
+                    scales={"x": {"time": False}, "y": {"auto": True}},
+                    axes=({"size": 32}, {"size": 34}),
+                    legend={"show": False},
+                    height=PANEL.plot_height,
+                    padding=(6, 8, 0, 0),
+                )
+        if self.worst.value == NONE_CHOSEN:
+            worst = timeline.worst()
+            options = [f"{frame}: {psnr[frame]:.1f} dB, {splits[frame]}, {names[frame]}" for frame in worst]
+            if (NONE_CHOSEN, *options) != tuple(self.worst.options):
+                self.worst.options = (NONE_CHOSEN, *options)
 
     def _worst_chosen(self) -> None:
         if self.worst.value == NONE_CHOSEN:
             return
-        frame = self._worst[list(self.worst.options).index(self.worst.value) - 1]
+        frame = int(self.worst.value.partition(":")[0])
         for instrument in self.instruments:
             instrument.reset()
         self.play.value = False
@@ -193,8 +169,16 @@ class InstrumentPanel:
         # unit of the sliders of a reading: degrees (revolute) or mm (prismatic)
         self._per_unit = {joint: 1.0 if instrument.slides(joint) else math.degrees(1.0) for joint in instrument.joints}
         with gui.add_folder(f"Instrument {self.name}"):
-            spans = self._ranges.items()
-            self._joints = {joint: _joint_slider(gui, joint, span, self._per_unit[joint]) for joint, span in spans}
+            self._joints: dict[str, viser.GuiSliderHandle[float]] = {}
+            for joint, span in self._ranges.items():  # ends rounded outwards; a reading outside is rendered at its end
+                per_unit = self._per_unit[joint]
+                lower, upper = per_unit * span.lower, per_unit * span.upper
+                digits = max(0, 1 - math.floor(math.log10((upper - lower) / 5)))
+                step = 10.0**-digits
+                lower = round(math.floor(lower / step) * step, digits)
+                upper = round(math.ceil(upper / step) * step, digits)
+                unit, begin = "mm" if per_unit == 1 else "°", min(max(0.0, lower), upper)
+                self._joints[joint] = gui.add_slider(f"{joint} ({unit})", lower, upper, step, begin)
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
             end, angle = "About the shaft's end.", PANEL.yaw_deg
             self._moves = [  # slide in mm; roll, yaw and pitch in degrees
@@ -263,17 +247,6 @@ class InstrumentPanel:
 def _by_user(action: Callable[[], None]) -> Callable[[viser.GuiEvent[Any]], None]:
     """Wrap `action` to run only when a user, not the program, moved a control."""
     return lambda event: None if event.client is None else action()
-
-
-def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: float) -> viser.GuiSliderHandle[float]:
-    """Add a slider in mm where `per_unit` is 1, else in degrees. Ends are rounded outwards; a reading outside is
-    rendered at its end."""
-    lower, upper = per_unit * span.lower, per_unit * span.upper
-    digits = max(0, 1 - math.floor(math.log10((upper - lower) / 5)))
-    step = 10.0**-digits
-    lower, upper = round(math.floor(lower / step) * step, digits), round(math.ceil(upper / step) * step, digits)
-    unit = "mm" if per_unit == 1 else "°"
-    return gui.add_slider(f"{joint} ({unit})", lower, upper, step, min(max(0.0, lower), upper))
 
 
 def status_html(

@@ -19,7 +19,7 @@ from neeco.viewer.access import HOST, PORT
 from neeco.viewer.panel import message_html
 from neeco.viewer.runs import VIEW, median_distance
 from neeco.viewer.server import ViserPage
-from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, stands_at, wxyz_of
+from neeco.viewer.views import Overlays, aspect_of, browser_camera, fitting_view, jump, stands_at, wxyz_of
 
 if TYPE_CHECKING:
     import viser
@@ -55,11 +55,12 @@ class RecordingServer(ViserPage):
         self.unit = VIEW.distance_units / self.distance
         super().__init__(host, port, [frame.camera for frame in frames], self.distance, self.unit)
         self.sessions: dict[int, RecordingSession] = {}
-        self._server.on_client_connect(self._connect)
-        self._server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
 
-    def _connect(self, client: viser.ClientHandle) -> None:
-        self.sessions[client.client_id] = RecordingSession(client, self.capture, self.unit, self.distance)
+        def connect(client: viser.ClientHandle) -> None:
+            self.sessions[client.client_id] = RecordingSession(client, self.capture, self.unit, self.distance)
+
+        self._server.on_client_connect(connect)
+        self._server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
 
 
 class RecordingSession:

@@ -1,8 +1,11 @@
-"""The viewed run folder: its scene, also during training, and the score of each frame."""
+"""The viewed run folder: its scene, also during training, the score of each frame, and the files that users save from
+it: states for `synthesize --states`, and single labelled images.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -16,17 +19,23 @@ import torch
 from torch import Tensor
 
 from neeco.base.errors import NeecoError
+from neeco.base.files import LOCK_WAIT_S, own_folder, read_text, write_text
 from neeco.capture import read_capture
-from neeco.capture.model import Capture, Frame
+from neeco.capture.model import Capture, Frame, State
+from neeco.capture.readers import StateLine, read_states
+from neeco.capture.writer import camera_to_json, state_to_json
 from neeco.evaluation.image_metrics import psnr
-from neeco.evaluation.mask_folders import load_reference
-from neeco.evaluation.mask_metrics import iou
+from neeco.evaluation.masks import iou, load_reference
 from neeco.geometry.camera import Camera
-from neeco.labels.drawing import draw, to_numpy
+from neeco.labels.annotation import annotate
+from neeco.labels.drawing import draw, draw_layers, to_numpy
+from neeco.labels.labellers import CompositedLabels
 from neeco.scene import DrawableScene, Recorded, load_scene
-from neeco.scene.gaussian_scene import is_gaussian
-from neeco.synthesis.samplers import shafts_of
-from neeco.synthesis.states import Shaft
+from neeco.scene.gaussian_scene import is_gaussian, require_gaussians
+from neeco.synthesis.contact import labels_of
+from neeco.synthesis.samplers import DrawnCameras, Shaft, moved_camera, shafts_of
+from neeco.synthesis.settings import RECORDED_SIZE, Settings, SizeSettings
+from neeco.synthesis.writers import encoded_sample, load_record, record_path
 from neeco.training.run import SCENE_FILE, checkpoint_path, read_checkpoint, read_config
 
 
@@ -266,3 +275,54 @@ def coarse_psnr(loaded: LoadedRun, index: int) -> float:
         mask = torch.from_numpy(cv2.resize(mask.numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
     rendered = loaded.scene.render(frame.state, camera).color.clamp(0, 1).cpu()
     return psnr(rendered, torch.from_numpy(image), mask)
+
+
+FOLDER = "kept"  # of the run
+STATES, SAMPLES = "states.jsonl", "samples"
+
+
+class SavedStates:
+    """Writes into one run's folder `kept/`, whoever of several users asks. Any thread may call it. size: of images."""
+
+    def __init__(self, run: Path, size: SizeSettings = RECORDED_SIZE) -> None:
+        self.size = size
+        self.folder = Path(run) / FOLDER
+        self._lock = threading.Lock()
+
+    @property
+    def states_path(self) -> Path:
+        """File for `synthesize --states`."""
+        return self.folder / STATES
+
+    def add(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> int:
+        """Add a state and the camera [4, 4] that sees it (OpenCV axes, mm); returns how many are saved. Raises
+        NeecoError where the file cannot be written, or holds states of another scene."""
+        line = json.dumps(state_to_json(state) | {"camera": camera_to_json(world_from_camera)}, allow_nan=False)
+        with self._lock, own_folder(self.folder, wait_s=LOCK_WAIT_S):
+            count = len(self.read(loaded))
+            before = read_text(self.states_path, "states").splitlines() if count else []
+            write_text(self.states_path, "".join(f"{entry}\n" for entry in [*before, line]))
+            return count + 1
+
+    def read(self, loaded: LoadedRun) -> list[StateLine]:
+        """Read the saved states, checked against the scene. Raises NeecoError."""
+        if not self.states_path.exists():
+            return []
+        return read_states(self.states_path, loaded.scene.instruments)
+
+    def save_image(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> Path:
+        """Write one labelled image as `synthesize` does, of the recorded cameras' intrinsics, as large as was asked;
+        returns the image's path. Raises NeecoError for a scene without labels, and where it cannot be written."""
+        scene = require_gaussians(loaded.scene, "save labelled image")
+        labeller = CompositedLabels(scene)
+        camera = DrawnCameras(self.size)(moved_camera(loaded.recorded.cameras[0], world_from_camera))
+        with scene.torch_threads(), torch.no_grad():
+            drawing = draw_layers(scene, labeller, state, camera, Settings.min_component)
+            labels = labels_of(scene, drawing, annotate(scene, drawing, labeller.names))
+        root = self.folder / SAMPLES
+        with self._lock, own_folder(root, wait_s=LOCK_WAIT_S):
+            index = 0
+            while record_path(root, index).exists() and load_record(root, index) is not None:
+                index += 1
+            record = encoded_sample(index, drawing, labels).write(root)
+        return root / record["image"]

@@ -19,7 +19,7 @@ from downstream_world import Pixels, bar_parts, read_grey, save_grey, write_set
 from torch import Tensor
 
 from neeco.base.errors import NeecoError
-from neeco.evaluation.mask_metrics import iou
+from neeco.evaluation.masks import iou
 from neeco.studies.downstream import DownstreamRequest
 from neeco.studies.downstream import model as models_module
 from neeco.studies.downstream.experiment import (

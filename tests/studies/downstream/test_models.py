@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from neeco.base.errors import NeecoError
-from neeco.evaluation.mask_metrics import iou
+from neeco.evaluation.masks import iou
 from neeco.studies.downstream.model import WEIGHTS_FILE, find_models, input_size, model_class
 from neeco.studies.downstream.models.dfine import DFine
 from neeco.studies.downstream.models.unet import ResidualUNet, UNet

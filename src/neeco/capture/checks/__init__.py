@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from neeco.capture.checks.frames import check_frames, check_pictures, check_states
-from neeco.capture.checks.pictures import read_pictures
-from neeco.capture.checks.placement import check_placement
-from neeco.capture.checks.truth import check_truth
-from neeco.capture.checks.verdicts import ImageVerdicts
+from neeco.capture.checks.evidence import read_pictures
+from neeco.capture.checks.frames import check_frames, check_pictures, check_states, check_truth
+from neeco.capture.checks.verdicts import ImageVerdicts, check_placement
 from neeco.capture.documents import Problem, ProblemReport, condensed, errors_only, key_name
 from neeco.capture.model import Capture
 from neeco.capture.readers import capture_of, parse_capture
@@ -33,9 +30,6 @@ class CaptureSummary:
     joints: dict[str, tuple[float, float]]  # "instrument.joint" -> lowest and highest value, rad
     travel_mm: dict[str, float]  # instrument -> diagonal of the box its origin moves in
     still: bool = False  # whether the scope was still
-
-    def as_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True)

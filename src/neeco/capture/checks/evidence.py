@@ -1,5 +1,7 @@
 """Evidence of the images on cameras and instrument poses.
 
+One pass over a capture's images and masks finds faults of each file, and reduces images for the comparisons.
+
 Colours: a sparse point has the colour of the pixel that it projects to. Lighting and exposure vary between images, so
 differences between a point's brightness and its neighbours' are correlated with those in the image: by 0.3 to 0.7 if
 images and cameras correspond, by less than 0.1 if not.
@@ -13,20 +15,97 @@ poses, lies on moving pixels.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property, partial
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from neeco.capture.checks.pictures import Picture, compared_rows, in_threads, reduced_size, resized
+from neeco.base.errors import NeecoError
 from neeco.capture.checks.settings import SETTINGS, Margin
-from neeco.capture.model import evenly_spaced
+from neeco.capture.images import Hidden, byte_pixels, measure_hidden
+from neeco.capture.model import Frame, evenly_spaced
+from neeco.capture.points import measured_sample
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project
+
+Result = TypeVar("Result")
+
+
+@dataclass(kw_only=True)
+class Picture:
+    """A frame's image and mask, decoded once. Errors name files without their folders."""
+
+    digest: bytes | None = None  # of the pixels; None when not readable
+    image: np.ndarray | None = None  # uint8 [h, w, 3], at most SETTINGS.compared_width px wide; None: not used
+    mask: np.ndarray | None = None  # float32 [h, w], share of each pixel that counts; None: all
+    uniform: bool = False  # one colour
+    hidden: Hidden | None = None  # content hidden by the mask; None: no usable mask
+    image_error: str = ""
+    mask_error: str = ""
+
+
+def in_threads(function: Callable[..., Result], *arguments: Iterable[Any]) -> list[Result]:
+    """Return `list(map(function, *arguments))`, computed in threads: Pillow, OpenCV and NumPy release the GIL."""
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        return list(pool.map(function, *arguments))
+
+
+def compared_rows(parsed: Parsed) -> np.ndarray:
+    """Return the frames [F] whose images are compared with points and states."""
+    return np.array(evenly_spaced(len(parsed.frames), SETTINGS.max_images))
+
+
+def read_pictures(parsed: Parsed) -> list[Picture]:
+    """Decode the image and the mask of every frame."""
+    compared = set(compared_rows(parsed).tolist())
+    points = measured_sample(parsed.points)
+
+    def read(row: int) -> Picture:
+        frame, picture, pixels = parsed.frames[row], Picture(), None
+        try:
+            pixels = frame.load_pixels()
+            picture.digest = hashlib.blake2b(pixels.tobytes(), digest_size=16).digest()
+            picture.uniform = bool((pixels[0] == pixels[0, 0]).all() and (pixels == pixels[0, 0]).all())
+            if row in compared:
+                picture.image = resized(byte_pixels(pixels), reduced_size(frame))
+        except NeecoError as error:
+            picture.image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
+        try:
+            counted = frame.load_mask()
+            mask = None if counted is None else counted.numpy()
+            if mask is not None and not mask.any():
+                picture.mask_error = "ignores every pixel; invert it (black is ignored), or write 255 instead of 1"
+            elif mask is not None and pixels is not None:
+                camera = None if row in parsed.without_camera else frame.camera
+                picture.hidden = measure_hidden(pixels, mask, camera, points)
+                picture.mask = resized(mask.astype(np.float32), reduced_size(frame)) if row in compared else None
+        except NeecoError as error:
+            picture.mask_error = str(error).replace(
+                str(frame.mask_path), frame.mask_path.name if frame.mask_path else ""
+            )
+        return picture
+
+    return in_threads(read, range(len(parsed.frames)))
+
+
+def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return an image area-averaged to (width, height)."""
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def reduced_size(frame: Frame) -> tuple[int, int]:
+    """Return (width, height) px to which a frame's image is reduced."""
+    factor = min(1.0, SETTINGS.compared_width / frame.camera.width)
+    return round(frame.camera.width * factor), max(1, round(frame.camera.height * factor))
+
 
 MIN_DEPTH = 1e-3  # mm; points with smaller depth are not in front of a camera
 LUMA = np.array([0.299, 0.587, 0.114])  # luma weights of red, green, blue
@@ -91,10 +170,6 @@ class CameraArrays:
             u, v = (u, v) if pixels is None else pixels(u, v, width, height)
             return u, v, (local[..., 2] > MIN_DEPTH) & (u > 0) & (u < width) & (v > 0) & (v < height)
 
-    def sees(self, points: np.ndarray) -> np.ndarray:
-        """Return which of points [F, P, 3] or [1, P, 3] each camera has in its image, bool [F, P]."""
-        return self.project(points)[2]
-
 
 class ColorEvidence:
     """Agreement of the sparse points' brightness with evenly spaced images."""
@@ -145,8 +220,9 @@ class ColorEvidence:
         return mean / max(recorded, 1e-9), gain_certainty((agreement - self.recorded)[both]), mean
 
     def agreement(self, candidate: Candidate | None = None, every: int = 1, *, coarse: bool = False) -> np.ndarray:
-        """Return [F] correlation of the points' brightness with the images', relative to their neighbours: 0 with too
-        few visible points, NaN without a camera in the candidate. Evaluated for some images only."""
+        """Return [F] correlation of the points' brightness with the images', relative to their neighbours (coarse:
+        these relative to more neighbours): 0 with too few visible points, NaN without a camera in the candidate. every:
+        evaluated for some images only."""
         few = slice(None, None, every)
         cameras, pixels = self.cameras, None
         if candidate is not None:
@@ -155,8 +231,15 @@ class ColorEvidence:
             cameras = replace(cameras, poses=poses)
         u, v, inside = cameras[np.arange(len(self.rows))[few]].project(self.points, pixels)
         observed = np.stack([_sample(gray, *place) for gray, *place in zip(self.grays[few], u, v, inside, strict=True)])
+
+        def mean(values: np.ndarray, count: int) -> np.ndarray:
+            near = self.neighbours[:, :count]
+            return np.asarray((values * inside)[:, near].sum(-1) / inside[:, near].sum(-1).clip(1))
+
+        planes, count = (observed, np.tile(self.brightness, (len(u), 1))), SETTINGS.neighbours
         observed, color = (
-            self._relative(values, inside, coarse) for values in (observed, np.tile(self.brightness, (len(u), 1)))
+            mean(values, count) - mean(values, SETTINGS.far_neighbours) if coarse else values - mean(values, count)
+            for values in planes
         )
         near = inside[:, self.neighbours[:, : SETTINGS.neighbours]].sum(-1)
         counted = inside & (near >= SETTINGS.neighbours // 2)
@@ -171,16 +254,6 @@ class ColorEvidence:
         if candidate is not None and candidate.available is not None:
             correlation[~candidate.available[few]] = np.nan
         return np.asarray(correlation)
-
-    def _relative(self, values: np.ndarray, inside: np.ndarray, coarse: bool) -> np.ndarray:
-        """Values [F, P] less the mean of their neighbours; coarse: that mean less the mean of more neighbours."""
-
-        def mean(count: int) -> np.ndarray:
-            near = self.neighbours[:, :count]
-            return np.asarray((values * inside)[:, near].sum(-1) / inside[:, near].sum(-1).clip(1))
-
-        near = mean(SETTINGS.neighbours)
-        return near - mean(SETTINGS.far_neighbours) if coarse else values - near
 
     def color_difference(self, order: tuple[int, int, int]) -> float:
         """Median difference, of 255, between the points' colours and the images', whose channels are in this order."""
@@ -237,7 +310,19 @@ class MotionEvidence:
         differences = in_threads(find, range(len(valid)))
         # [F, h, w] confidence in [0, 1] that a pixel moves
         moving = np.stack([cv2.blur(((pixels - low) / (high - low)).clip(0, 1), (3, 3)) for pixels in differences])
-        self._choose_rays(moving)
+        generator, each = np.random.default_rng(0), -(-SETTINGS.rays // len(moving))
+        places = [
+            (index, place)
+            for index, pixels in enumerate(moving)
+            if len(candidates := np.flatnonzero(pixels > 0.5)) >= each
+            for place in generator.choice(candidates, each, replace=False)
+        ]
+        self.ray_views, place = np.array(places, int).reshape(-1, 2).T
+        row, column = np.divmod(place, self.width)
+        fx, fy, cx, cy = self.cameras.intrinsics[self.ray_views].T
+        slopes = np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(len(row))], -1)  # [R, 3]
+        at_depths = self.depths[self.ray_views, row, column][:, None] * DEPTHS
+        self.points = slopes[:, None] * at_depths[..., None]  # [R, D, 3] mm, in the camera's frame
         # uniform and permanent motion, and pixels outside the image (a border of one pixel), are not evidence
         evidence = np.pad((moving - moving.mean(0)).astype(np.float32), ((0, 0), (1, 1), (1, 1)))
         self._evidence, self._first = evidence.ravel(), np.arange(len(valid), dtype=np.int32) * evidence[0].size
@@ -263,10 +348,16 @@ class MotionEvidence:
         fx, fy, cx, cy = self.cameras.intrinsics[index]
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         world = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1) @ pose[:3, :3].T + pose[:3, 3]
-        predictions, observed = [], np.zeros(depth.shape, int)
-        for other in self._neighbours(index):
-            other_pose = self.cameras.poses[other]
-            local = (world - other_pose[:3, 3]) @ other_pose[:3, :3]
+        # others with cameras near this one, spread over the time that they span
+        poses, predictions, observed = self.cameras.poses, [], np.zeros(depth.shape, int)
+        cosine = (np.einsum("ij,fij->f", pose[:3, :3], poses[:, :3, :3]) - 1) / 2
+        distance = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.median(depth)
+        distance += np.arccos(cosine.clip(-1, 1))
+        distance[index] = np.inf
+        count = min(len(poses) - 1, max(3 * SETTINGS.predicting, len(poses) // 2))
+        near = np.sort(np.argsort(distance, kind="stable")[:count])
+        for other in near[evenly_spaced(len(near), SETTINGS.predicting)].tolist():
+            local = (world - poses[other, :3, 3]) @ poses[other, :3, :3]
             fx, fy, cx, cy = self.cameras.intrinsics[other]
             x, y = (place.astype(np.float32) - 0.5 for place in project(local, fx, fy, cx, cy, MIN_DEPTH))
             warped = cv2.remap(images[other], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -280,33 +371,6 @@ class MotionEvidence:
         below = cv2.erode(predicted, np.ones((3, 3))) - image
         above = image - cv2.dilate(predicted, np.ones((3, 3)))
         return np.where(valid, np.maximum(below, above).clip(0).max(-1), 0.0)
-
-    def _neighbours(self, index: int) -> list[int]:
-        """Return frames with cameras near that of `index`, spread over the time that they span."""
-        poses, pose = self.cameras.poses, self.cameras.poses[index]
-        shift = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.median(self.depths[index])
-        cosine = (np.einsum("ij,fij->f", pose[:3, :3], poses[:, :3, :3]) - 1) / 2
-        distance = shift + np.arccos(cosine.clip(-1, 1))
-        distance[index] = np.inf
-        count = min(len(poses) - 1, max(3 * SETTINGS.predicting, len(poses) // 2))
-        near = np.sort(np.argsort(distance, kind="stable")[:count])
-        return near[evenly_spaced(len(near), SETTINGS.predicting)].tolist()
-
-    def _choose_rays(self, moving: np.ndarray) -> None:
-        generator = np.random.default_rng(0)
-        each = -(-SETTINGS.rays // len(moving))
-        places = [
-            (index, place)
-            for index, pixels in enumerate(moving)
-            if len(candidates := np.flatnonzero(pixels > 0.5)) >= each
-            for place in generator.choice(candidates, each, replace=False)
-        ]
-        self.ray_views, place = np.array(places, int).reshape(-1, 2).T
-        row, column = np.divmod(place, self.width)
-        fx, fy, cx, cy = self.cameras.intrinsics[self.ray_views].T
-        slopes = np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(len(row))], -1)  # [R, 3]
-        depths = self.depths[self.ray_views, row, column][:, None] * DEPTHS
-        self.points = slopes[:, None] * depths[..., None]  # [R, D, 3] mm, in the camera's frame
 
     def enough(self, ray_views: np.ndarray) -> bool:
         """Return True if the rays come from enough frames."""

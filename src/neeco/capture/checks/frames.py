@@ -1,22 +1,69 @@
-"""Checks of frames and instrument states: splits, times, images and masks; missing states and joints, and limits."""
+"""Checks of frames and instrument states: splits, times, images and masks; missing states and joints, and limits; the
+folders of a capture's ground truth, for evaluation only."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
+from neeco.base.files import read_json, require_inside, visible_entries
 from neeco.base.plausible import PLAUSIBLE, Fault, exceeds_limits, joint_fault, limits_fault
-from neeco.capture.checks.pictures import Picture
+from neeco.capture.checks.evidence import Picture
 from neeco.capture.checks.settings import SETTINGS
 from neeco.capture.documents import Node, printable
-from neeco.capture.images import masks_fault
+from neeco.capture.images import masks_fault, read_labels, read_mask
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import MIN_DEVIATION, Frame, Instrument
 from neeco.capture.readers.parsed import Parsed
+
+PARTS_FILE = "parts.json"  # part names of mask ids in a folder
+USUAL_NAMES: Mapping[int, str] = {1: "shaft", 2: "wrist", 3: "jaw_left", 4: "jaw_right"}  # without a PARTS_FILE
+REFERENCE_FOLDER, SHADOW_FOLDER = "reference_masks", "truth/shadow"
+MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)  # of a capture, in order of preference
+
+
+def stated_names(path: Path) -> dict[int, str] | None:
+    """Return the names of ids in the folder's `parts.json`, or None without one. Raises NeecoError."""
+    file = path / PARTS_FILE
+    if not file.is_file():
+        return None
+    stated = read_json(file)
+    try:
+        return {int(entry["id"]): str(entry["part"]) for entry in stated["ids"] if entry["id"]}
+    except (KeyError, TypeError, ValueError):
+        expected = 'expected [{"id": 1, "part": "shaft"}, …]'
+        raise NeecoError(f"{file}: ids: {expected}; correct it or give --classes") from None
+
+
+def check_truth(parsed: Parsed) -> None:
+    """Warn of truth masks that evaluation would reject or ignore. They do not prevent training."""
+    root, report = parsed.root, parsed.places[0].report
+    cameras = {frame.name: frame.camera for frame in parsed.with_cameras().frames}
+    names = {frame.name for frame in parsed.frames}
+    for folder in (*MASK_FOLDERS, SHADOW_FOLDER):
+        files = visible_entries(root / folder) if (root / folder).is_dir() else []
+        further = tuple(f"{file.stem}_" for file in files if file.stem in names)  # 000003_label.png of 000003.png
+        for file in files:
+            problem = ""
+            try:
+                if file.name == PARTS_FILE:
+                    stated_names(file.parent)
+                elif file.stem in cameras and file.suffix == ".png":
+                    size = cameras[file.stem].width, cameras[file.stem].height
+                    require_inside(file, root)
+                    (read_labels if folder == MASK_FOLDERS[0] else read_mask)(file, size)
+                elif (file.stem not in names or file.suffix != ".png") and not file.stem.startswith(further):
+                    problem = "belongs to no frame; masks must be PNG files with the names of the images"
+            except NeecoError as error:
+                problem = str(error).replace(f"{file}: ", "")
+            if problem:
+                message, _, remedy = problem.partition("; ")
+                report.warning(f"{folder}/{file.name}", "", message, remedy)
 
 
 def check_frames(parsed: Parsed) -> None:
@@ -101,9 +148,8 @@ def _is_same(one: Frame, two: Frame) -> bool:
 def check_states(parsed: Parsed) -> None:
     """Report missing instruments and joints, exceeded limits, degrees for radians, and states that never change."""
     for instrument in parsed.instruments:
-        frames = zip(parsed.frames, parsed.places, strict=True)
-        without = [place for frame, place in frames if instrument.name not in frame.state.instruments]
-        name = printable(instrument.name)
+        name, pairs = printable(instrument.name), zip(parsed.frames, parsed.places, strict=True)
+        without = [place for frame, place in pairs if instrument.name not in frame.state.instruments]
         if len(without) == len(parsed.frames):
             message = f"instrument {name} is declared, but not in any frame"
             parsed.header("instruments").error(message, "remove it or give its poses")
@@ -120,7 +166,28 @@ def check_states(parsed: Parsed) -> None:
         if 2 * unknown > len(stated):  # from video, it cannot be learned
             message = f"the roll of {name} is unknown in {unknown} of {len(stated)} frames"
             parsed.header("frames").warning(message, "log it, or pose frames by hand: neeco view CAPTURE --annotate")
-    _check_changes(parsed)
+    # states that are the same in every frame: motion cannot be learned from them
+    frames, moving, still = parsed.header("frames"), False, []
+    for instrument in parsed.instruments:
+        states, name = [state for _, state in parsed.states_of(instrument.name)], printable(instrument.name)
+        if len(states) < 2:
+            continue
+        travels = float(np.ptp(np.stack([state.pose.numpy() for state in states]), axis=0).max()) > MIN_DEVIATION
+        values = {joint: [one.joints[joint] for one in states if joint in one.joints] for joint in instrument.joints}
+        moves = {joint: max(series) - min(series) > MIN_DEVIATION for joint, series in values.items() if series}
+        moving = moving or travels or any(moves.values())
+        if travels:
+            for joint in (joint for joint, moved in moves.items() if not moved):
+                message = f"joint {printable(joint)} of {name} is always {values[joint][0]:g}"
+                frames.warning(message, "its other values cannot be learned")
+        elif any(moves.values()):
+            frames.warning(f"the pose of {name} never changes", "check the connection of its tracker")
+        else:
+            still.append(name)
+    for name in still:
+        message = f"the state of {name} never changes: pose and joints are the same in every frame"
+        remedy = "check the connection of its tracker, or remove the instrument if it is fixed"
+        (frames.warning if moving else frames.error)(message, remedy)
 
 
 def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
@@ -179,28 +246,3 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
         if explained > SETTINGS.max_explained:
             message = f"joint {printable(joint)} of {name} follows from the others ({explained:.1%} of its variance)"
             place.warning(message, "also move joints one at a time, to separate their axes")
-
-
-def _check_changes(parsed: Parsed) -> None:
-    """Report states that are the same in every frame: motion cannot be learned from them."""
-    frames, moving, still = parsed.header("frames"), False, []
-    for instrument in parsed.instruments:
-        states, name = [state for _, state in parsed.states_of(instrument.name)], printable(instrument.name)
-        if len(states) < 2:
-            continue
-        travels = float(np.ptp(np.stack([state.pose.numpy() for state in states]), axis=0).max()) > MIN_DEVIATION
-        values = {joint: [one.joints[joint] for one in states if joint in one.joints] for joint in instrument.joints}
-        moves = {joint: max(series) - min(series) > MIN_DEVIATION for joint, series in values.items() if series}
-        moving = moving or travels or any(moves.values())
-        if travels:
-            for joint in (joint for joint, moved in moves.items() if not moved):
-                message = f"joint {printable(joint)} of {name} is always {values[joint][0]:g}"
-                frames.warning(message, "its other values cannot be learned")
-        elif any(moves.values()):
-            frames.warning(f"the pose of {name} never changes", "check the connection of its tracker")
-        else:
-            still.append(name)
-    for name in still:
-        message = f"the state of {name} never changes: pose and joints are the same in every frame"
-        remedy = "check the connection of its tracker, or remove the instrument if it is fixed"
-        (frames.warning if moving else frames.error)(message, remedy)

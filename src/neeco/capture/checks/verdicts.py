@@ -1,12 +1,13 @@
-"""Verdicts of the images on cameras and instruments.
+"""Verdicts of the images on cameras and instruments, and their placement: distances, units, and visibility.
 
 A mistake is named only if the images agree clearly better without it. If they contradict the recorded data and no
-candidate explains it, only the contradiction is reported.
+candidate explains it, only the contradiction is reported. For points or instruments out of view, the images determine
+the mistake.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import permutations, product
@@ -15,13 +16,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.checks.evidence import Candidate, ColorEvidence, MotionEvidence, Pixels
-from neeco.capture.checks.pictures import Picture
+from neeco.capture.checks.evidence import CameraArrays, Candidate, ColorEvidence, MotionEvidence, Picture, Pixels
 from neeco.capture.checks.settings import SETTINGS
 from neeco.capture.documents import errors_only, printable
-from neeco.capture.model import Instrument
+from neeco.capture.model import HOW_TO_REGISTER, Instrument
+from neeco.capture.points import sampled
 from neeco.capture.readers.parsed import Parsed
 from neeco.geometry.conventions import DVRK_ECM, OPENCV, OPENGL, swap_camera_axes
+from neeco.geometry.lines import across_projectors
 
 STATES, POSES = "frames[*].instruments[*]", "frames[*].instruments[*].pose"
 UNITS_MM = {"centimetres": 10.0, "inches": 25.4, "metres": 1000.0}
@@ -53,11 +55,10 @@ class ImageVerdicts:
 
     def __init__(self, parsed: Parsed, pictures: Sequence[Picture]) -> None:
         self.parsed, self.pictures = parsed, pictures
-        self._instruments: dict[str, Verdict] = {}  # cache by name
 
     def report(self) -> None:
         """Report all contradictions as warnings."""
-        for verdict in (self.cameras, *map(self.instrument, self.parsed.instruments)):
+        for verdict in (self.cameras, *self.instruments.values()):
             if verdict.status == "contradicted":
                 self.parsed.header(verdict.field).warning(verdict.message, verdict.remedy, contradicted=True)
 
@@ -69,7 +70,14 @@ class ImageVerdicts:
         if colors is None:
             return Verdict("contradicted" if has_errors else "undecided")
         fine = float(colors.recorded.mean())
-        candidates = list(offset_candidates(colors.all_cameras.poses, colors.rows))
+        all_poses, rows, candidates = colors.all_cameras.poses, colors.rows, list[Candidate]()
+        for steps in range(-SETTINGS.max_offset, SETTINGS.max_offset + 1):
+            if steps:
+                at = (rows + steps).clip(0, len(all_poses) - 1)
+                words = f"{abs(steps)} frame{'s' * (abs(steps) > 1)} {'earlier' if steps < 0 else 'later'}"
+                message, remedy = f"the images fit the cameras of {words}", f"list each with the frame that is {words}"
+                offset = Candidate("order", message, remedy, SETTINGS.offset, poses=all_poses[at])
+                candidates.append(replace(offset, available=at == rows + steps))
         candidates += camera_candidates(colors.cameras.poses) if fine < SETTINGS.good_colors else []
         if (mistake := likeliest(candidates, colors)) is not None:
             return Verdict.of(mistake, "frames[*].transform_matrix", "frames")
@@ -93,24 +101,27 @@ class ImageVerdicts:
         contradicted = self.cameras.status == "contradicted"
         return None if contradicted else MotionEvidence.of(self.parsed, self.pictures)
 
-    def instrument(self, instrument: Instrument) -> Verdict:
-        """Return the verdict whether an instrument is at its stated poses, by motion. Needs states in all frames."""
-        if instrument.name not in self._instruments:
-            self._instruments[instrument.name] = self._find(instrument)
-        return self._instruments[instrument.name]
+    @cached_property
+    def instruments(self) -> dict[str, Verdict]:
+        """Return the verdicts whether instruments are at their stated poses, by motion. Needs states in all frames."""
+        poses: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # [N, 4, 4] as recorded, and to the root: most visible
+        for item in self.parsed.instruments:
+            tree, states = item.kinematics, [state for _, state in self.parsed.states_of(item.name)]
+            if len(states) == len(self.parsed.frames):
+                back = [np.eye(4) if tree is None else tree.world_from_root(np.eye(4), one.joints) for one in states]
+                poses[item.name] = np.stack([state.pose.numpy() for state in states]), np.stack(back)
+        return {item.name: self._verdict(item.name, poses) for item in self.parsed.instruments}
 
-    def _find(self, instrument: Instrument) -> Verdict:
-        poses = dict(self._poses)
-        recorded_poses = poses.pop(instrument.name)
-        if recorded_poses is None or self._motion is None:
+    def _verdict(self, instrument: str, poses: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Verdict:
+        if instrument not in poses or self._motion is None:
             return Verdict("undecided")
-        rows, (recorded, root_from_recorded) = self._motion.rows, recorded_poses
+        rows, (recorded, root_from_recorded) = self._motion.rows, poses[instrument]
         roots = recorded @ root_from_recorded
-        other_paths = [(other[0] @ other[1])[rows] for other in poses.values() if other is not None]
+        other_paths = [(other @ back)[rows] for name, (other, back) in poses.items() if name != instrument]
         motion = self._motion.without(other_paths, roots[rows])
         if motion is None:
             return Verdict("undecided")
-        name, motion = printable(instrument.name), motion.with_recorded(roots[rows])
+        name, motion = printable(instrument), motion.with_recorded(roots[rows])
         if (mistake := self._mistake(name, recorded, root_from_recorded, motion)) is not None:
             return Verdict.of(mistake, POSES, STATES)
         evidence = motion.mean(roots[rows])
@@ -127,19 +138,6 @@ class ImageVerdicts:
         )
         remedy = "shifts, other axes, frames and units were tried; states, cameras and images must be of one recording"
         return Verdict("contradicted", POSES, message, remedy)
-
-    @cached_property
-    def _poses(self) -> dict[str, tuple[np.ndarray, np.ndarray] | None]:
-        """Return recorded poses [N, 4, 4] of each instrument, and the transforms [N, 4, 4] to its root, which is most
-        visible; None if a frame has no state."""
-        poses: dict[str, tuple[np.ndarray, np.ndarray] | None] = {}
-        for item in self.parsed.instruments:
-            poses[item.name], tree = None, item.kinematics
-            states = [state for _, state in self.parsed.states_of(item.name)]
-            if len(states) == len(self.parsed.frames):
-                back = [np.eye(4) if tree is None else tree.world_from_root(np.eye(4), one.joints) for one in states]
-                poses[item.name] = np.stack([state.pose.numpy() for state in states]), np.stack(back)
-        return poses
 
     def _mistake(self, name: str, recorded: np.ndarray, back: np.ndarray, motion: MotionEvidence) -> Candidate | None:
         """Return the mistake in the poses [N, 4, 4] of an instrument that the images confirm."""
@@ -283,11 +281,123 @@ def camera_candidates(poses: np.ndarray) -> Iterator[Candidate]:
         yield replace(candidate, poses=swap_camera_axes(candidate.poses), margin=SETTINGS.camera)
 
 
-def offset_candidates(poses: np.ndarray, rows: np.ndarray) -> Iterator[Candidate]:
-    """Return candidate offsets between images of `rows` [F] and cameras, of poses [N, 4, 4]."""
-    for steps in range(-SETTINGS.max_offset, SETTINGS.max_offset + 1):
-        if steps:
-            at = (rows + steps).clip(0, len(poses) - 1)
-            words = f"{abs(steps)} frame{'s' * (abs(steps) > 1)} {'earlier' if steps < 0 else 'later'}"
-            message, remedy = f"the images fit the cameras of {words}", f"list each with the frame that is {words}"
-            yield Candidate("order", message, remedy, SETTINGS.offset, poses=poses[at], available=at == rows + steps)
+ALL_IN_MM = "give all lengths in mm"
+
+
+def check_placement(parsed: Parsed, verdicts: ImageVerdicts) -> None:
+    """Check points, cameras against points, then instruments against both (unless the cameras are wrong)."""
+    report, placed = parsed.places[0].report, parsed.with_cameras()
+    before, place = len(errors_only(report.problems)), parsed.points_place
+    assert place is not None  # there are frames
+    points = None  # the measured ones [P, 3] float64; None where there are none, or all coincide
+    if parsed.points is None or not parsed.points.measured:
+        if not place.reported:
+            place.warning("no sparse points", "training starts from random points, with a poorer result")
+    elif not len(points := parsed.points.positions.astype(np.float64)):
+        place.error("contains no points", "add SfM points or remove ply_file_path")
+        points = None
+    else:
+        if len(points) < SETTINGS.few_points:
+            message = f"few sparse points: {len(points)}, fewer than {SETTINGS.few_points}"
+            place.warning(message, "use the complete SfM point cloud if possible")
+        if _radius(points) < 1e-9:
+            place.error("all points coincide", "repair the point cloud")
+            points = None
+    if not placed.frames:
+        return
+    if not parsed.registered and parsed.instruments:
+        message = "instrument poses are 'unregistered': in a tracker's or robot's frame, not the cameras' world"
+        remedy = f"positions of instruments in the images cannot be checked; {HOW_TO_REGISTER}"
+        parsed.header("instrument_frame").warning(message, remedy)
+    if points is not None:
+        _check_cameras(placed, points, verdicts)
+    if len(errors_only(report.problems)) == before:
+        for instrument in parsed.instruments:
+            _check_instrument(placed, instrument, points, verdicts)
+
+
+def _radius(points: np.ndarray) -> float:
+    """Return the 90 % quantile of distances, mm, of points [P, 3] to their median."""
+    return float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
+
+
+def _check_cameras(parsed: Parsed, points: np.ndarray, verdicts: ImageVerdicts) -> None:
+    """Report cameras far from the points, or with no point in their images."""
+    matrices = parsed.header("frames[*].transform_matrix")
+    cameras = CameraArrays.of([frame.camera for frame in parsed.frames])
+    distances = np.linalg.norm(cameras.centers - np.median(points, axis=0), axis=1)
+    distance, radius = float(np.median(distances)), _radius(points)
+    visible = cameras.project(sampled(points)[None])[2].mean(axis=1)  # [F] share of the points in each image
+    too_near = bool(parsed.instruments) and distance < SETTINGS.min_distance_mm
+    if too_near or distance > SETTINGS.far_distance * radius:
+        message = f"cameras are {distance:.4g} mm from the points, which span {2 * radius:.4g} mm: probably metres"
+        matrices.error(message, ALL_IN_MM)
+    elif visible.mean() < SETTINGS.min_visible and (verdict := verdicts.cameras).wrong_poses:
+        matrices.error(f"points are outside the images: {verdict.message}", verdict.remedy)
+    elif not visible.any():
+        remedy = "camera-to-world with OpenGL axes, in the points' frame and unit (mm), is expected"
+        matrices.error("no camera observes any point", remedy)
+    else:
+        for place, away, share in zip(parsed.places, distances, visible, strict=True):
+            if away > SETTINGS.max_distance * max(radius, distance):
+                message = f"camera is far from the points: {away:.4g} mm, others {distance:.4g} mm"
+                place.child("transform_matrix").error(message, "repair the pose or drop the frame")
+            elif share == 0:
+                remedy = "check its pose, unless SfM missed this part of the scene"
+                place.child("transform_matrix").warning("the camera observes no point", remedy)
+
+
+def _check_instrument(
+    parsed: Parsed, instrument: Instrument, points: np.ndarray | None, verdicts: ImageVerdicts
+) -> None:
+    """Report an instrument far from the scene or out of view."""
+    name, all_poses = printable(instrument.name), parsed.header(POSES)
+    states = parsed.states_of(instrument.name)
+    if not states:
+        return
+    places, poses = [place for place, _ in states], np.stack([state.pose.numpy() for _, state in states])
+    origins = poses[:, :3, 3]
+    farthest = float(np.linalg.norm(origins, axis=1).max())
+    if np.ptp(origins, axis=0).max() > 0 and farthest < SETTINGS.min_distance_mm:
+        message = f"positions of {name} stay within {farthest:.2g} mm of the frame's origin: probably metres"
+        all_poses.error(message, "give them in mm")
+    if not parsed.registered or farthest < SETTINGS.min_distance_mm:
+        return
+    cameras = CameraArrays.of([frame.camera for frame in parsed.frames if instrument.name in frame.state.instruments])
+    visible = cameras.project(origins[:, None])[2][:, 0]  # [I]
+    outside = "every image" if not visible.any() else f"{len(visible) - int(visible.sum())} of {len(visible)} images"
+    out_of_view = visible.mean() < SETTINGS.min_visible
+    verdict = verdicts.instruments[instrument.name] if out_of_view else None
+    if verdict is not None and verdict.wrong_poses:
+        all_poses.error(f"instrument {name} is outside {outside}: {verdict.message}", verdict.remedy)
+        return
+    if points is not None:
+        center = np.median(points, axis=0)
+        size = max(_radius(points), float(np.median(np.linalg.norm(cameras.centers - center, axis=1))))
+        distances = np.linalg.norm(origins - center, axis=1)
+        far = np.flatnonzero(distances > SETTINGS.max_distance * size + SETTINGS.sensor_reach_mm)
+        for index in far:
+            message = f"instrument {name} is far from the points: {distances[index]:.4g} mm"
+            places[index].child("pose").error(message, "pose and points must share frame and unit (mm)")
+        if len(far):
+            return
+    if not out_of_view:  # single poses out of view and far away from all others: tracker drop-outs
+        distances = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
+        usual = max(float(np.median(distances)), SETTINGS.min_distance_mm)
+        for index in np.flatnonzero((distances > SETTINGS.max_distance * usual) & ~visible):
+            message = f"instrument {name} is {distances[index]:.4g} mm from its median position, and out of view"
+            remedy = "probably a tracker drop-out or a wrong unit: repair the pose or drop the frame"
+            places[index].child("pose").warning(message, remedy)
+    elif verdict is not None and verdict.status == "undecided":
+        behind = bool(visible.any())
+        if not behind:  # whether most images show the instrument-fixed point nearest to all optical axes
+            across = across_projectors(cameras.poses[:, :3, 2])
+            rows = (across @ poses[:, :3, :3]).reshape(-1, 3)
+            target = (across @ (cameras.centers - poses[:, :3, 3])[:, :, None]).reshape(-1)
+            point = np.linalg.lstsq(rows, target, rcond=1e-6)[0]
+            world = np.einsum("fij,j->fi", poses[:, :3, :3], point) + poses[:, :3, 3]
+            shown = cameras.project(world[:, None])[2].mean() > SETTINGS.min_body_visible
+            behind = bool(shown and np.linalg.norm(point) < SETTINGS.sensor_reach_mm)
+        remedy = "correct only if its sensor is far behind the tip"
+        remedy += "" if behind else "; world_from_instrument in mm, in the cameras' world, is expected"
+        (all_poses.warning if behind else all_poses.error)(f"the origin of {name} is outside {outside}", remedy)

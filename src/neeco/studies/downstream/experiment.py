@@ -20,7 +20,7 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import own_folder, read_json, require_like, require_same, write_atomically, write_json, write_text
 from neeco.capture import Capture, read_capture
 from neeco.capture.checks import read_checked
-from neeco.evaluation.mask_folders import truth_file
+from neeco.evaluation.masks import truth_file
 from neeco.raster.devices import device_of
 from neeco.studies.downstream import DownstreamRequest
 from neeco.studies.downstream.model import Predict, TorchModel, TrainingTask, input_size, model_class
@@ -284,7 +284,13 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
     words = dict.fromkeys(request.conditions or default_conditions(names))
     conditions = [parse_condition(word, names) for word in words]
     capture = read_checked(request.capture, request.transforms)
-    splits = _splits(capture, request.splits)
+    with_truth = {frame.split for frame in capture.frames if truth_file(capture.root, frame.name)}
+    usable = [split for split in capture.splits if split != "train" and split in with_truth]
+    for split in request.splits or ("",):
+        if split not in usable and (split or not usable):
+            truth = f"has true masks of {', '.join(usable)}" if usable else "has no true mask outside of split train"
+            raise NeecoError(f"--splits: {split or 'missing'}: {capture.root} {truth}; choose a split with true masks")
+    splits = tuple(request.splits or usable)
     request = replace(request, splits=splits, models=tuple(dict.fromkeys(request.models)))
     size = frame_size(recorded_samples(capture, splits[0], request.classes))
     classes = class_names(capture, request.classes)
@@ -296,7 +302,18 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
         if class_names(other, request.classes) != classes:
             raise NeecoError(f"--test {name}: {path} has other parts than {capture.root}; use --classes instrument")
         recorded_samples(other, None, request.classes)
-    _check_models(request, capture, size)
+    for name in request.models:  # that can be trained on this machine, and on these images
+        kind = model_class(name)
+        if missing := kind.missing_requirement():
+            raise NeecoError(f"--models {name}: {missing}")
+        width, height = input_of(request, kind, size)
+        if kind.is_too_small((width, height)):
+            raise NeecoError(f"--models {name}: input of {width}x{height} px is too small; give a larger --size")
+        several = [str(data.path) for data in request.image_sets if data.instruments() > 1]
+        several += [str(capture.root)] if len(capture.instruments) > 1 else []
+        if kind.predicts == "boxes" and several:
+            problem = f"{several[0]}: has several instruments, which the labels do not distinguish"
+            raise NeecoError(f"--models {name}: {problem}; use a model that predicts masks")
     labelled, counts = 0, [0] if "0" in (request.num_real or ("0",)) else []
     for word in request.num_real:
         labelled_count(word, 10**9)
@@ -323,8 +340,8 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
         if bool(real) == (REAL in condition)
     )
     trained = {job.condition.name for job in jobs}
-    if missing := [item.name for item in conditions if item.name not in trained and (request.conditions or not jobs)]:
-        problem = f"condition {missing[0]} has no training data"
+    if untrained := [item.name for item in conditions if item.name not in trained and (request.conditions or not jobs)]:
+        problem = f"condition {untrained[0]} has no training data"
         raise NeecoError(f"--num-real: {problem}; add 0 for sets alone, a number for real")
     entries = [entry.name for entry in request.output.iterdir()] if request.output.is_dir() else []
     if [name for name in entries if not name.startswith(".")] != ["jobs"]:  # else interrupted before the first result
@@ -335,33 +352,6 @@ def plan_downstream(request: DownstreamRequest) -> DownstreamPlan:
     return DownstreamPlan(
         request=request, capture=capture, jobs=jobs, images=images, labelled=labelled, frame_size=size
     )
-
-
-def _splits(capture: Capture, requested: Sequence[str]) -> tuple[str, ...]:
-    """Return the test splits. Raises NeecoError."""
-    labelled = {frame.split for frame in capture.frames if truth_file(capture.root, frame.name)}
-    usable = [split for split in capture.splits if split != "train" and split in labelled]
-    for split in requested or ("",):
-        if split not in usable and (split or not usable):
-            truth = f"has true masks of {', '.join(usable)}" if usable else "has no true mask outside of split train"
-            raise NeecoError(f"--splits: {split or 'missing'}: {capture.root} {truth}; choose a split with true masks")
-    return tuple(requested or usable)
-
-
-def _check_models(request: DownstreamRequest, capture: Capture, frame: tuple[int, int]) -> None:
-    """Raise NeecoError for models that cannot be trained on this machine, or on these images."""
-    for name in request.models:
-        kind = model_class(name)
-        if missing := kind.missing_requirement():
-            raise NeecoError(f"--models {name}: {missing}")
-        width, height = input_of(request, kind, frame)
-        if kind.is_too_small((width, height)):
-            raise NeecoError(f"--models {name}: input of {width}x{height} px is too small; give a larger --size")
-        several = [str(data.path) for data in request.image_sets if data.instruments() > 1]
-        several += [str(capture.root)] if len(capture.instruments) > 1 else []
-        if kind.predicts == "boxes" and several:
-            problem = f"{several[0]}: has several instruments, which the labels do not distinguish"
-            raise NeecoError(f"--models {name}: {problem}; use a model that predicts masks")
 
 
 def run_downstream(plan: DownstreamPlan, progress: Callable[[JobEvent], None] | None = None) -> dict[str, Any]:

@@ -108,7 +108,11 @@ class TorchModel(ABC):
         fused = task.device.type == "cuda"
         decay = self.weight_decay
         optimizer = torch.optim.AdamW(module.parameters(), self.learning_rate, weight_decay=decay, fused=fused)
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self._rate(step, task.steps))
+
+        def rate(step: int) -> float:  # as a share of the maximum
+            return min((step + 1) / (1 + self.warmup * task.steps), (1 + math.cos(math.pi * step / task.steps)) / 2)
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)
         rng = torch.Generator(task.device).manual_seed(task.seed) if task.batches.augmented else None
         with_boxes = self.predicts == "boxes"
         module.train()
@@ -126,10 +130,6 @@ class TorchModel(ABC):
                 if not math.isfinite(value):
                     raise NeecoError(f"{self.model}: loss is not finite at step {step}; train with more images")
                 task.progress(step / task.steps, f"step {step}  loss {value:.3f}")
-
-    def _rate(self, step: int, steps: int) -> float:
-        """Return the learning rate at a step, as a share of the maximum."""
-        return min((step + 1) / (1 + self.warmup * steps), (1 + math.cos(math.pi * step / steps)) / 2)
 
     @torch.inference_mode()
     def _predict(self, module: nn.Module, images: Sequence[np.ndarray], task: TrainingTask) -> list[Prediction]:

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neeco.evaluation.mask_metrics import boundary_f, dice, iou, mean_of, precision
+from neeco.evaluation.masks import boundary_f, dice, iou, mean_of, precision
+from neeco.studies.configurations import UNKNOWN, Cell, Column, ResultTable, Row, csv_text
 from neeco.studies.downstream.samples import Example
 from neeco.studies.downstream.training_data import BASELINES, PERMUTED, REAL
-from neeco.studies.tables import UNKNOWN, Cell, Column, ResultTable, Row, csv_text
 
 MASK_SCORES = ("iou", "dice", "precision", "recall", "boundary_f")
 BOX_SCORES = ("ap", "ap50", "ap75")
@@ -86,12 +86,42 @@ def box_scores(
 ) -> dict[str, float | None]:
     """Return COCO's box AP: mean over IoU 0.5 to 0.95, at 0.5 and at 0.75; for several classes the mean, and
     `CLASS.ap`. None if the ground truth has no box."""
-    labelled = [example.boxes() for example in truth]
-    per_class = {}
+    from pycocotools.coco import COCO
+    from pycocotools.cocoeval import COCOeval
+
+    def box_of(image: int, box: np.ndarray) -> dict[str, object]:
+        x0, y0, x1, y1 = map(float, box)
+        bbox = [x0, y0, x1 - x0, y1 - y0]
+        return {"image_id": image, "bbox": bbox, "area": bbox[2] * bbox[3], "category_id": 1}
+
+    per_class: dict[str, list[float]] = {}
+    true_boxes = [example.boxes() for example in truth]
     for number, name in enumerate(classes, 1):
-        true = [boxes[numbers == number] for boxes, numbers in labelled]
-        if any(len(boxes) for boxes in true):
-            per_class[name] = _coco_ap([each.of_class(number) for each in predictions], true)
+        labelled = [
+            box_of(image, box)
+            for image, (boxes, numbers) in enumerate(true_boxes, 1)
+            for box in boxes[numbers == number]
+        ]
+        detections = [
+            box_of(image, box) | {"score": float(score)}
+            for image, each in enumerate(predictions, 1)
+            for box, score in zip(*each.of_class(number), strict=True)
+        ]
+        if not labelled:
+            continue
+        per_class[name] = [0.0, 0.0, 0.0]
+        if detections:
+            with contextlib.redirect_stdout(io.StringIO()):
+                true = COCO()
+                images = [{"id": image} for image in range(1, len(truth) + 1)]
+                annotations = [box | {"id": number, "iscrowd": 0} for number, box in enumerate(labelled, 1)]
+                true.dataset = {"info": {}, "images": images, "categories": [{"id": 1}], "annotations": annotations}
+                true.createIndex()
+                evaluation = COCOeval(true, true.loadRes(detections), "bbox")
+                evaluation.evaluate()
+                evaluation.accumulate()
+                evaluation.summarize()
+            per_class[name] = evaluation.stats[:3].tolist()
     if not per_class:
         return dict.fromkeys(BOX_SCORES)
     means = np.mean(list(per_class.values()), axis=0).tolist()
@@ -109,37 +139,6 @@ def box_iou(detections: Detections, truth: Example) -> float:
         areas = [np.prod(corners[2:] - corners[:2]) for corners in (best, box)]
         values.append(float(both / (sum(areas) - both)))
     return mean_of(values)
-
-
-def _coco_ap(detected: Sequence[tuple[np.ndarray, np.ndarray]], true: Sequence[np.ndarray]) -> list[float]:
-    """Return the AP over IoU 0.5 to 0.95, at 0.5 and at 0.75, by pycocotools."""
-    from pycocotools.coco import COCO
-    from pycocotools.cocoeval import COCOeval
-
-    def box_of(image: int, box: np.ndarray) -> dict[str, object]:
-        x0, y0, x1, y1 = map(float, box)
-        bbox = [x0, y0, x1 - x0, y1 - y0]
-        return {"image_id": image, "bbox": bbox, "area": bbox[2] * bbox[3], "category_id": 1}
-
-    labelled = [box_of(image, box) for image, boxes in enumerate(true, 1) for box in boxes]
-    detections = [
-        box_of(image, box) | {"score": float(score)}
-        for image, (boxes, scores) in enumerate(detected, 1)
-        for box, score in zip(boxes, scores, strict=True)
-    ]
-    if not detections:
-        return [0.0, 0.0, 0.0]
-    with contextlib.redirect_stdout(io.StringIO()):
-        truth = COCO()
-        images = [{"id": image} for image in range(1, len(true) + 1)]
-        boxes_of = [box | {"id": number, "iscrowd": 0} for number, box in enumerate(labelled, 1)]
-        truth.dataset = {"info": {}, "images": images, "categories": [{"id": 1}], "annotations": boxes_of}
-        truth.createIndex()
-        evaluation = COCOeval(truth, truth.loadRes(detections), "bbox")
-        evaluation.evaluate()
-        evaluation.accumulate()
-        evaluation.summarize()
-    return evaluation.stats[:3].tolist()
 
 
 class Arm(NamedTuple):
@@ -177,6 +176,11 @@ class Scores:
         """Return the score of every fold that has it."""
         scores = {fold: job["splits"].get(test, {}).get(metric) for fold, job in self.jobs.get(arm, {}).items()}
         return {fold: score for fold, score in sorted(scores.items()) if score is not None}
+
+    def mean(self, arm: Arm, test: str, metric: str) -> float | None:
+        """Return the mean score over folds; None if no fold has it."""
+        values = self.by_fold(arm, test, metric)
+        return float(np.mean(list(values.values()))) if values else None
 
     def estimate(self, arm: Arm, test: str, metric: str, against: Arm | None = None) -> Estimate | None:
         """Return the mean of an arm's score over folds, or of its difference to another arm over their common folds;
@@ -234,11 +238,6 @@ def block_weights(frames: int) -> np.ndarray:
     return covered[:, :frames] + covered[:, frames : 2 * frames]
 
 
-def mean_or_none(values: Mapping[int, float]) -> float | None:
-    """Return the mean over folds; None if no fold has the score."""
-    return float(np.mean(list(values.values()))) if values else None
-
-
 def words_of(condition: str) -> set[str]:
     """Return the terms of a condition, without their order."""
     return set(condition.split("+"))
@@ -276,7 +275,7 @@ def summarise(jobs: Sequence[Document], models: Mapping[str, str], tests: Sequen
         for test in tests:
             score = scores.estimate(arm, test, main) or Estimate(0, math.nan, None, None)
             row: dict[str, Any] = {**arm._asdict(), "test": test, "folds": score.folds}
-            row |= {metric: mean_or_none(scores.by_fold(arm, test, metric)) for metric in metrics}
+            row |= {metric: scores.mean(arm, test, metric) for metric in metrics}
             row |= {"low": score.low, "high": score.high}
             reference = _reference(arm, test, scores, main)
             if reference is not None and (gain := scores.estimate(arm, test, main, reference)) is not None:
@@ -304,7 +303,7 @@ def _reference(arm: Arm, test: str, scores: Scores, metric: str) -> Arm | None:
         for other in other_arms
         if words_of(other.condition) in references
         and other.real == real
-        and (mean := mean_or_none(scores.by_fold(other, test, metric))) is not None
+        and (mean := scores.mean(other, test, metric)) is not None
     ]
     return max(rivals)[1] if rivals else None
 

@@ -16,11 +16,10 @@ from scipy.ndimage import find_objects
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes, read_json, read_json_lines, require_inside, require_like
 from neeco.base.settings import name_and_value
-from neeco.capture.checks.truth import PARTS_FILE
+from neeco.capture.checks.frames import PARTS_FILE
 from neeco.capture.images import image_files, image_size, read_image_bytes, read_labels
 from neeco.capture.model import Capture, Frame
-from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, truth_file, truth_names
-from neeco.evaluation.mask_metrics import pairs_of
+from neeco.evaluation.masks import Masks, open_masks, open_truth, pairs_of, truth_file, truth_names
 
 ClassNames = Literal["instrument", "parts"]
 WHOLE = ("instrument",)  # classes without parts

@@ -25,8 +25,7 @@ from neeco.geometry.conventions import swap_camera_axes
 from neeco.geometry.lens import INTRINSICS
 from neeco.labels.annotation import bounding_box
 from neeco.labels.drawing import extended_silhouettes
-from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import DEPTH_MM_PER_COUNT, Record, link, stem
+from neeco.synthesis.writers import DEPTH_MM_PER_COUNT, Record, Writer, WrittenImages, link, stem
 
 SCENE = "000000"
 NOWHERE = [-1, -1, -1, -1]
@@ -45,35 +44,34 @@ class Bop(Writer):
         write_json(root / self.format / "objects.json", {str(k): name for k, name in enumerate(instruments, 1)})
         for split in sorted({record["split"] for record in images.records}):
             folder = root / self.format / split / SCENE
-            cameras, poses, infos = {}, {}, {}
+            cameras, infos = {}, {}
+            poses: dict[str, list[dict[str, Any]]] = {}
             for record in (record for record in images.records if record["split"] == split):
                 name, key = stem(record["index"]), str(record["index"])
                 link(root / record["image"], folder / "rgb" / Path(record["image"]).name)
                 link(root / "depth" / f"{name}.png", folder / "depth" / f"{name}.png")
-                cameras[key] = _camera(record)
-                poses[key] = [_pose(label, instruments.index(label["name"]) + 1) for label in record["labels"]]
+                fx, fy, cx, cy = (record["intrinsics"][name] for name in INTRINSICS)
+                camera_from_world = np.linalg.inv(swap_camera_axes(np.array(record["camera"])))
+                cameras[key] = {
+                    "cam_K": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+                    "depth_scale": DEPTH_MM_PER_COUNT,
+                    "cam_R_w2c": camera_from_world[:3, :3].ravel().tolist(),
+                    "cam_t_w2c": camera_from_world[:3, 3].tolist(),
+                }
+                poses[key] = []
+                for label in record["labels"]:
+                    pose = np.array(label["camera_from_instrument"])
+                    poses[key].append(
+                        {
+                            "cam_R_m2c": pose[:3, :3].ravel().tolist(),
+                            "cam_t_m2c": pose[:3, 3].tolist(),
+                            "obj_id": instruments.index(label["name"]) + 1,
+                        }
+                    )
                 infos[key] = _masks(images, folder, record)
             write_json(folder / "scene_camera.json", cameras)
             write_json(folder / "scene_gt.json", poses)
             write_json(folder / "scene_gt_info.json", infos)
-
-
-def _camera(record: Record) -> dict[str, Any]:
-    """Intrinsics, where the world is from here, and mm per count of the depth image."""
-    intrinsics = record["intrinsics"]
-    matrix = [intrinsics["fl_x"], 0.0, intrinsics["cx"], 0.0, intrinsics["fl_y"], intrinsics["cy"], 0.0, 0.0, 1.0]
-    pose = np.linalg.inv(swap_camera_axes(np.array(record["camera"])))
-    return {
-        "cam_K": matrix,
-        "depth_scale": DEPTH_MM_PER_COUNT,
-        "cam_R_w2c": pose[:3, :3].ravel().tolist(),
-        "cam_t_w2c": pose[:3, 3].tolist(),
-    }
-
-
-def _pose(label: dict[str, Any], number: int) -> dict[str, Any]:
-    pose = np.array(label["camera_from_instrument"])
-    return {"cam_R_m2c": pose[:3, :3].ravel().tolist(), "cam_t_m2c": pose[:3, 3].tolist(), "obj_id": number}
 
 
 def _masks(images: WrittenImages, folder: Path, record: Record) -> list[dict[str, Any]]:

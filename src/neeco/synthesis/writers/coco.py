@@ -10,7 +10,7 @@ Category ids of parts are the part ids of dataset.json and of parts/, whether an
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,7 @@ import numpy as np
 
 from neeco.base.files import write_json
 from neeco.capture.images import read_labels
-from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import CONTACT, Record, link, stem
+from neeco.synthesis.writers import CONTACT, Record, Writer, WrittenImages, link, stem
 
 Entry = dict[str, Any]
 
@@ -58,6 +57,16 @@ class Coco(Writer):
             link(images.root / record["image"], folder / "images" / Path(record["image"]).name)
         for split in (None, *sorted({record["split"] for record in records})):
             chosen = [record for record in records if split in (None, record["split"])]
+            entries = [
+                {
+                    "id": record["index"] + 1,  # some tools take 0 for "no image"
+                    "file_name": Path(record["image"]).name,
+                    "width": record["width"],
+                    "height": record["height"],
+                    "split": record["split"],
+                }
+                for record in chosen
+            ]
             visible = [(record, label) for record in chosen for label in record["labels"] if label["area"] > 0]
             exact = _exact_masks(images, visible) if split is None else {}
             by_instrument = (_instrument(record, label, numbers, keypoints) for record, label in visible)
@@ -68,7 +77,13 @@ class Coco(Writer):
             )
             for kind, categories, made in (("instances", instruments, by_instrument), ("parts", parts, by_part)):
                 path = folder / (f"{kind}.json" if split is None else f"annotations/{kind}_{split}.json")
-                document = _document(chosen, categories, made)
+                document: Entry = {
+                    "info": {"description": "made by neeco; see dataset.json"},
+                    "licenses": [],
+                    "images": entries,
+                    "categories": categories,
+                    "annotations": [{"id": k + 1} | annotation for k, annotation in enumerate(made)],
+                }
                 write_json(path, document, indent=None)
                 if split is None:
                     for annotation, runs in zip(document["annotations"], exact[kind], strict=True):
@@ -95,26 +110,6 @@ def run_lengths(mask: np.ndarray) -> Entry:
     changes = np.flatnonzero(np.diff(flat)) + 1
     counts = np.diff([0, *changes, flat.size]).tolist()
     return {"size": list(mask.shape), "counts": [0, *counts] if flat[0] else counts}
-
-
-def _document(records: Sequence[Record], categories: list[Entry], annotations: Iterable[Entry]) -> Entry:
-    images = [
-        {
-            "id": record["index"] + 1,  # some tools take 0 for "no image"
-            "file_name": Path(record["image"]).name,
-            "width": record["width"],
-            "height": record["height"],
-            "split": record["split"],
-        }
-        for record in records
-    ]
-    return {
-        "info": {"description": "made by neeco; see dataset.json"},
-        "licenses": [],
-        "images": images,
-        "categories": categories,
-        "annotations": [{"id": k + 1} | annotation for k, annotation in enumerate(annotations)],
-    }
 
 
 def _annotation(record: Record, shape: Entry, category: int) -> Entry:

@@ -20,8 +20,7 @@ from pathlib import Path
 
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import read_bytes, write_atomically, write_text
-from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import Record, link, public_record, stem
+from neeco.synthesis.writers import Record, Writer, WrittenImages, link, public_record, stem
 
 SPLITS = {"train": "train", "val": "validation"}  # ours, and the hub's names
 SHARD_SIZE = 1000  # samples in a tar file

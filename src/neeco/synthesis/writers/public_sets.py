@@ -21,8 +21,7 @@ from PIL import Image
 
 from neeco.base.files import write_json, write_unsynced
 from neeco.capture.images import read_labels
-from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import link, stem
+from neeco.synthesis.writers import Writer, WrittenImages, link, stem
 
 CLASSES = {"shaft": "shaft|tube", "wrist": "wrist", "clasper": "clasp|jaw|grip|blade|finger|end_effector"}
 

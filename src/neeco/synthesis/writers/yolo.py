@@ -14,7 +14,7 @@ Classes are instruments; those of yolo/parts/ are the part ids of dataset.json, 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,11 @@ import numpy as np
 import yaml
 
 from neeco.base.files import write_text, write_unsynced
-from neeco.synthesis.writers import Writer, WrittenImages
-from neeco.synthesis.writers.folder import Record, link, stem
+from neeco.synthesis.writers import Writer, WrittenImages, link, stem
 
 Row = Callable[[dict[str, Any], np.ndarray], list[float]]  # (label, image size [2]) -> numbers after the class
 MAX_SHARE = 1.01  # of the image's width and height: Ultralytics rejects labels that extend further
-Shapes = Callable[[WrittenImages, Record], Iterator[tuple[int, dict[str, Any]]]]  # (class, label) of all in an image
+Shapes = list[tuple[int, dict[str, Any]]]  # class and label of all that an image shows
 
 
 class Yolo(Writer):
@@ -44,32 +43,36 @@ class Yolo(Writer):
     def write(self, images: WrittenImages) -> None:
         """(Re)write every variant. Raises NeecoError."""
         keypoints, folder = images.keypoint_names, images.root / self.format
-        _write_variant(images, folder, detect_row, {})
-        _write_variant(images, folder / "segment", segment_row, {})
-        _write_variant(images, folder / "obb", oriented_row, {})
+        visible: list[Shapes] = [  # of every image
+            [(images.instruments.index(label["name"]), label) for label in record["labels"] if label["area"] > 0]
+            for record in images.records
+        ]
+        parts: list[Shapes] = [
+            [
+                (images.part_names.index((label["name"], part)), shape)
+                for label in record["labels"]
+                for part, shape in label["parts"].items()
+            ]
+            for record in images.records
+        ]
+        _write_variant(images, folder, detect_row, {}, visible)
+        _write_variant(images, folder / "segment", segment_row, {}, visible)
+        _write_variant(images, folder / "obb", oriented_row, {}, visible)
         names = {k: f"{instrument}/{part}" for k, (instrument, part) in enumerate(images.part_names)}
-        _write_variant(images, folder / "parts", segment_row, {"names": names}, visible_parts)
+        _write_variant(images, folder / "parts", segment_row, {"names": names}, parts)
         if keypoints:
             swapped = {"left": "right", "right": "left"}
             mirrored = [re.sub("left|right", lambda found: swapped[found[0]], name) for name in keypoints]
             flip = [keypoints.index(name) if name in keypoints else k for k, name in enumerate(mirrored)]
             extra: dict[str, Any] = {"kpt_shape": [len(keypoints), 3], "flip_idx": flip}
             extra["kpt_names"] = {k: list(keypoints) for k in range(len(images.instruments))}
-            _write_variant(images, folder / "pose", _pose_row(keypoints), extra)
 
+            def pose_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
+                points = np.array([label["keypoints"].get(name, [0, 0, 0]) for name in keypoints], dtype=float)
+                points[:, :2] /= size
+                return detect_row(label, size) + points.ravel().tolist()
 
-def visible_instruments(images: WrittenImages, record: Record) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield class and label of every instrument that the image shows."""
-    for label in record["labels"]:
-        if label["area"] > 0:
-            yield images.instruments.index(label["name"]), label
-
-
-def visible_parts(images: WrittenImages, record: Record) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield class and shape of every part that the image shows."""
-    for label in record["labels"]:
-        for part, shape in label["parts"].items():
-            yield images.part_names.index((label["name"], part)), shape
+            _write_variant(images, folder / "pose", pose_row, extra, visible)
 
 
 def detect_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
@@ -107,25 +110,15 @@ def joined_polygon(polygons: list[np.ndarray]) -> np.ndarray:
     return joined
 
 
-def _pose_row(keypoints: Sequence[str]) -> Row:
-    def row(label: dict[str, Any], size: np.ndarray) -> list[float]:
-        points = np.array([label["keypoints"].get(name, [0, 0, 0]) for name in keypoints], dtype=float)
-        points[:, :2] /= size
-        return detect_row(label, size) + points.ravel().tolist()
-
-    return row
-
-
 def _write_variant(
-    images: WrittenImages, folder: Path, row: Row, extra: dict[str, Any], shapes: Shapes = visible_instruments
+    images: WrittenImages, folder: Path, row: Row, extra: dict[str, Any], shapes: Sequence[Shapes]
 ) -> None:
     records = images.records
-    for record in records:
+    for record, shown in zip(records, shapes, strict=True):
         name, split = stem(record["index"]), record["split"]
         size = np.array([record["width"], record["height"]], dtype=float)
         lines = [
-            " ".join([str(category), *(f"{value:.6g}" for value in row(shape, size))])
-            for category, shape in shapes(images, record)
+            " ".join([str(category), *(f"{value:.6g}" for value in row(shape, size))]) for category, shape in shown
         ]
         write_unsynced(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines).encode())
         link(images.root / record["image"], folder / "images" / split / Path(record["image"]).name)
