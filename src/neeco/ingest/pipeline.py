@@ -32,7 +32,7 @@ from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.model import Recording, Splits
 from neeco.ingest.registration.clocks import note_frame_rates
 from neeco.ingest.result import IngestResult
-from neeco.ingest.shaft.from_video import NOT_VISIBLE, instruments_of, uncertainties
+from neeco.ingest.shaft.from_video import NOT_VISIBLE, instruments_of
 from neeco.ingest.staging import staged
 from neeco.ingest.timing.episodes import Episodes, States
 from neeco.ingest.timing.reading import read_episodes
@@ -87,13 +87,11 @@ def ingest(
 def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
     """Return the capture with the `chosen` rows of the views."""
     data, images, views, shaft = world.data, world.images, world.views, world.shaft
-    item = data.video_instrument
-    deviations = uncertainties(item, shaft) if item and shaft else None
     frames = tuple(
         Frame(
             images.rename(int(views.frames[row]), data.frame_name(int(views.frames[row]))),
             views.pinhole.camera(views.world_from_camera[row]),
-            _state(world.states, row, float(views.times[row]), None if deviations is None else deviations[row]),
+            _state(world.states, row, float(views.times[row]), None if shaft is None else shaft.uncertainties[row]),
             splits[row],
             images.mask_of(int(views.frames[row])),
         )
