@@ -23,7 +23,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.capture.model import BaseUncertainty, Capture, Frame, InstrumentState, State, Uncertainty
+from neeco.capture.model import (
+    BaseUncertainty,
+    Capture,
+    Frame,
+    FromVideo,
+    Instrument,
+    InstrumentState,
+    State,
+    Uncertainty,
+)
 from neeco.capture.writer import write_capture
 from neeco.ingest.cameras.still_scene import RightCamera
 from neeco.ingest.frames.images import DropReason, StageProgress, choose_images
@@ -32,7 +41,7 @@ from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.model import Recording, Splits
 from neeco.ingest.registration.clocks import note_frame_rates
 from neeco.ingest.result import IngestResult
-from neeco.ingest.shaft.from_video import NOT_VISIBLE, instruments_of
+from neeco.ingest.shaft.from_video import NOT_VISIBLE
 from neeco.ingest.staging import staged
 from neeco.ingest.timing.episodes import Episodes, States
 from neeco.ingest.timing.reading import read_episodes
@@ -103,8 +112,17 @@ def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
     registered = world.registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
     lens = replace(images.lens, size=images.size, border=images.border)
     instruments = tuple(
-        replace(one, base_uncertainty=_shared_uncertainty(world, one.name, chosen))
-        for one in instruments_of(data.recording, shaft)
+        Instrument(
+            item.name,
+            {name: source.limits for name, source in item.joints.items()},
+            item.kinematics,
+            from_video=None
+            if shaft is None or item.from_video is None
+            else FromVideo(item.from_video.shaft_diameter_mm, shaft.working_length),
+            base_uncertainty=_shared_uncertainty(world, item.name, chosen),
+        )
+        for item in data.recording.instruments
+        if item.placed
     )
     return Capture(
         images.folder, frames, instruments, world.tissue, registered=registered, lens=lens, still=world.still

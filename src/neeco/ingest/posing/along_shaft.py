@@ -102,16 +102,6 @@ class Shafts:
         across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
         return np.cross(across, self.directions), across
 
-    def rolls(self, x_axes: np.ndarray) -> np.ndarray:
-        """Roll [F] rad of instruments whose x axis is [F, 3] in the camera's axes."""
-        towards, across = self.view_axes
-        return np.arctan2((x_axes * across).sum(-1), (x_axes * towards).sum(-1))
-
-    def x_axes(self, rolls: np.ndarray) -> np.ndarray:
-        """Return the inverse of `rolls`: [F, 3] in the camera's axes."""
-        towards, across = self.view_axes
-        return np.cos(rolls)[:, None] * towards + np.sin(rolls)[:, None] * across
-
     def rotation(self, frame: int, roll: float) -> np.ndarray:
         """world_from_instrument [3, 3] of one frame at a roll, rad."""
         towards, across = (axis[frame] for axis in self.view_axes)
@@ -132,36 +122,22 @@ class Shafts:
         moved = cosine * moved + np.cross(normal, moved) + normal * inner / np.maximum(1 + cosine, 1e-9)
         return np.arctan2((moved * across[1:]).sum(-1), (moved * towards[1:]).sum(-1))
 
-    def project(self, points: np.ndarray, frames: np.ndarray) -> np.ndarray:
-        """Return pixels [N, ..., 2] (centres at +0.5) of points [N, ..., 3] in the camera's axes of `frames` [N]; far
-        outside the image for points behind the camera."""
-        fx, fy, cx, cy = (value.reshape(-1, *[1] * (points.ndim - 2)) for value in self.intrinsics[frames].T)
+    def sample(self, frame: int, image: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Sample an image [H, W(, C)] where points [A, B, 3] mm in the camera's axes of a frame are observed:
+        [A, B(, C)], black outside the image and behind the camera."""
+        fx, fy, cx, cy = self.intrinsics[frame]
         pixels = np.stack(project(points, fx, fy, cx, cy, nearest=SETTINGS.nearest_mm), -1)
-        return np.where(points[..., 2:] < SETTINGS.nearest_mm, -1e4, pixels)
+        places = (np.where(points[..., 2:] < SETTINGS.nearest_mm, -1e4, pixels) - 0.5).astype(np.float32)
+        return np.asarray(
+            cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        )
 
 
 def crop(shafts: Shafts, frame: int, image: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndarray:
     """Sample an image [H, W(, C)] in the plane through the shaft that faces the camera: [A, B(, C)] at `along` [A] mm
-    from the origin towards the tip and `across` [B] mm. Black outside the image."""
-    sideways = shafts.view_axes[1][frame]
-    points = shafts.origins[frame] + along[:, None, None] * shafts.directions[frame] + across[None, :, None] * sideways
-    return _sample(image, shafts.project(points[None], np.array([frame]))[0])
-
-
-def unroll(shafts: Shafts, frame: int, image: np.ndarray, along: np.ndarray, azimuths: np.ndarray) -> np.ndarray:
-    """Sample an image [H, W, C] on the shaft's cylinder: [A, B, C] at `along` [A] mm and `azimuths` [B] rad about the
-    shaft, from the direction `towards` the camera. Black outside the image."""
-    towards, sideways = (axis[frame] for axis in shafts.view_axes)
-    round_ = np.cos(azimuths)[:, None] * towards + np.sin(azimuths)[:, None] * sideways
-    points = shafts.origins[frame] + along[:, None, None] * shafts.directions[frame] + shafts.diameter_mm / 2 * round_
-    return _sample(image, shafts.project(points[None], np.array([frame]))[0])
-
-
-def _sample(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    places = (pixels - 0.5).astype(np.float32)
-    return np.asarray(
-        cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    )
+    from the origin towards the tip and `across` [B] mm."""
+    middle = shafts.origins[frame] + along[:, None, None] * shafts.directions[frame]
+    return shafts.sample(frame, image, middle + across[None, :, None] * shafts.view_axes[1][frame])
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,29 +159,25 @@ def unrolled_textures(shafts: Shafts, load: Load) -> tuple[np.ndarray, np.ndarra
     azimuths = np.arange(-SETTINGS.max_azimuth, SETTINGS.max_azimuth + 0.01, SETTINGS.column_rad)
     visible = np.empty(len(shafts), bool)
     textures = np.empty((len(shafts), len(along), len(azimuths), 3), np.float32)
-    for frame in range(len(shafts)):
-        pixels = unroll(shafts, frame, load(frame), along, azimuths)
+    for frame, (towards, sideways) in enumerate(zip(*shafts.view_axes, strict=True)):
+        rim = np.cos(azimuths)[:, None] * towards + np.sin(azimuths)[:, None] * sideways
+        middle = shafts.origins[frame] + along[:, None, None] * shafts.directions[frame]
+        pixels = shafts.sample(frame, load(frame), middle + shafts.diameter_mm / 2 * rim)
         visible[frame] = (pixels.max(-1) > 0).mean() > SETTINGS.min_visible
         textures[frame] = np.log(pixels.astype(np.float32) + 10)
     textures -= np.median(textures, axis=(1, 2), keepdims=True)
-    if visible.any():
-        _take_out_shading(textures, visible)
+    if visible.any():  # the temporal mean, over which the instrument has rotated, is the view's shading
+        frames = np.arange(len(textures))
+        weights = np.exp(-0.5 * ((frames[:, None] - frames) / SETTINGS.shading_frames) ** 2) * visible
+        weights += 1e-3 * visible  # a frame without neighbours: the mean over the whole video
+        flat = textures.reshape(len(textures), -1)
+        flat -= (weights / weights.sum(1, keepdims=True)).astype(np.float32) @ flat
     np.clip(textures, -SETTINGS.max_contrast, SETTINGS.max_contrast, out=textures)
     for texture in textures:
         cv2.GaussianBlur(texture, (0, 0), 0.8, dst=texture)
         # light from elsewhere varies slowly across the shaft
         texture -= cv2.blur(texture, (15, 1), borderType=cv2.BORDER_REPLICATE)
     return textures, visible
-
-
-def _take_out_shading(textures: np.ndarray, visible: np.ndarray) -> None:
-    """Subtract from each texture the temporal mean, over which the instrument has rotated."""
-    frames = np.arange(len(textures))
-    weights = np.exp(-0.5 * ((frames[:, None] - frames) / SETTINGS.shading_frames) ** 2) * visible
-    # a frame without neighbours: the mean over the whole video
-    weights = weights + 1e-3 * visible
-    flat = textures.reshape(len(textures), -1)
-    flat -= (weights / weights.sum(1, keepdims=True)).astype(np.float32) @ flat
 
 
 def _correlations(textures: np.ndarray, rows: slice) -> np.ndarray:
@@ -232,24 +204,15 @@ def _normalised(textures: np.ndarray) -> np.ndarray:
 
 def roll_pairs(textures: np.ndarray, visible: np.ndarray) -> RollPairs:
     """Compare frames close in time, and every frame with the most similar distant ones; only `visible` ones."""
-    blocks = [
-        RollPairs(
-            *(
-                np.zeros((0, *shape), kind)
-                for shape, kind in ((((), int),) * 2 + (((SETTINGS.max_hypotheses,), float),) * 2)
-            )
-        )
-    ]
+    blocks = []
     for start in range(0, len(textures), SETTINGS.block):
         # pairs are counted once: the second comes later
         scores = _correlations(textures[start:], slice(0, SETTINGS.block))
         first, second = _chosen(scores.max(-1), visible[start:])
         turns, peaks = _peaks(scores[first, second])
         good = peaks[:, 0] >= SETTINGS.min_score
-        blocks.append(RollPairs(first[good] + start, second[good] + start, turns[good], peaks[good]))
-    return RollPairs(
-        *(np.concatenate([getattr(block, name) for block in blocks]) for name in ("first", "second", "turns", "scores"))
-    )
+        blocks.append((first[good] + start, second[good] + start, turns[good], peaks[good]))
+    return RollPairs(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
 def _chosen(best: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -46,37 +46,34 @@ SETTINGS = MeasurementSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
-    """widths [F] mm of the silhouettes beyond the wrist, across the shaft; shapes [F, C]: principal components of the
-    stabilised outlines, mm."""
-
-    widths: np.ndarray
-    shapes: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Measurements:
-    """Measurements of one instrument: pairs of frames with turns between them, silhouettes, frames [F] that show its
-    wrist, and the joints that nothing logged."""
+    """Measurements of one instrument: pairs of frames with turns between them; widths [F] mm of the silhouettes beyond
+    the wrist, across the shaft; shapes [F, C]: principal components of the stabilised outlines, mm; frames [F] that
+    show its wrist; and the joints that nothing logged."""
 
     pairs: RollPairs
-    shapes: Shapes
+    widths: np.ndarray
+    shapes: np.ndarray
     seen: np.ndarray
     joints: tuple[str, ...] = ()
 
 
-def silhouette_shapes(shafts: Shafts, load_mask: Load) -> Shapes:
-    """Measure silhouettes. load_mask: frame's index -> bool [H, W], where the instrument is, of any size in the image's
-    proportions."""
+def silhouette_shapes(shafts: Shafts, load_mask: Load) -> tuple[np.ndarray, np.ndarray]:
+    """Return widths [F] mm and shapes [F, C] of silhouettes.
+
+    load_mask: frame's index -> bool [H, W], where the instrument is, of any size in the image's proportions.
+    """
     length = shafts.working_length_mm
     along = np.arange(SETTINGS.along[0] * length, SETTINGS.along[1] * length, SETTINGS.step_mm)
     across = np.arange(-SETTINGS.across * length, SETTINGS.across * length + SETTINGS.step_mm / 2, SETTINGS.step_mm)
     signed = np.empty((len(shafts), len(along), len(across)), np.float32)
     for frame in range(len(shafts)):
         inside = crop(shafts, frame, load_mask(frame).astype(np.uint8) * 255, along, across) > 127
-        signed[frame] = np.clip(
-            _distance(inside) - _distance(~inside), -SETTINGS.max_distance_mm, SETTINGS.max_distance_mm
+        within, beyond = (
+            cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 3) * SETTINGS.step_mm
+            for part in (inside, ~inside)
         )
+        signed[frame] = np.clip(within - beyond, -SETTINGS.max_distance_mm, SETTINGS.max_distance_mm)
     half = SETTINGS.median_frames // 2
     padded = np.concatenate([signed[:1]] * half + [signed] + [signed[-1:]] * half)
     widths = np.empty(len(shafts))
@@ -93,11 +90,7 @@ def silhouette_shapes(shafts: Shafts, load_mask: Load) -> Shapes:
     values, vectors = np.linalg.eigh((outlines @ outlines.T).astype(np.float64))
     order = np.argsort(-values)[: SETTINGS.n_components]
     shapes = vectors[:, order] * np.sqrt(np.maximum(values[order], 0.0))
-    return Shapes(widths, shapes / np.sqrt(outlines.shape[1]))
-
-
-def _distance(inside: np.ndarray) -> np.ndarray:
-    return np.asarray(cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 3) * SETTINGS.step_mm)
+    return widths, shapes / np.sqrt(outlines.shape[1])
 
 
 def measure(capture: Capture, load_mask: Mapping[str, Load]) -> dict[str, Measurements]:
@@ -114,11 +107,10 @@ def measure(capture: Capture, load_mask: Mapping[str, Load]) -> dict[str, Measur
             continue
         shafts = Shafts.of(capture, instrument)
         textures, seen = unrolled_textures(shafts, load)
-        masks = load_mask[instrument.name]
-        shapes = silhouette_shapes(shafts, masks)
-        opened = np.quantile(shapes.widths, 0.95) - np.quantile(shapes.widths, 0.05)
-        jaws = not instrument.joints and opened > SETTINGS.min_opening * shafts.diameter_mm
-        measured[instrument.name] = Measurements(roll_pairs(textures, seen), shapes, seen, (JAWS,) if jaws else ())
+        widths, shapes = silhouette_shapes(shafts, load_mask[instrument.name])
+        opened = np.quantile(widths, 0.95) - np.quantile(widths, 0.05)
+        joints = (JAWS,) if not instrument.joints and opened > SETTINGS.min_opening * shafts.diameter_mm else ()
+        measured[instrument.name] = Measurements(roll_pairs(textures, seen), widths, shapes, seen, joints)
     return measured
 
 
@@ -126,16 +118,10 @@ def write_measurements(capture: Capture, measured: Mapping[str, Measurements]) -
     """Write them into the capture's folder, whole or not at all. Raises NeecoError."""
     tensors: dict[str, np.ndarray] = {}
     for number, item in enumerate(measured.values()):
-        stored = {
-            "first": item.pairs.first.astype(np.int32),
-            "second": item.pairs.second.astype(np.int32),
-            "turns": item.pairs.turns.astype(np.float32),
-            "scores": item.pairs.scores.astype(np.float32),
-            "widths": item.shapes.widths.astype(np.float32),
-            "shapes": item.shapes.shapes.astype(np.float32),
-            "seen": item.seen,
-        }
-        tensors |= {f"{number}/{name}": np.ascontiguousarray(value) for name, value in stored.items()}
+        arrays = {**vars(item.pairs), "widths": item.widths, "shapes": item.shapes, "seen": item.seen}
+        for name, values in arrays.items():
+            smaller = {"i": np.int32, "f": np.float32}.get(values.dtype.kind, values.dtype)
+            tensors[f"{number}/{name}"] = np.ascontiguousarray(values.astype(smaller))
     joints = json.dumps({name: item.joints for name, item in measured.items()}, allow_nan=False)
     notes = {"format": FORMAT, "frames": _frames(capture), "joints": joints}
     write_atomically(capture.root / FILE, lambda path: save_file(tensors, path, metadata=notes))
@@ -162,17 +148,16 @@ def read_measurements(capture: Capture) -> dict[str, Measurements]:
     for number, (name, by_hand) in enumerate(joints.items()):
         part = {key.partition("/")[2]: value for key, value in tensors.items() if key.startswith(f"{number}/")}
         try:
-            pairs = RollPairs(*(part[key] for key in ("first", "second", "turns", "scores")))
-            measured = Measurements(pairs, Shapes(part["widths"], part["shapes"]), part["seen"], tuple(by_hand))
+            pairs = RollPairs(*(part.pop(key) for key in ("first", "second", "turns", "scores")))
+            measurements[name] = Measurements(pairs, part["widths"], part["shapes"], part["seen"], tuple(by_hand))
             ends = np.concatenate([pairs.first, pairs.second, [0]])
             whole = pairs.turns.shape == pairs.scores.shape == (len(pairs.first), pairs.turns.shape[1])
             whole &= len(pairs.first) == len(pairs.second) and bool(0 <= ends.min() <= ends.max() < count)
-            whole &= all(len(value) == count for value in (part["widths"], part["shapes"], part["seen"]))
+            whole &= all(len(value) == count for value in part.values())
         except (KeyError, IndexError, ValueError):
             whole = False
         if not whole:
             raise NeecoError(f"{path}: {name}: is not in neeco's format; {again}")
-        measurements[name] = measured
     return measurements
 
 

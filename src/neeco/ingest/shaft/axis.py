@@ -252,10 +252,7 @@ class _AxesProblem:
 
     def cost(self, axes: ShaftAxes) -> float:
         """Return half the sum of squares; with a Cauchy loss on the edges."""
-        return self._cost(self.residuals(axes))
-
-    def _cost(self, residuals: np.ndarray) -> float:
-        edges, prior_residuals = np.split(residuals, [self.edges.deviations.size])
+        edges, prior_residuals = np.split(self.residuals(axes), [self.edges.deviations.size])
         return float(
             0.5 * SETTINGS.edge_loss_sd**2 * np.log1p((edges / SETTINGS.edge_loss_sd) ** 2).sum()
             + 0.5 * (prior_residuals**2).sum()
@@ -268,7 +265,7 @@ class _AxesProblem:
         weights = 1 / (1 + (base / SETTINGS.edge_loss_sd) ** 2)
         weights[self.edges.deviations.size :] = 1.0
         weighted = sparse.diags(weights) @ slopes
-        return Linearisation(slopes.T @ weighted, weighted.T @ base, self._cost(base), self.cost)
+        return Linearisation(slopes.T @ weighted, weighted.T @ base, self.cost(axes), self.cost)
 
     def with_covariance(self, axes: ShaftAxes) -> ShaftAxes:
         """Return the axes with the covariance of each, and of the scale, at the minimum."""

@@ -10,11 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.capture.model import UNKNOWN_DEG, FromVideo, Instrument, Uncertainty, evenly_spaced
+from neeco.capture.model import UNKNOWN_DEG, Uncertainty, evenly_spaced
 from neeco.geometry.lines import distances_to_lines, unit
+from neeco.geometry.rotations import rigid
 from neeco.ingest.foreground.silhouettes import shaft_lines
 from neeco.ingest.frames.images import SfmResult, Views, reduced
-from neeco.ingest.recording.model import InstrumentLogs, Recording
+from neeco.ingest.recording.model import InstrumentLogs
 from neeco.ingest.shaft.axis import ShaftAxes, ShaftEdges, ShaftVideo, across_axes, edge_distances, solve_axes
 from neeco.ingest.shaft.edges import (
     EDGE,
@@ -147,7 +148,7 @@ def find_shaft(
         axes = replace(axes, covariance=SHAFT.short_factor**2 * axes.covariance)
         notes.append("its standard deviations are doubled, as little of the shaft is visible; hold the scope back")
     by_color = bool(ends.any()) and heads is not None
-    measured = head if heads is None else float(np.nanquantile(heads, SHAFT.closed_quantile))
+    length = head if working_length or heads is None else float(np.nanquantile(heads, SHAFT.closed_quantile))
     slant = np.abs((unit(axes.points) * axes.directions).sum(1))
     seen = SHAFT.end_px * axes.points[:, 2] / video.intrinsics[0] / np.sqrt(np.maximum(1 - slant**2, 1e-3))
     nearest = np.abs(video.times[:, None] - video.times[ends]).min(1, initial=np.inf)
@@ -170,7 +171,7 @@ def find_shaft(
         uncertainties=uncertainties,
         axes=axes,
         share=share,
-        working_length=working_length or measured,
+        working_length=length,
         notes=tuple(notes),
     )
 
@@ -304,14 +305,12 @@ def _poses(video: ShaftVideo, axes: ShaftAxes) -> np.ndarray:
     points, directions = video.world_lines(axes)
     mean = unit(directions.mean(0))
     start = unit(np.cross(mean, np.eye(3)[np.abs(mean).argmin()]))
-    poses = np.tile(np.eye(4), (len(points), 1, 1))
-    for frame, (point, direction) in enumerate(zip(points, directions, strict=True)):
-        turn = np.cross(mean, direction)
-        angle = np.arctan2(np.linalg.norm(turn), mean @ direction)
-        x = Rotation.from_rotvec(turn * angle / max(float(np.linalg.norm(turn)), 1e-12)).apply(start)
-        x = unit(x - (x @ direction) * direction)
-        poses[frame, :3] = np.stack([x, np.cross(direction, x), direction, point], 1)
-    return poses
+    turns = np.cross(mean, directions)
+    lengths = np.linalg.norm(turns, axis=1)
+    angles = np.arctan2(lengths, directions @ mean)
+    x = Rotation.from_rotvec(turns * (angles / np.maximum(lengths, 1e-12))[:, None]).apply(start)
+    x = unit(x - (x * directions).sum(1, keepdims=True) * directions)
+    return rigid(np.stack([x, np.cross(directions, x), directions], -1), points)
 
 
 def _uncertainties(
@@ -403,16 +402,3 @@ def on_masks(masks: np.ndarray, sfm: SfmResult, size: tuple[int, int]) -> np.nda
     row, x, y = (sfm.observations[:, column] for column in (0, 2, 3))
     column = np.clip(x * width / size[0], 0, width - 1).astype(int)
     return np.asarray(around[row.astype(int), np.clip(y * height / size[1], 0, height - 1).astype(int), column] > 0)
-
-
-def instruments_of(recording: Recording, shaft: FoundShaft | None) -> tuple[Instrument, ...]:
-    """Return the instruments of a recording for its capture. found: the one that was found in the video."""
-    stated = []
-    for item in recording.instruments:
-        if item.placed:
-            limits = {name: source.limits for name, source in item.joints.items()}
-            in_video = None
-            if shaft is not None and item.from_video is not None:
-                in_video = FromVideo(item.from_video.shaft_diameter_mm, shaft.working_length)
-            stated.append(Instrument(item.name, limits, item.kinematics, from_video=in_video))
-    return tuple(stated)
