@@ -3,7 +3,7 @@ motion and registered by its tracker; the frame of a still scope is the world.""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from neeco.ingest.cameras.still_scene import (
     STILL_SCOPE,
     RightCamera,
     look_behind,
+    moving_shares,
     read_right_camera,
     same_place,
     stands_still,
@@ -26,10 +27,10 @@ from neeco.ingest.cameras.still_scene import (
 from neeco.ingest.foreground.background import find_background
 from neeco.ingest.foreground.masks import moving_masks, passing_masks
 from neeco.ingest.foreground.residual_flow import ResidualFlow
-from neeco.ingest.foreground.rough_shape import RoughShape, best_lag, carve_shape, observations_on
+from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shapes, observations_on
 from neeco.ingest.frames.images import ChosenImages, SfmResult, StageProgress, Views, undistort_images
 from neeco.ingest.readers.columns import CAMERA
-from neeco.ingest.recording.model import MIN_FRAMES, MOVING, STILL
+from neeco.ingest.recording.model import MIN_FRAMES, MOVING, STILL, IngestSettings
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.clocks import find_instrument_clocks, register
 from neeco.ingest.registration.find_bases import (
@@ -87,26 +88,50 @@ def residual_flow(sfm: SfmResult, views: Views) -> ResidualFlow:
     return ResidualFlow(views.load, sfm, views.times, views.pinhole, visible=views.visible, episodes=views.episodes)
 
 
-def longest_lag(data: Episodes) -> float:
-    """Return the maximum plausible clock error of a log, s: a longer one leaves half of the frames without poses."""
-    return float(max(np.ptp(part.times) for part in data.parts)) / 2
+def shape_rows(count: int, settings: IngestSettings) -> np.ndarray:
+    """Return the rows of `count` views in which instruments are carved."""
+    return np.unique(np.linspace(0, count - 1, settings.shape_frames).astype(int))
 
 
-def note_motion_contradiction(data: Episodes, name: str, moves: bool, lag: float) -> None:
-    """Note an instrument whose poses do not match any motion in the images, or match it at another time."""
-    logs = data.parts[0].poses
-    clock, sentence = logs[name].clock if name in logs else "", ""
-    if lag and not data.notes.is_contradicted(f"sync {clock}"):
-        after = "later" if lag > 0 else "earlier"
-        sentence = (
-            f"what moves in the images fits the poses of {name} that its log has {abs(lag):.1f} s {after}: if its "
-            f"clock {clock!r} is not that of the other logs, give it one of its own (poses: clock), else correct `sync`"
-        )
-    elif lag or not moves:
-        sentence = (
-            f"nothing in the images moves with the tracked pose of {name}: check its log, its frame and its clock"
-        )
-    data.notes.contradict(f"motion of {name}", sentence, severe=True)
+def tracked_in(data: Episodes, names: Iterable[str], views: Views, rows: np.ndarray | slice) -> dict[str, PosesAt]:
+    """Return what gives the poses of instruments in the cameras' frames of some rows of the views, by their names."""
+    camera_from_world = np.linalg.inv(views.world_from_camera[rows])
+
+    def poses_at(name: str, lag: float) -> tuple[np.ndarray, np.ndarray]:
+        poses, valid = data.instrument_poses(name, views.times[rows], lag)
+        return camera_from_world @ np.where(valid[:, None, None], poses, np.eye(4)), valid
+
+    return {name: partial(poses_at, name) for name in names}
+
+
+def compare_motion(
+    data: Episodes,
+    tracked: Mapping[str, PosesAt],
+    shapes: Mapping[str, RoughShape],
+    evidence: np.ndarray,
+    pinhole: Lens,
+) -> None:
+    """Note instruments whose poses do not match any motion in the images, or match it at another time.
+
+    evidence: moving pixels [R, h, w] of the rows of `tracked`, through `pinhole`.
+    """
+    longest = max(float(np.ptp(part.times)) for part in data.parts) / 2  # s; beyond, half of the frames have no poses
+    for name, poses_at in tracked.items():
+        lag = best_lag(evidence, poses_at, pinhole, longest)
+        logs = data.parts[0].poses
+        clock, sentence = logs[name].clock if name in logs else "", ""
+        if lag and not data.notes.is_contradicted(f"sync {clock}"):
+            after = "later" if lag > 0 else "earlier"
+            sentence = (
+                f"what moves in the images fits the poses of {name} that its log has {abs(lag):.1f} s {after}: if its "
+                f"clock {clock!r} is not that of the other logs, give it one of its own (poses: clock), else correct "
+                "`sync`"
+            )
+        elif lag or name not in shapes:
+            sentence = (
+                f"nothing in the images moves with the tracked pose of {name}: check its log, its frame and its clock"
+            )
+        data.notes.contradict(f"motion of {name}", sentence, severe=True)
 
 
 def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progress: StageProgress) -> World:
@@ -184,7 +209,9 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         placed, points = _in_mm(sfm, views, registration, shaft.axes.scale * distance)
     data = data.with_assumed_clocks()
     if registration is not None and evidence:
-        _compare_motion(data, placed, shapes, evidence, flow.pinhole)
+        rows = np.flatnonzero(np.isin(views.frames, list(evidence)))
+        moved = np.stack([evidence[frame] for frame in views.frames[rows].tolist()])
+        compare_motion(data, tracked_in(data, data.parts[0].poses, placed, rows), shapes, moved, flow.pinhole)
     states, usable = data.states_at(views.times)
     return World(
         data=data,
@@ -255,43 +282,17 @@ def _carve_instruments(
     Return the observations bool [Q] on instruments, the shapes, and moving pixels [h, w] by video frame.
     """
     settings = data.recording.settings
-    rows = np.unique(np.linspace(0, len(sfm.indices) - 1, settings.shape_frames).astype(int))
+    rows = shape_rows(len(sfm.indices), settings)
     evidence = flow.moving_pixels(rows, settings.moving_px)
     points, views = registration.points(sfm.points), _registered(views, registration)
-    camera_from_world = np.linalg.inv(views.world_from_camera)
-    on_instruments, shapes = np.zeros(len(sfm.observations), dtype=bool), {}
-    for name in data.parts[0].poses:
-        poses, valid = data.instrument_poses(name, views.times)
-        camera_from_instrument = camera_from_world @ np.where(valid[:, None, None], poses, np.eye(4))
-        usable = valid[rows]
-        shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], flow.pinhole)
-        if shape is None:
-            continue
-        shapes[name] = shape
+    on_instruments, names = np.zeros(len(sfm.observations), dtype=bool), data.parts[0].poses
+    shapes = carve_shapes(evidence, tracked_in(data, names, views, rows), flow.pinhole)
+    for name, poses_at in tracked_in(data, shapes, views, slice(None)).items():
+        poses, valid = poses_at(0.0)
         for row in np.flatnonzero(valid):
             camera = flow.pinhole.camera(views.world_from_camera[row])
-            on_instruments |= observations_on(shape, camera_from_instrument[row], sfm, int(row), points, camera)
+            on_instruments |= observations_on(shapes[name], poses[row], sfm, int(row), points, camera)
     return on_instruments, shapes, dict(zip(views.frames[rows].tolist(), evidence, strict=True))
-
-
-def _compare_motion(
-    data: Episodes, views: Views, shapes: Mapping[str, RoughShape], evidence: Mapping[int, np.ndarray], pinhole: Lens
-) -> None:
-    """Note instruments whose motion in the images differs from their poses, given the capture's clocks and cameras.
-
-    evidence: moving pixels [h, w] by video frame.
-    """
-    rows = np.flatnonzero(np.isin(views.frames, list(evidence)))
-    moved = np.stack([evidence[frame] for frame in views.frames[rows].tolist()])
-    camera_from_world = np.linalg.inv(views.world_from_camera[rows])
-    for name in data.parts[0].poses:
-
-        def before_cameras(lag: float, of: str = name) -> tuple[np.ndarray, np.ndarray]:
-            poses, valid = data.instrument_poses(of, views.times[rows], lag)
-            return camera_from_world @ np.where(valid[:, None, None], poses, np.eye(4)), valid
-
-        lag = best_lag(moved, before_cameras, pinhole, longest_lag(data))
-        note_motion_contradiction(data, name, name in shapes, lag)
 
 
 def is_still(data: Episodes, images: ChosenImages, progress: StageProgress) -> bool:
@@ -346,14 +347,19 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
         data, shaft = find_in_video(data, data.video_instrument, views, masks, None)
     data = data.with_assumed_clocks()
     names = (*data.world_from_base, *data.video_poses)
-    tracked = {name: partial(data.instrument_poses, name, views.times) for name in names}
     progress("finding the tissue behind the instrument", 0, 0)
-    behind = look_behind(views, tracked, longest_lag(data), data.recording.settings, right)
+    settings, shapes = data.recording.settings, dict[str, RoughShape]()
+    if names:
+        rows = shape_rows(count, settings)
+        moved, tracked = moving_shares(views, rows), tracked_in(data, names, views, rows)
+        shapes = carve_shapes(moved, tracked, views.reduced_pinhole)
+    poses = {name: poses_at(0.0) for name, poses_at in tracked_in(data, names, views, slice(None)).items()}
+    behind = look_behind(views, shapes, poses, settings, right)
     for note in behind.notes:
         data.notes.add(note)
     data.notes.contradict("stereo", behind.doubt, severe=True)
-    for name, lag in behind.lags.items():
-        note_motion_contradiction(data, name, name in behind.shapes, lag)
+    if names:
+        compare_motion(data, tracked, shapes, moved, views.reduced_pinhole)
     states, usable = data.states_at(views.times)
     return World(
         data=data,
@@ -362,7 +368,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
         states=states,
         usable=usable,
         tissue=PointCloud(behind.points.astype(np.float32), (behind.colors / 255).astype(np.float32)),
-        shapes=behind.shapes,
+        shapes=shapes,
         bases=bases,
         shaft=shaft,
         masks=masks,
