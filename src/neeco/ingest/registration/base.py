@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from neeco.capture.model import BaseUncertainty
-from neeco.ingest.foreground.silhouettes import ShaftLines
 from neeco.ingest.registration.logged import BasePrior, step_between
 
 
@@ -98,30 +97,6 @@ class BaseRegistration:
             "doubts": list(self.doubts),
             "covariance": self.covariance.tolist(),
         }
-
-
-def too_few_shafts(shafts: ShaftLines) -> str:
-    """Error where too few masks show a shaft."""
-    return (
-        f"what moves looks like a shaft in {int(shafts.visible.sum())} of {len(shafts.visible)} frames, at least "
-        f"{BASES.min_frames} are needed; give the transform, exactly or, before a still scope, of an arm with a "
-        "trocar, roughly (sd_mm, sd_deg), or a recording that shows more of it"
-    )
-
-
-def unmoved(*, stated: bool, linked: bool = False) -> str:
-    """Error where nothing in the images moves as an instrument's log says; stated: whether its base was, roughly;
-    linked: whether its links were."""
-    if stated:
-        return (
-            "nothing in the images moves with its poses; check which arm and which clock its log is of, or give the "
-            "exact transform"
-        )
-    links = "" if linked else "the links of a wrist that bends (kinematics), or "
-    return (
-        f"of all bases none was found from which its poses explain what moves; state {links}the base as far as it is "
-        "known (transform, sd_mm, sd_deg); check which arm and which clock its log is of"
-    )
 
 
 def moved_from(reference: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, Any]:
