@@ -30,7 +30,7 @@ from neeco.ingest.foreground.residual_flow import ResidualFlow
 from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shapes, observations_on
 from neeco.ingest.frames.images import ChosenImages, SfmResult, StageProgress, Views, undistort_images
 from neeco.ingest.readers.columns import CAMERA
-from neeco.ingest.recording.model import MIN_FRAMES, MOVING, STILL, IngestSettings
+from neeco.ingest.recording.model import MIN_FRAMES, MOVING, STILL
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.clocks import find_instrument_clocks, register
 from neeco.ingest.registration.find_bases import (
@@ -81,16 +81,6 @@ class World:
     # of a scope that stands still
     depth_source: str | None = None  # continues "the tissue's depth is"
     right: RightCamera | None = None
-
-
-def residual_flow(sfm: SfmResult, views: Views) -> ResidualFlow:
-    """Return the residual optical flow between the views, beyond that of a still scene."""
-    return ResidualFlow(views.load, sfm, views.times, views.pinhole, visible=views.visible, episodes=views.episodes)
-
-
-def shape_rows(count: int, settings: IngestSettings) -> np.ndarray:
-    """Return the rows of `count` views in which instruments are carved."""
-    return np.unique(np.linspace(0, count - 1, settings.shape_frames).astype(int))
 
 
 def tracked_in(data: Episodes, names: Iterable[str], views: Views, rows: np.ndarray | slice) -> dict[str, PosesAt]:
@@ -164,7 +154,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         images = undistort_images(images, sfm.lens, data.video, progress)
 
     views = images.views(data, sfm.indices, sfm.world_from_camera)
-    flow = residual_flow(sfm, views)
+    flow = ResidualFlow(sfm, views)
 
     def foreground(rows: np.ndarray) -> np.ndarray:
         return passing_masks(views.load, flow, rows, settings.moving_px, views.visible)
@@ -180,13 +170,13 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     if registration is None:
         require_no_base(data)
     else:
-        before = _registered(views, registration)
+        before, first_points = _in_mm(sfm, views, registration, settings.scene_distance_mm)
         data, bases = find_bases(data, before, foreground, progress, registration)
         data, corrected = correct_placement(data, before, registration, foreground, progress)
         bases |= corrected
         data = data.with_assumed_clocks()
         progress("finding the instrument", 0, 0)
-        on_instruments, shapes, evidence = _carve_instruments(data, sfm, views, flow, registration)
+        on_instruments, shapes, evidence = _carve_instruments(data, sfm, before, first_points, flow)
     if data.video_instrument is not None:
         progress("finding what moves", 0, 0)
         masks = foreground(np.arange(len(sfm.indices)))
@@ -212,6 +202,10 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         rows = np.flatnonzero(np.isin(views.frames, list(evidence)))
         moved = np.stack([evidence[frame] for frame in views.frames[rows].tolist()])
         compare_motion(data, tracked_in(data, data.parts[0].poses, placed, rows), shapes, moved, flow.pinhole)
+    reliable = sfm.reliable_points()
+    if not reliable.any():
+        reliable = np.ones(len(points), dtype=bool)
+        data.notes.add("no tissue point is observed by several frames and fits well: all of them are kept")
     states, usable = data.states_at(views.times)
     return World(
         data=data,
@@ -219,7 +213,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         views=placed,
         states=states,
         usable=usable,
-        tissue=_reliable(data, sfm, points),
+        tissue=PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32)),
         shapes=shapes,
         bases=bases,
         shaft=shaft,
@@ -244,16 +238,13 @@ def _check_joined(data: Episodes, placed: np.ndarray) -> None:
             )
 
 
-def _registered(views: Views, registration: Registration) -> Views:
-    return replace(views, world_from_camera=registration.cameras(views.world_from_camera))
-
-
 def _in_mm(
     sfm: SfmResult, views: Views, registration: Registration | None, distance_mm: float
 ) -> tuple[Views, np.ndarray]:
     """Return views and points [P, 3] in the tracker's frame, or in SfM's with the tissue `distance_mm` away."""
     if registration is not None:
-        return _registered(views, registration), registration.points(sfm.points)
+        placed = replace(views, world_from_camera=registration.cameras(views.world_from_camera))
+        return placed, registration.points(sfm.points)
     scale = distance_mm / float(np.median(_distances(sfm.points, sfm.world_from_camera)))
     cameras = sfm.world_from_camera.copy()
     cameras[:, :3, 3] *= scale
@@ -265,26 +256,17 @@ def _distances(points: np.ndarray, cameras: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(points[:, None] - cameras[None, ::10, :3, 3], axis=-1))
 
 
-def _reliable(data: Episodes, sfm: SfmResult, points: np.ndarray) -> PointCloud:
-    """Return the tissue: points [P, 3] mm of a reconstruction with several observations and a small residual."""
-    reliable = sfm.reliable_points()
-    if not reliable.any():
-        reliable = np.ones(len(points), dtype=bool)
-        data.notes.add("no tissue point is observed by several frames and fits well: all of them are kept")
-    return PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
-
-
 def _carve_instruments(
-    data: Episodes, sfm: SfmResult, views: Views, flow: ResidualFlow, registration: Registration
+    data: Episodes, sfm: SfmResult, views: Views, points: np.ndarray, flow: ResidualFlow
 ) -> tuple[np.ndarray, dict[str, RoughShape], dict[int, np.ndarray]]:
     """Carve the rough shape of every tracked instrument from pixels that move with its pose.
 
-    Return the observations bool [Q] on instruments, the shapes, and moving pixels [h, w] by video frame.
+    views, points [P, 3]: in mm. Return the observations bool [Q] on instruments, the shapes, and moving pixels [h, w]
+    by video frame.
     """
     settings = data.recording.settings
-    rows = shape_rows(len(sfm.indices), settings)
+    rows = np.unique(np.linspace(0, len(sfm.indices) - 1, settings.shape_frames).astype(int))
     evidence = flow.moving_pixels(rows, settings.moving_px)
-    points, views = registration.points(sfm.points), _registered(views, registration)
     on_instruments, names = np.zeros(len(sfm.observations), dtype=bool), data.parts[0].poses
     shapes = carve_shapes(evidence, tracked_in(data, names, views, rows), flow.pinhole)
     for name, poses_at in tracked_in(data, shapes, views, slice(None)).items():
@@ -330,7 +312,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     def moving(rows: np.ndarray) -> np.ndarray:
         return moving_masks(views.load, count, rows, views.visible)
 
-    data = find_instrument_clocks(data, residual_flow(cameras, views), views, progress)
+    data = find_instrument_clocks(data, ResidualFlow(cameras, views), views, progress)
     in_camera = [name for name, log in data.parts[0].poses.items() if log.frame == CAMERA]
     data = replace(data, world_from_base={name: np.eye(4) for name in in_camera})
     data, bases = find_bases(data, views, moving, progress)
@@ -350,7 +332,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     progress("finding the tissue behind the instrument", 0, 0)
     settings, shapes = data.recording.settings, dict[str, RoughShape]()
     if names:
-        rows = shape_rows(count, settings)
+        rows = np.unique(np.linspace(0, count - 1, settings.shape_frames).astype(int))
         moved, tracked = moving_shares(views, rows), tracked_in(data, names, views, rows)
         shapes = carve_shapes(moved, tracked, views.reduced_pinhole)
     poses = {name: poses_at(0.0) for name, poses_at in tracked_in(data, names, views, slice(None)).items()}

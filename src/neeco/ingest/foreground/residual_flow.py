@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -16,7 +16,7 @@ from scipy.spatial import QhullError
 from neeco.capture.model import REFERENCE_PIXELS
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project, project_world
-from neeco.ingest.frames.images import SfmResult
+from neeco.ingest.frames.images import SfmResult, Views
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,38 +38,28 @@ class ResidualFlow:
 
     Frames are reduced to REFERENCE_PIXELS: one pixel is as much of the scene in every recording.
 
-    load(row): image [H, W, 3] uint8 of a row of `sfm`, as `pinhole` sees it; times [M] s of the rows; visible: bool
-    [H, W], the field of view, where it has a border; episodes [M]: which of several recordings each row is of: those of
-    one are compared. `self.pinhole` is that of the reduced images.
+    views: the rows of `sfm`; those of one episode are compared. `self.pinhole` is that of the reduced images.
     """
 
-    def __init__(
-        self,
-        load: Callable[[int], np.ndarray],
-        sfm: SfmResult,
-        times: np.ndarray,
-        pinhole: Lens,
-        visible: np.ndarray | None = None,
-        episodes: np.ndarray | None = None,
-    ) -> None:
-        self.episodes = np.zeros(len(times)) if episodes is None else episodes
-        camera = pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS)
+    def __init__(self, sfm: SfmResult, views: Views) -> None:
+        self.episodes, times = views.episodes, views.times
+        camera = views.pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS)
         self.sfm, self.pinhole = sfm, Lens.of(camera)
         self.estimator: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # its stub asks for a flow
         height, width = camera.height, camera.width
 
         @lru_cache(maxsize=16)
         def grey(row: int) -> np.ndarray:
-            image = cv2.resize(load(row), (width, height), interpolation=cv2.INTER_AREA)
+            image = cv2.resize(views.load(row), (width, height), interpolation=cv2.INTER_AREA)
             return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
         self.grey = grey
         self.v, self.u = np.mgrid[FLOW.step_px // 2 : height : FLOW.step_px, FLOW.step_px // 2 : width : FLOW.step_px]
         self.step = max(1, round(FLOW.interval_s / float(np.median(np.diff(times))))) if len(times) > 1 else 1  # rows
         self.hidden = np.zeros(self.u.shape, dtype=bool)
-        if visible is not None:
+        if views.visible is not None:
             size = self.u.shape[::-1]
-            share = cv2.resize(visible.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            share = cv2.resize(views.visible.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             self.hidden = binary_dilation(share < 1, iterations=FLOW.bleeding)
 
     def moving_pixels(self, rows: np.ndarray, moving_px: float) -> np.ndarray:
