@@ -88,7 +88,12 @@ def ingest(
         dropped = {**world.images.dropped, **_left_out(world, splits)}
         result = _result(world, output, capture, chosen, dropped, rule)
         write_capture(capture, folder / "capture")
-        _measure_roll(world, result, folder / "capture", progress)
+        item = world.data.video_instrument
+        if item is not None and item.roll is None and world.right is None and world.masks is not None:
+            # for `neeco view --annotate`; a second camera's images have no masks
+            progress("measuring roll and joints", 0, 0)
+            masks = world.masks[np.isin(world.views.frames, result.selected)]
+            prepare(folder / "capture", {item.name: lambda frame: masks[frame]})
         complete(result, folder / "capture")
         return result
 
@@ -225,17 +230,6 @@ def _state(states: States, row: int, time: float, uncertainty: Uncertainty | Non
     return State(instruments, time)
 
 
-def _measure_roll(world: World, result: IngestResult, capture: Path, progress: StageProgress) -> None:
-    """Measure roll and joints of an instrument found in the video in the written capture, for `neeco view --annotate`;
-    not if the roll was logged, nor with a second camera, which has no masks."""
-    item = world.data.video_instrument
-    if item is None or item.roll is not None or world.right is not None or world.masks is None:
-        return
-    progress("measuring roll and joints", 0, 0)
-    masks = world.masks[np.isin(world.views.frames, result.selected)]
-    prepare(capture, {item.name: lambda frame: masks[frame]})
-
-
 def split_frames(data: Episodes, frames: np.ndarray, states: States, usable: np.ndarray) -> tuple[np.ndarray, str]:
     """Split video frames [M] by the first tracked instrument's states where these are `usable` [M]; LEFT_OUT elsewhere.
 
@@ -300,13 +294,27 @@ def assign_splits(
         return splits, f"{words}; unseen: {_listed(rule.unseen_episodes, rule.unseen)}"
     if rule.unseen_fraction == 0:
         return splits, f"{words}; unseen: none"
-    unseen, why = _extremes(poses, joints, rule.unseen_fraction, rule.unseen_by)
+    # the extreme of one joint, of the instrument's rotation from its mean direction, or half of each
+    moving = [name for name, values in joints.items() if np.ptp(values) > SPLITS.min_range]
+    joint = rule.unseen_by or (moving[0] if moving else None)
+    share = rule.unseen_fraction if rule.unseen_by or joint is None else rule.unseen_fraction / 2
+    unseen, why = np.zeros(len(poses), dtype=bool), []
+    if joint is not None:
+        limit = float(np.quantile(joints[joint], 1 - share))
+        unseen |= joints[joint] > limit
+        why.append(f"{joint} above {np.degrees(limit):.0f} deg")
+    if rule.unseen_by is None:
+        turn = Rotation.from_matrix(poses[:, :3, :3])
+        away = (turn.mean().inv() * turn).magnitude()
+        limit = float(np.quantile(away, 1 - share))
+        unseen |= away > limit
+        why.append(f"instrument turned more than {np.degrees(limit):.0f} deg from its mean direction")
     if not unseen.any():
         return splits, f"{words}; unseen: none, as nothing moves"
     splits[unseen] = "unseen"
     splits[~unseen & (np.abs(frames[:, None] - frames[unseen]).min(1) <= SPLITS.unseen_margin)] = LEFT_OUT
     left_out = f"frames within {SPLITS.unseen_margin} of an unseen one are left out of the capture"
-    return splits, f"{words}; unseen: {why}; {left_out}"
+    return splits, f"{words}; unseen: {' or '.join(why)}; {left_out}"
 
 
 def _inside(
@@ -321,25 +329,3 @@ def _listed(names: Sequence[str], ranges: Sequence[tuple[int, int]]) -> str:
     if names:
         return f"the recording{'s' * (len(names) > 1)} {', '.join(names)}"
     return "video frames " + ", ".join(f"{first}-{last}" for first, last in ranges)
-
-
-def _extremes(
-    poses: np.ndarray, joints: Mapping[str, np.ndarray], fraction: float, by: str | None
-) -> tuple[np.ndarray, str]:
-    """Return the frames [N] at the extreme of one joint, of the instrument's rotation from its mean direction, or half
-    of each; and a description of the rule."""
-    moving = [name for name, values in joints.items() if np.ptp(values) > SPLITS.min_range]
-    joint = by or (moving[0] if moving else None)
-    share = fraction if by or joint is None else fraction / 2
-    unseen, words = np.zeros(len(poses), dtype=bool), []
-    if joint is not None:
-        limit = float(np.quantile(joints[joint], 1 - share))
-        unseen |= joints[joint] > limit
-        words.append(f"{joint} above {np.degrees(limit):.0f} deg")
-    if by is None:
-        turn = Rotation.from_matrix(poses[:, :3, :3])
-        away = (turn.mean().inv() * turn).magnitude()
-        limit = float(np.quantile(away, 1 - share))
-        unseen |= away > limit
-        words.append(f"instrument turned more than {np.degrees(limit):.0f} deg from its mean direction")
-    return unseen, " or ".join(words)

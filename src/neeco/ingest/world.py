@@ -144,7 +144,14 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         episodes=data.episode_of(images.selected),
     )
     sfm = motion.reconstruct(progress)
-    _check_joined(data, images.selected[sfm.indices])
+    counts = np.bincount(data.episode_of(images.selected[sfm.indices]), minlength=len(data.parts))
+    for part, placed_count in zip(data.parts, counts, strict=True):
+        if placed_count < MIN_FRAMES and not data.single:
+            raise NeecoError(
+                f"{part.recording.path}: {part.name} stands alone: {placed_count} of its frames show enough of what "
+                "the other recordings show to find their cameras together (at least "
+                f"{MIN_FRAMES} are needed); where it shows another tissue, {SEPARATE_TISSUES}, else leave it out"
+            )
     if lens is None:
         assert sfm.lens is not None
         data.notes.add(
@@ -224,18 +231,6 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         moving=evidence,
         still=False,
     )
-
-
-def _check_joined(data: Episodes, placed: np.ndarray) -> None:
-    """Raise NeecoError for an episode that structure from motion did not join. placed [M]: frames with a camera."""
-    counts = np.bincount(data.episode_of(placed), minlength=len(data.parts))
-    for part, count in zip(data.parts, counts, strict=True):
-        if count < MIN_FRAMES and not data.single:
-            raise NeecoError(
-                f"{part.recording.path}: {part.name} stands alone: {count} of its frames show enough of what the other "
-                f"recordings show to find their cameras together (at least {MIN_FRAMES} are needed); where it "
-                f"shows another tissue, {SEPARATE_TISSUES}, else leave it out"
-            )
 
 
 def _in_mm(
@@ -336,10 +331,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
         moved, tracked = moving_shares(views, rows), tracked_in(data, names, views, rows)
         shapes = carve_shapes(moved, tracked, views.reduced_pinhole)
     poses = {name: poses_at(0.0) for name, poses_at in tracked_in(data, names, views, slice(None)).items()}
-    behind = look_behind(views, shapes, poses, settings, right)
-    for note in behind.notes:
-        data.notes.add(note)
-    data.notes.contradict("stereo", behind.doubt, severe=True)
+    tissue, how = look_behind(data.notes, views, shapes, poses, settings, right)
     if names:
         compare_motion(data, tracked, shapes, moved, views.reduced_pinhole)
     states, usable = data.states_at(views.times)
@@ -349,13 +341,13 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
         views=views,
         states=states,
         usable=usable,
-        tissue=PointCloud(behind.points.astype(np.float32), (behind.colors / 255).astype(np.float32)),
+        tissue=tissue,
         shapes=shapes,
         bases=bases,
         shaft=shaft,
         masks=masks,
         still=True,
-        depth_source=behind.how,
+        depth_source=how,
         right=right,
     )
 

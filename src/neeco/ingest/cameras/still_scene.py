@@ -18,7 +18,7 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_unsynced
 from neeco.capture.images import encoded_rgb, open_image, write_labels
-from neeco.capture.model import evenly_spaced
+from neeco.capture.model import PointCloud, evenly_spaced
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
 from neeco.ingest.cameras.tissue_surface import TissueSurface, epipolar_error, surface_behind, surface_from_stereo
@@ -29,6 +29,7 @@ from neeco.ingest.foreground.rough_shape import RoughShape, project_mask
 from neeco.ingest.frames.images import SfmResult, StageProgress, Views, reduced
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import IngestSettings, Recording, VideoFile
+from neeco.ingest.timing.episodes import Notes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,17 +108,6 @@ def _features(grey: np.ndarray) -> np.ndarray:
                 row, column = np.unravel_index(cell.argmax(), cell.shape)
                 places.append((left + column, top + row))
     return np.array(places, np.float32).reshape(-1, 1, 2)
-
-
-@dataclass(frozen=True, kw_only=True)
-class StillScene:
-    """Tissue behind a still scope's instruments, and remarks on it."""
-
-    points: np.ndarray  # [P, 3] mm
-    colors: np.ndarray  # uint8 [P, 3]
-    how: str  # source of the tissue's depth, in words
-    notes: tuple[str, ...]  # one sentence each
-    doubt: str  # about the second camera's calibration, in a sentence; "" without
 
 
 @dataclass(frozen=True)
@@ -216,17 +206,18 @@ def still_cameras(count: int) -> SfmResult:
 
 
 def look_behind(
+    notes: Notes,
     views: Views,
     shapes: Mapping[str, RoughShape],
     tracked: Mapping[str, tuple[np.ndarray, np.ndarray]],
     settings: IngestSettings,
     right: RightCamera | None,
-) -> StillScene:
-    """Estimate the tissue behind the instruments in the views of a still scope.
+) -> tuple[PointCloud, str]:
+    """Estimate the tissue behind the instruments in the views of a still scope, and say where its depth is from.
 
-    shapes: of instruments; tracked: camera_from_instrument [M, 4, 4] of those with known poses, and where known [M].
+    notes: of the recording; shapes: of instruments; tracked: camera_from_instrument [M, 4, 4] of those with known
+    poses, and where known [M].
     """
-    notes, doubt = [], ""
 
     def hidden_from(lens: Lens, world_from_camera: np.ndarray, rows: list[int]) -> Callable[[int], np.ndarray] | None:
         camera, camera_from_world = lens.camera(np.eye(4)), np.linalg.inv(world_from_camera)
@@ -249,37 +240,37 @@ def look_behind(
         rows = sorted(right.names)
         hidden = hidden_from(right.pinhole, right.world_from_camera, rows)
         other = find_background(lambda place: right.load(rows[place]), len(rows), hidden)
-        surface, doubt = _by_stereo(background, other, views, right)
+        surface = _by_stereo(notes, background, other, views, right)
         if surface is None:
-            notes.append("the stereo partner's images match too little for depth; check its calibration")
+            notes.add("the stereo partner's images match too little for depth; check its calibration")
     if surface is None:
         deepest = [float(placed[valid, 2, 3].max()) for placed, valid in tracked.values() if valid.any()]
         swept = [(shape, tracked[name][0][tracked[name][1]]) for name, shape in shapes.items()]
         small = views.reduced_pinhole
         surface = surface_behind(swept, small, max(deepest, default=None), settings.scene_distance_mm)
     points, colors = surface.points(background.colors, pinhole, visible)
-    return StillScene(points=points, colors=colors, how=surface.how, notes=tuple(notes), doubt=doubt)
+    return PointCloud(points.astype(np.float32), (colors / 255).astype(np.float32)), surface.how
 
 
 def _by_stereo(
-    left: Background, right: Background, views: Views, other: RightCamera
-) -> tuple[TissueSurface | None, str]:
-    """Return the surface from two backgrounds (None with too few matches), and doubts about the calibration."""
+    notes: Notes, left: Background, right: Background, views: Views, other: RightCamera
+) -> TissueSurface | None:
+    """Return the surface from two backgrounds; None with too few matches. Note doubts about the calibration."""
     visible = left.seen > 0 if views.visible is None else (left.seen > 0) & views.visible
     if right.colors.shape != left.colors.shape:
-        return None, ""
+        return None
     size = views.reduced_pinhole.size
     assert size is not None
-    right_from_left = np.linalg.inv(other.world_from_camera)
-    lenses = (views.pinhole, other.pinhole)
+    right_from_left, lenses = np.linalg.inv(other.world_from_camera), (views.pinhole, other.pinhole)
     error = epipolar_error(left.colors, right.colors, lenses, right_from_left)
-    limit, doubt = STILL_SCOPE.max_epipolar * left.colors.shape[1], ""
+    limit = STILL_SCOPE.max_epipolar * left.colors.shape[1]
     if error is not None and error > limit:
         doubt = (
             f"what the second camera shows lies {error:.1f} px off where its calibration puts it (median; up to "
             f"{limit:.1f} px is usual): check that the calibration is this scope's and of these images"
         )
-    return surface_from_stereo(left.colors, right.colors, lenses, right_from_left, visible, size), doubt
+        notes.contradict("stereo", doubt, severe=True)
+    return surface_from_stereo(left.colors, right.colors, lenses, right_from_left, visible, size)
 
 
 def moving_shares(views: Views, rows: np.ndarray) -> np.ndarray:

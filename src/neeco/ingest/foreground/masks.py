@@ -55,26 +55,21 @@ MASKS = MaskSettings()
 REACH = np.ones((9, 9), np.uint8)  # px about what may move, in which the instrument is
 
 
-@dataclass(frozen=True, eq=False)
-class ColorOdds:
-    """Log odds of every colour inside against outside: float32 [`levels`**3]."""
-
-    of_color: np.ndarray
-
-    def smoothed(self, colors: np.ndarray, px: float) -> np.ndarray:
-        """Log odds float32 [h, w] of the colours [h, w] of an image (`color_levels`), averaged over px."""
-        return np.asarray(cv2.GaussianBlur(self.of_color[colors], (0, 0), px))
-
-
 def color_levels(images: np.ndarray) -> np.ndarray:
     """Number the colours [...] of images uint8 [..., 3], below `levels`**3."""
     level = images.astype(np.int64) * MASKS.levels // 256
     return np.asarray((level[..., 0] * MASKS.levels + level[..., 1]) * MASKS.levels + level[..., 2])
 
 
-def color_odds(colors: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> ColorOdds:
-    """Estimate odds from the colours [...] of images and the pixels inside and outside, bool [...]."""
-    return ColorOdds(np.log(_shares(colors[inside]) / _shares(colors[outside])).astype(np.float32))
+def color_odds(colors: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
+    """Estimate log odds float32 [`levels`**3] of every colour from the colours [...] of images (`color_levels`) and the
+    pixels inside and outside, bool [...]."""
+    return np.asarray(np.log(_shares(colors[inside]) / _shares(colors[outside])), np.float32)
+
+
+def blurred(odds: np.ndarray, px: float) -> np.ndarray:
+    """Log odds [h, w] averaged over px."""
+    return np.asarray(cv2.GaussianBlur(odds, (0, 0), px))
 
 
 def _shares(colors: np.ndarray) -> np.ndarray:
@@ -114,7 +109,7 @@ def moving_masks(
     odds = color_odds(colors, moves, ~around & field)
     covering = []
     for mask, levels in zip(moves, colors, strict=True):
-        likely = odds.smoothed(levels, MASKS.smooth_px) > MASKS.min_odds
+        likely = blurred(odds[levels], MASKS.smooth_px) > MASKS.min_odds
         piece = whole_pieces(likely, MASKS.min_area, mask, MASKS.moving_share)
         covering.append(_grown(mask | piece, MASKS.hidden_px))
     hidden = np.stack(covering)
@@ -123,7 +118,7 @@ def moving_masks(
     masks = []
     for image, levels, covered in zip(images, colors, hidden, strict=True):
         mask = whole_pieces(background.differs(image), MASKS.min_area) | (covered & unknown)
-        likely = odds.smoothed(levels, MASKS.outline_px)
+        likely = blurred(odds[levels], MASKS.outline_px)
         mask_or_color = (mask & (likely > MASKS.tissue_odds)) | (likely > MASKS.certain_odds)
         masks.append(whole_pieces(mask_or_color, MASKS.min_area, mask, MASKS.moving_share))
     return field & np.stack(masks)
@@ -151,7 +146,7 @@ def passing_masks(
     for _ in range(MASKS.n_rounds):
         odds = color_odds(colors, inside & field, outside & field)
         inside = np.stack([
-            whole_pieces((odds.smoothed(levels, MASKS.smooth_px) > MASKS.flow_min_odds) & may, MASKS.flow_min_area)
+            whole_pieces((blurred(odds[levels], MASKS.smooth_px) > MASKS.flow_min_odds) & may, MASKS.flow_min_area)
             for levels, may in zip(colors, candidates, strict=True)
         ])  # fmt: skip
         outside = ~inside
@@ -159,7 +154,7 @@ def passing_masks(
     odds = color_odds(colors, inside & field, outside & field)
     return np.stack([
         whole_pieces(
-            (odds.smoothed(levels, MASKS.flow_outline_px) > MASKS.flow_outline_odds) & field,
+            (blurred(odds[levels], MASKS.flow_outline_px) > MASKS.flow_outline_odds) & field,
             MASKS.flow_min_area,
             mask,
             MASKS.flow_moving_share,

@@ -149,18 +149,14 @@ class SolvedPosing:
         """Roll and joints by name."""
         return {"roll": self.rolls, **self.joints}
 
-    @property
-    def breaks(self) -> list[int]:
-        """Frames before which texture alone does not determine the roll."""
-        return chain_breaks(self.measured.pairs, self.rolls)
-
     def suggestions(self, count: int = POSING.n_suggested) -> list[Suggestion]:
         """The frames whose answers would help most, each as if those before it were answered already."""
         solved = list(self.angles.values())
         usable = self.measured.seen.copy()
         usable[[frame for frame, _ in self.answers]] = False
         chosen: list[Suggestion] = []
-        breaks = np.array(self.breaks)
+        # frames before which texture alone does not determine the roll
+        breaks = np.array(chain_breaks(self.measured.pairs, self.rolls))
         for _ in range(min(count, int(usable.sum()))):
             variance = np.asarray(sum(np.diag(some.covariance) for some in solved))
             if not self.answers and not chosen:  # all are equal; open jaws show their hinge best

@@ -275,7 +275,7 @@ def shaft_ends(images: np.ndarray, masks: np.ndarray, points: np.ndarray, direct
     for _ in range(EDGE.n_rounds):
         colors = np.concatenate([*shaft, *head])
         is_shaft = np.arange(len(colors)) < sum(map(len, shaft))
-        odds = np.clip(color_odds(colors, is_shaft, ~is_shaft).of_color, -EDGE.max_odds, EDGE.max_odds)
+        odds = np.clip(color_odds(colors, is_shaft, ~is_shaft), -EDGE.max_odds, EDGE.max_odds)
         shaft, head = [], []
         for frame in frames:
             tints, along, first, last = seen[frame]
