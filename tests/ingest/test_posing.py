@@ -14,8 +14,16 @@ from posing_world import JOINT, NAME, PosingWorld, measured_world
 
 from neeco.base.errors import NeecoError
 from neeco.capture.readers import read_capture
-from neeco.ingest.posing.along_shaft import Shafts, crop, roll_pairs, unrolled_textures
-from neeco.ingest.posing.measurements import FILE, measure, read_measurements, write_measurements
+from neeco.ingest.posing.along_shaft import (
+    FILE,
+    Shafts,
+    crop,
+    measure,
+    read_measurements,
+    roll_pairs,
+    unrolled_textures,
+    write_measurements,
+)
 from neeco.ingest.posing.posed_capture import HandPose, PosedCapture, read_answers, write_answers
 
 HAND_DEG = 3.0

@@ -1,5 +1,6 @@
 """The chosen frames of a recording: sharp ones that differ, spread over states and views; as images, they are written,
-undistorted once the lens is known, and their dark border is masked. Also their cameras, once these are found."""
+undistorted once the lens is known; their dark border and a console's overlay are masked. Also their cameras, once these
+are found."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from scipy import ndimage
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_unsynced
@@ -19,7 +21,6 @@ from neeco.capture.images import PIXELS, encoded_rgb, is_repeated, open_image, w
 from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
-from neeco.ingest.frames.overlay import find_overlay
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.timing.episodes import Episodes
@@ -264,6 +265,53 @@ class ChosenImages:
         """Rename a video frame's image to its name in the capture (SfM orders images by name); return its path."""
         image = self.folder / "raw" / f"{frame:06d}.png"
         return image.rename(image.with_name(f"{name}.png"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverlaySettings:
+    """Thresholds for overlays. Brightness is of 255."""
+
+    min_images: int = 8
+    percentiles: tuple[float, float] = (5.0, 95.0)  # percentiles of a pixel's brightness whose difference is its spread
+    min_motion: float = 12.0  # minimum median spread of a moving scene
+    max_spread: float = 8.0  # maximum spread of an overlay, by compression alone
+    min_edge: float = 30.0  # minimum step of the median image; moving content has no sharp edges there
+    reach: int = 4  # px of compression artefacts around such an edge, by which masks are dilated
+    min_sharp: float = 0.6  # minimum share of a region's boundary with a sharp edge; a shaft's is sharp at one end
+    min_region_px: int = 6  # minimum size of a stroke or bar
+    min_share: float = 2e-4  # of the image; smaller ones are coincidences
+    max_share: float = 0.4  # of the image; larger ones are side panels, or a still scene
+
+
+OVERLAY = OverlaySettings()
+
+
+def find_overlay(images: Iterable[np.ndarray], visible: np.ndarray | None) -> np.ndarray | None:
+    """Return the pixels bool [H, W] that are drawn over the scene in all images uint8 [H, W, 3] of a recording; None
+    where there are none, or the scene does not move. visible: bool [H, W], the field of view; None: all of it.
+
+    They keep their brightness, and edges nearly all around them are sharp in the median image.
+    """
+    stack = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images])
+    if len(stack) < OVERLAY.min_images:
+        return None
+    low, median, high = np.percentile(stack, [OVERLAY.percentiles[0], 50, OVERLAY.percentiles[1]], axis=0)
+    field = np.ones(median.shape, bool) if visible is None else visible
+    spread = high - low
+    if not field.any() or np.median(spread[field]) < OVERLAY.min_motion:
+        return None
+    still = field & (spread <= OVERLAY.max_spread)
+    steps = ndimage.morphological_gradient(median, size=3)  # among a pixel and its neighbours
+    sharp = ndimage.maximum_filter(steps, 2 * OVERLAY.reach + 1) > OVERLAY.min_edge
+    regions, count = ndimage.label(still, np.ones((3, 3)))
+    around = ndimage.grey_dilation(regions, size=3) * ~still  # the region beside a pixel
+    pixels = np.bincount(around[field], minlength=count + 1)
+    share = np.bincount(around[field & sharp], minlength=count + 1) / np.maximum(pixels, 1)
+    large = np.bincount(regions.ravel(), minlength=count + 1) >= OVERLAY.min_region_px
+    overlay = still & (large & (share > OVERLAY.min_sharp))[regions]
+    if not OVERLAY.min_share <= overlay.mean() <= OVERLAY.max_share:
+        return None
+    return ndimage.binary_dilation(overlay, iterations=OVERLAY.reach)
 
 
 def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> ChosenImages:

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neeco.capture.model import UNKNOWN_DEG
-from neeco.ingest.posing.along_shaft import RollPairs
-from neeco.ingest.posing.measurements import Measurements
+from neeco.ingest.posing.along_shaft import Measurements, RollPairs
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,9 +26,8 @@ from neeco.base.settings import Fault, faults_in, printable, read
 from neeco.capture.documents import Node
 from neeco.capture.model import UNKNOWN_DEG, Capture, Instrument
 from neeco.capture.readers import read_capture
-from neeco.ingest.posing.along_shaft import Load, Shafts
+from neeco.ingest.posing.along_shaft import Load, Measurements, Shafts, measure, read_measurements, write_measurements
 from neeco.ingest.posing.angles import SETTINGS, AnglePosterior, chain_breaks, solve_joint, solve_rolls
-from neeco.ingest.posing.measurements import Measurements, measure, read_measurements, write_measurements
 from neeco.ingest.recording.sections import Name
 
 FILE = "hand_posed.yaml"

@@ -39,20 +39,18 @@ from neeco.ingest.registration.articulated_fit import (
 )
 from neeco.ingest.registration.base import (
     BASES,
-    BaseRegistration,
-    in_camera,
-    moved_from,
-    sd_motion,
-    with_prior,
-)
-from neeco.ingest.registration.logged import (
     CLOCK_SHIFTS_S,
     MIDDLE,
     BasePrior,
+    BaseRegistration,
     Prior,
+    in_camera,
     moved_base,
+    moved_from,
     poses_at_clock,
+    sd_motion,
     step_between,
+    with_prior,
 )
 from neeco.ingest.registration.silhouette_search import search_bases
 from neeco.states.outline_model import MODEL, ArticulatedModel, bends, joint_values, with_motion

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.ingest.foreground.silhouettes import SHAFT_LINES, Silhouettes, border_of
-from neeco.ingest.registration.logged import (
+from neeco.ingest.registration.base import (
     BASE,
     CLOCK_SHIFTS_S,
     MIDDLE,

@@ -20,9 +20,8 @@ from neeco.ingest.readers.logs import ReadingLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
 from neeco.ingest.registration.articulated import LoggedMotion, find_base
-from neeco.ingest.registration.base import BASES, BaseRegistration
+from neeco.ingest.registration.base import BASES, BaseRegistration, Prior
 from neeco.ingest.registration.hand_eye import HAND_EYE, Registration
-from neeco.ingest.registration.logged import Prior
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, VIDEOS_OWN, ClockOffset
 from neeco.ingest.timing.episodes import Episode, Episodes
 

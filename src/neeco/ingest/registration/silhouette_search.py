@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from neeco.geometry.lines import unit
 from neeco.ingest.foreground.silhouettes import ShaftLines
 from neeco.ingest.registration.articulated_fit import ArticulatedProblem
-from neeco.ingest.registration.logged import MIDDLE
+from neeco.ingest.registration.base import MIDDLE
 
 
 @dataclass(frozen=True, kw_only=True)
