@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neeco.geometry.lens import Lens
-from neeco.ingest.foreground.residual_flow import FLOW, ResidualFlow
+from neeco.ingest.foreground.masks import FLOW, ResidualFlow
 from neeco.ingest.foreground.rough_shape import best_lag, carve_shape, lag_of, observations_on, project_mask
 from neeco.ingest.frames.images import SfmResult, Views
 

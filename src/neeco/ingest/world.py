@@ -24,8 +24,7 @@ from neeco.ingest.cameras.still_scene import (
     stands_still,
     still_cameras,
 )
-from neeco.ingest.foreground.masks import find_background, moving_masks, passing_masks
-from neeco.ingest.foreground.residual_flow import ResidualFlow
+from neeco.ingest.foreground.masks import ResidualFlow, find_background, moving_masks, passing_masks
 from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shapes, observations_on
 from neeco.ingest.frames.images import ChosenImages, SfmResult, StageProgress, Views, undistort_images
 from neeco.ingest.readers.columns import CAMERA

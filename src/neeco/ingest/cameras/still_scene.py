@@ -22,8 +22,7 @@ from neeco.capture.model import PointCloud, evenly_spaced
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
 from neeco.ingest.cameras.tissue_surface import TissueSurface, epipolar_error, surface_behind, surface_from_stereo
-from neeco.ingest.foreground.masks import Background, find_background, moving_masks
-from neeco.ingest.foreground.residual_flow import FLOW
+from neeco.ingest.foreground.masks import FLOW, Background, find_background, moving_masks
 from neeco.ingest.foreground.rough_shape import RoughShape, project_mask
 from neeco.ingest.frames.images import SfmResult, StageProgress, Views, reduced
 from neeco.ingest.readers import VideoSource

@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation
 from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project, project_world
-from neeco.ingest.foreground.residual_flow import FLOW
+from neeco.ingest.foreground.masks import FLOW
 from neeco.ingest.frames.images import SfmResult
 
 

@@ -55,10 +55,6 @@ class Silhouettes:
         size = np.array(self.distances.shape[:0:-1])
         return np.asarray(((pixels > margin) & (pixels < size - margin)).all(-1))
 
-    def overlap(self, filled: np.ndarray) -> float:
-        """Intersection over union of filled silhouettes bool [F, h, w] with the masks, over all frames."""
-        return int((filled & self.masks).sum()) / max(int((filled | self.masks).sum()), 1)
-
     def take(self, rows: np.ndarray) -> Silhouettes:
         """Return those of some of the frames."""
         return Silhouettes(self.masks[rows], self.distances[rows], self.intrinsics, self.shafts.take(rows))

@@ -161,24 +161,19 @@ class SolvedPosing:
             if not self.answers and not chosen:  # all are equal; open jaws show their hinge best
                 variance = self.measured.widths
             frame = int(np.argmax(np.where(usable, variance, -np.inf)))
-            chosen.append(
-                Suggestion(frame, self._reason(frame, [some.deviations_deg[frame] for some in solved], breaks))
-            )
+            widths, reason = self.measured.widths, "the chain of rolls breaks here"
+            if self.joints and widths[frame] >= np.quantile(widths, 1 - POSING.extreme):
+                reason = "jaws at their widest"
+            elif not len(breaks) or np.abs(breaks - frame).min() > POSING.near_break:
+                deviations = {name: some.deviations_deg[frame] for name, some in zip(self.angles, solved, strict=True)}
+                least = max(deviations, key=lambda name: deviations[name])
+                reason = f"largest deviation: {least} ± {deviations[least]:.0f}°"
+                if self.joints and widths[frame] <= np.quantile(widths, POSING.extreme):
+                    reason = "jaws at their narrowest"
+            chosen.append(Suggestion(frame, reason))
             usable[frame] = False
             solved = [some.with_answer(frame) for some in solved]
         return chosen
-
-    def _reason(self, frame: int, deviations: Sequence[float], breaks: np.ndarray) -> str:
-        widths = self.measured.widths
-        if self.joints and widths[frame] >= np.quantile(widths, 1 - POSING.extreme):
-            return "jaws at their widest"
-        if len(breaks) and np.abs(breaks - frame).min() <= POSING.near_break:
-            return "the chain of rolls breaks here"
-        if self.joints and widths[frame] <= np.quantile(widths, POSING.extreme):
-            return "jaws at their narrowest"
-        names = list(self.angles)
-        least = int(np.argmax(deviations))
-        return f"largest deviation: {names[least]} ± {deviations[least]:.0f}°"
 
     def outliers(self) -> list[OutlierAnswer]:
         """Answers that differ from an earlier one of the same frame; and of roll and of each joint the one that differs
