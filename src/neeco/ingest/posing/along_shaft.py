@@ -217,23 +217,18 @@ def roll_pairs(textures: np.ndarray, visible: np.ndarray) -> RollPairs:
     for start in range(0, len(textures), SETTINGS.block):
         # pairs are counted once: the second comes later
         scores = _correlations(textures[start:], slice(0, SETTINGS.block))
-        first, second = _chosen(scores.max(-1), visible[start:])
+        best, later = scores.max(-1), visible[start:]
+        apart = np.arange(best.shape[1]) - np.arange(best.shape[0])[:, None]
+        both = later & later[: len(best), None]
+        far = np.where((apart > SETTINGS.far_frames) & both, best, -1.0)
+        similar = np.argsort(-far, axis=1, kind="stable")[:, : SETTINGS.far_pairs]
+        chosen = np.isin(apart, SETTINGS.near_frames)
+        np.put_along_axis(chosen, similar, True, axis=1)
+        first, second = np.nonzero(chosen & both & (apart > 0))
         turns, peaks = _peaks(scores[first, second])
         good = peaks[:, 0] >= SETTINGS.min_score
         blocks.append((first[good] + start, second[good] + start, turns[good], peaks[good]))
     return RollPairs(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
-
-
-def _chosen(best: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Choose pairs [R, F] from their highest correlations."""
-    apart = np.arange(best.shape[1]) - np.arange(best.shape[0])[:, None]
-    both = visible & visible[: len(best), None]
-    far = np.where((apart > SETTINGS.far_frames) & both, best, -1.0)
-    similar = np.argsort(-far, axis=1, kind="stable")[:, : SETTINGS.far_pairs]
-    chosen = np.isin(apart, SETTINGS.near_frames)
-    np.put_along_axis(chosen, similar, True, axis=1)
-    first, second = np.nonzero(chosen & both & (apart > 0))
-    return first, second
 
 
 def _peaks(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -107,7 +107,14 @@ def _chained(
     for sharpness in np.linspace(0.0, 1.6, SETTINGS.n_rounds).clip(max=1.0):
         widened = SETTINGS.first_widening + (1 - SETTINGS.first_widening) * sharpness
         weights, turns = _likely(pairs, texture_rolls, view, share, widened)
-        between, toward = _differences(pairs, weights, turns, len(times))
+        first, second = pairs.first, pairs.second
+        between, toward = np.zeros((len(times), len(times))), np.zeros(len(times))  # normal equations of the pairs
+        np.add.at(between, (first, first), weights)
+        np.add.at(between, (second, second), weights)
+        np.add.at(between, (first, second), -weights)
+        np.add.at(between, (second, first), -weights)
+        np.add.at(toward, second, weights * turns)
+        np.add.at(toward, first, -weights * turns)
         # textures show the roll and an error of each frame, which is solved for, too
         inner = np.linalg.solve(between + noise_precision, np.column_stack([noise_precision, toward]))
         information = precision + noise_precision - noise_precision @ inner[:, :-1]
@@ -200,16 +207,3 @@ def _likely(
     weights = SETTINGS.pair_weight * fits / (fits.sum(1, keepdims=True) + wrong) / deviation**2
     total = weights.sum(1)
     return total, (weights * turns).sum(1) / np.maximum(total, 1e-12)
-
-
-def _differences(pairs: RollPairs, weights: np.ndarray, turns: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations [F, F], [F] of the pairs."""
-    first, second = pairs.first, pairs.second
-    between, toward = np.zeros((count, count)), np.zeros(count)
-    np.add.at(between, (first, first), weights)
-    np.add.at(between, (second, second), weights)
-    np.add.at(between, (first, second), -weights)
-    np.add.at(between, (second, first), -weights)
-    np.add.at(toward, second, weights * turns)
-    np.add.at(toward, first, -weights * turns)
-    return between, toward

@@ -157,7 +157,12 @@ def find_base(
     if model is None or prior is None:
         fits = _explaining(problem, searched_starts(problem, model, seed))
     else:
-        fits = _explaining(problem, known_starts(problem, model))
+        base = prior[0]  # as stated, and shifted along the shaft or turned about it: there it is the least certain
+        shaft = unit((base[:3, :3] @ problem.poses[MIDDLE][:, :3, :3] @ model.axis).mean(0))
+        steps = [np.append(np.zeros(3), along * shaft) for along in (0.0, *LINKED.along_mm)]
+        steps += [np.append(roll * shaft, np.zeros(3)) for roll in LINKED.rolls_rad]
+        bases = [moved_base(base, problem.pivot(base), step) for step in steps]
+        fits = _explaining(problem, [ArticulatedFit.start(model, base) for base in bases])
         reached = overlap(problem, fits[0]) if fits else 0.0
         if reached < LINKED.usual_overlap and (words := _elsewhere(problem, model, reached, seed)):
             raise NeecoError(words)
@@ -323,15 +328,6 @@ def _resized(problem: ArticulatedProblem, factor: float, fit: ArticulatedFit) ->
     parameters[fit.model.tube] += np.log(factor)
     parameters[fit.model.mean_length] *= factor
     return replace(moved, parameters=parameters)
-
-
-def known_starts(problem: ArticulatedProblem, model: ArticulatedModel) -> list[ArticulatedFit]:
-    """The base as stated, and shifted along the shaft or turned about it: there it is the least certain."""
-    base = problem.prior.world_from_base
-    shaft = unit((base[:3, :3] @ problem.poses[MIDDLE][:, :3, :3] @ model.axis).mean(0))
-    steps = [np.append(np.zeros(3), along * shaft) for along in (0.0, *LINKED.along_mm)]
-    steps += [np.append(roll * shaft, np.zeros(3)) for roll in LINKED.rolls_rad]
-    return [ArticulatedFit.start(model, moved_base(base, problem.pivot(base), step)) for step in steps]
 
 
 def searched_starts(problem: ArticulatedProblem, model: ArticulatedModel | None, seed: int) -> list[ArticulatedFit]:

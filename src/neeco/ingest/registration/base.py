@@ -188,25 +188,20 @@ def with_prior(covariance: np.ndarray, prior: BasePrior, shaft: np.ndarray) -> t
     if prior.sd_rad is not None and prior.sd_mm is not None:
         units, limit = np.repeat([prior.sd_rad, prior.sd_mm], 3), BASES.open_share**2
     values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
-    words = [
-        _direction(shaft, vector) for value, vector in zip(values[::-1], vectors.T[::-1], strict=True) if value > limit
-    ]
+    words = []
+    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        if value <= limit:
+            continue
+        turns = np.square(vector[:3]).sum() > 0.5 * np.square(vector).sum()
+        way = vector[:3] if turns else vector[3:]
+        way = way / np.linalg.norm(way)
+        largest = int(np.argmax(np.abs(way)))
+        to = f"({', '.join(f'{part:+.1f}' for part in way)}) (right, down, forward)"
+        if abs(way @ shaft) > 0.9:
+            to = "the shaft"
+        elif way[largest] ** 2 > 0.75:
+            to = ("the image's width", "the image's height", "the view (depth)")[largest]
+        words.append(f"{'a turn about' if turns else 'a shift along'} {to}")
     if prior.sd_mm is not None:
         covariance = (vectors * np.minimum(values, 1.0)) @ vectors.T * np.outer(units, units)
     return covariance, tuple(dict.fromkeys(words))
-
-
-def _direction(shaft: np.ndarray, vector: np.ndarray) -> str:
-    """Describe a direction in which the base may move: turns and shifts [6], at `lever_mm`, along a camera's axes."""
-    turns = np.square(vector[:3]).sum() > 0.5 * np.square(vector).sum()
-    way = vector[:3] if turns else vector[3:]
-    way = way / np.linalg.norm(way)
-    what, at = ("a turn", "about") if turns else ("a shift", "along")
-    if abs(way @ shaft) > 0.9:
-        return f"{what} {at} the shaft"
-    names = ("the image's width", "the image's height", "the view (depth)")
-    largest = int(np.argmax(np.abs(way)))
-    if way[largest] ** 2 > 0.75:
-        return f"{what} {at} {names[largest]}"
-    parts = ", ".join(f"{value:+.1f}" for value in way)
-    return f"{what} {at} ({parts}) (right, down, forward)"

@@ -124,11 +124,17 @@ def shaded_edges(
     count = len(images)
     pixels, deviations = np.zeros((count, 2, EDGE.max_places, 2)), np.full((count, 2, EDGE.max_places), np.inf)
     diameters, misfits = np.zeros(count), []
+    fx, fy, cx, cy = intrinsics
+    back = np.linspace(EDGE.max_diameters * 2, EDGE.margin_radii, 400) * radius
     for frame in range(count):
-        seen = _visible(axes.points[frame], axes.directions[frame], radius, intrinsics, images.shape[1:3])
-        if seen is None:
+        axis = axes.points[frame] - back[:, None] * axes.directions[frame]
+        deep = np.maximum(axis[:, 2], 1e-6)
+        places = np.stack([fx * axis[:, 0] / deep + cx, fy * axis[:, 1] / deep + cy], 1)
+        inside = (axis[:, 2] > radius) & (places > 0).all(1) & (places < images.shape[2:0:-1]).all(1)
+        if inside.sum() < 2:
             continue
-        ends, width = seen
+        ends = places[np.flatnonzero(inside)[[0, -1]]]  # from the border to where the shaft ends
+        width = float((2 * radius * np.sqrt(fx * fy) / deep[inside]).mean())
         length = float(np.linalg.norm(ends[1] - ends[0]))
         diameters[frame] = length / width
         if length < EDGE.min_length_px:
@@ -143,29 +149,6 @@ def shaded_edges(
             # an edge has an error as a whole, too: its places are not independent
             deviations[frame, side, : len(keep)] = np.hypot(sds[keep], EDGE.common_sd_px * np.sqrt(max(len(keep), 1)))
     return ShaftEdges(pixels, deviations), diameters, float(np.mean(misfits)) if misfits else np.inf
-
-
-def _visible(
-    point: np.ndarray,
-    direction: np.ndarray,
-    radius: float,
-    intrinsics: Intrinsics,
-    size: tuple[int, ...],
-) -> tuple[np.ndarray, float] | None:
-    """Ends [2, 2] px of the shaft's axis in the image, from the border to where the shaft ends, and its mean width px;
-    None: none of it is in the image."""
-    fx, fy, cx, cy = intrinsics
-    height, width = size[:2]
-    back = np.linspace(EDGE.max_diameters * 2, EDGE.margin_radii, 400) * radius
-    axis = point - back[:, None] * direction
-    deep = np.maximum(axis[:, 2], 1e-6)
-    places = np.stack([fx * axis[:, 0] / deep + cx, fy * axis[:, 1] / deep + cy], 1)
-    inside = (axis[:, 2] > radius) & (places > 0).all(1) & (places[:, 0] < width) & (places[:, 1] < height)
-    if inside.sum() < 2:
-        return None
-    rows = np.flatnonzero(inside)
-    widths = 2 * radius * np.sqrt(fx * fy) / deep[rows]
-    return places[rows[[0, -1]]], float(widths.mean())
 
 
 def _edge(

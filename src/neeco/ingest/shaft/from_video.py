@@ -218,14 +218,6 @@ def _first_axes(
             f"a shaft is visible in {int(valid.sum())} of {len(masks)} frames; hold the scope back, so that more than "
             "the instrument's end shows"
         )
-    axes, edges = _bridged(video, axes, edges, valid)
-    axes = solve_axes(video, axes, edges)
-    axes, at_end, _ = _at_end(axes, images, masks, video, head, 0.0)
-    return axes, edges, at_end
-
-
-def _bridged(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges, valid: np.ndarray) -> tuple[ShaftAxes, ShaftEdges]:
-    """Interpolate the axes of outlier frames from the others, which alone keep their edges."""
     depth = axes.points[:, 2]
     usual = float(np.median(depth[valid]))
     good = valid & (depth > SHAFT.depth_range[0] * usual) & (depth < SHAFT.depth_range[1] * usual)
@@ -234,6 +226,7 @@ def _bridged(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges, valid: np.nd
         near = good & (video.episodes == video.episodes[frame])
         near[: max(frame - SHAFT.window_frames, 0)] = near[frame + SHAFT.window_frames + 1 :] = False
         good[frame] = np.linalg.norm(directions[frame] - np.median(directions[near], axis=0)) <= SHAFT.max_jump
+    # outliers lie between the others, which alone keep their edges
     values = np.concatenate([points, directions], 1)
     values = np.stack([np.interp(video.times, video.times[good], column[good]) for column in values.T], 1)
     rotations, centers = video.world_from_camera[:, :3, :3], axes.scale * video.world_from_camera[:, :3, 3]
@@ -242,7 +235,10 @@ def _bridged(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges, valid: np.nd
         points=np.einsum("fji,fj->fi", rotations, values[:, :3] - centers),
         directions=np.einsum("fji,fj->fi", rotations, unit(values[:, 3:])),
     )
-    return bridged, ShaftEdges(edges.pixels, np.where(good[:, None, None], edges.deviations, np.inf))
+    edges = ShaftEdges(edges.pixels, np.where(good[:, None, None], edges.deviations, np.inf))
+    axes = solve_axes(video, bridged, edges)
+    axes, at_end, _ = _at_end(axes, images, masks, video, head, 0.0)
+    return axes, edges, at_end
 
 
 def _at_end(
