@@ -282,16 +282,17 @@ def assign_splits(
     every = SPLITS.test_every if rule.test_every is None else rule.test_every
     splits = np.full(len(frames), "train", dtype=object)
     if whole or rule.test:
-        splits[_inside(frames, whole, rule.test, episodes)] = "test"
-        words = f"test: {_listed(whole, rule.test)}"
+        inside, words = _spans(frames, whole, rule.test, episodes)
+        splits[inside], words = "test", f"test: {words}"
     elif every:
         splits[frames % every == every // 2] = "test"
         words = f"test: video frames whose number leaves {every // 2} when divided by {every}"
     else:
         words = "test: none"
     if rule.unseen_episodes or rule.unseen:
-        splits[_inside(frames, rule.unseen_episodes, rule.unseen, episodes)] = "unseen"
-        return splits, f"{words}; unseen: {_listed(rule.unseen_episodes, rule.unseen)}"
+        inside, unseen_words = _spans(frames, rule.unseen_episodes, rule.unseen, episodes)
+        splits[inside] = "unseen"
+        return splits, f"{words}; unseen: {unseen_words}"
     if rule.unseen_fraction == 0:
         return splits, f"{words}; unseen: none"
     # the extreme of one joint, of the instrument's rotation from its mean direction, or half of each
@@ -317,15 +318,12 @@ def assign_splits(
     return splits, f"{words}; unseen: {' or '.join(why)}; {left_out}"
 
 
-def _inside(
+def _spans(
     frames: np.ndarray, names: Sequence[str], ranges: Sequence[tuple[int, int]], episodes: Mapping[str, tuple[int, int]]
-) -> np.ndarray:
-    """Return which frames [N] belong to the named episodes or, without any, to the ranges (first, last)."""
+) -> tuple[np.ndarray, str]:
+    """Return which frames [N] belong to the named episodes or, without any, to the ranges (first, last); in words."""
     spans = [episodes[name] for name in names] or ranges
-    return np.any([(frames >= first) & (frames <= last) for first, last in spans], axis=0)
-
-
-def _listed(names: Sequence[str], ranges: Sequence[tuple[int, int]]) -> str:
+    inside = np.any([(frames >= first) & (frames <= last) for first, last in spans], axis=0)
     if names:
-        return f"the recording{'s' * (len(names) > 1)} {', '.join(names)}"
-    return "video frames " + ", ".join(f"{first}-{last}" for first, last in ranges)
+        return inside, f"the recording{'s' * (len(names) > 1)} {', '.join(names)}"
+    return inside, "video frames " + ", ".join(f"{first}-{last}" for first, last in ranges)

@@ -225,24 +225,17 @@ def roll_pairs(textures: np.ndarray, visible: np.ndarray) -> RollPairs:
         chosen = np.isin(apart, SETTINGS.near_frames)
         np.put_along_axis(chosen, similar, True, axis=1)
         first, second = np.nonzero(chosen & both & (apart > 0))
-        turns, peaks = _peaks(scores[first, second])
+        # the highest local maxima of correlations over the shift, at subcolumn precision
+        before, middle, after = (scores[first, second, low : low - 2 or None] for low in (0, 1, 2))
+        ranked = np.where((middle >= before) & (middle > after), middle, 0.0)
+        order = np.argsort(-ranked, axis=1, kind="stable")[:, : SETTINGS.max_hypotheses]
+        a, b, c = (np.take_along_axis(values, order, 1) for values in (before, middle, after))
+        fraction = 0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-6)
+        turns = (order + 1 - SETTINGS.max_columns + np.clip(fraction, -0.5, 0.5)) * SETTINGS.column_rad
+        peaks = np.maximum(np.take_along_axis(ranked, order, 1), 0.0)
         good = peaks[:, 0] >= SETTINGS.min_score
         blocks.append((first[good] + start, second[good] + start, turns[good], peaks[good]))
     return RollPairs(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
-
-
-def _peaks(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the highest local maxima of correlations [P, 2 M + 1] over the shift, at subcolumn precision: rotations
-    rad and scores [P, K] of K hypotheses."""
-    before, middle, after = scores[:, :-2], scores[:, 1:-1], scores[:, 2:]
-    is_peak = (middle >= before) & (middle > after)
-    ranked = np.where(is_peak, middle, 0.0)
-    order = np.argsort(-ranked, axis=1, kind="stable")[:, : SETTINGS.max_hypotheses]
-    rows = np.arange(len(scores))[:, None]
-    a, b, c = before[rows, order], middle[rows, order], after[rows, order]
-    fraction = 0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-6)
-    turns = (order + 1 - SETTINGS.max_columns + np.clip(fraction, -0.5, 0.5)) * SETTINGS.column_rad
-    return turns, np.maximum(ranked[rows, order], 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -121,7 +121,13 @@ def _chained(
         rolls = np.linalg.solve(information, pull + noise_precision @ inner[:, -1])
         texture_rolls = inner[:, :-1] @ rolls + inner[:, -1]
         if len(frames) >= SETTINGS.min_gain_answers:
-            share = _share_shown(pairs, rolls + view, weights, turns, view, share)
+            # the share of a turn that textures show: shading that stays with the view reduces it, in all pairs
+            turned = (rolls + view)[second] - (rolls + view)[first]
+            measured = (turns + view[second] - view[first]) * share
+            together = (weights * turned**2).sum()
+            prior = SETTINGS.gain_prior * together + 1e-12
+            gain = ((weights * measured * turned).sum() + prior) / (together + prior)
+            share = float(np.clip(gain, *SETTINGS.gain_range))
     return AnglePosterior(rolls + center + view, np.linalg.inv(information))
 
 
@@ -176,18 +182,6 @@ def _correlation(times: np.ndarray, scale: float) -> np.ndarray:
 
 def _wrapped(angles: np.ndarray) -> np.ndarray:
     return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi)
-
-
-def _share_shown(
-    pairs: RollPairs, rolls: np.ndarray, weights: np.ndarray, turns: np.ndarray, view: np.ndarray, share: float
-) -> float:
-    """Share of a turn that textures show: shading that stays with the view reduces it, in all pairs. weights and turns
-    [P] of the pairs by the `share` so far."""
-    turned = rolls[pairs.second] - rolls[pairs.first]
-    measured = (turns + view[pairs.second] - view[pairs.first]) * share
-    together = (weights * turned**2).sum()
-    prior = SETTINGS.gain_prior * together + 1e-12
-    return float(np.clip(((weights * measured * turned).sum() + prior) / (together + prior), *SETTINGS.gain_range))
 
 
 def _likely(
