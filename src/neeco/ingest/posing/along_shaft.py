@@ -169,9 +169,9 @@ def unrolled_textures(shafts: Shafts, load: Load) -> tuple[np.ndarray, np.ndarra
     visible = np.empty(len(shafts), bool)
     textures = np.empty((len(shafts), len(along), len(azimuths), 3), np.float32)
     for frame, (towards, sideways) in enumerate(zip(*shafts.view_axes, strict=True)):
-        rim = np.cos(azimuths)[:, None] * towards + np.sin(azimuths)[:, None] * sideways
+        radial = np.cos(azimuths)[:, None] * towards + np.sin(azimuths)[:, None] * sideways
         middle = shafts.origins[frame] + along[:, None, None] * shafts.directions[frame]
-        pixels = shafts.sample(frame, load(frame), middle + shafts.diameter_mm / 2 * rim)
+        pixels = shafts.sample(frame, load(frame), middle + shafts.diameter_mm / 2 * radial)
         visible[frame] = (pixels.max(-1) > 0).mean() > SETTINGS.min_visible
         textures[frame] = np.log(pixels.astype(np.float32) + 10)
     textures -= np.median(textures, axis=(1, 2), keepdims=True)
