@@ -147,6 +147,6 @@ def hasten_ingest() -> None:
     world = module_at(TESTS / "ingest" / "conftest.py", "ingest_world")
     known = world.Recorded(world.World(Path(os.devnull)))
     StructureFromMotion._search = lambda self, progress: Attempt(strategies(None)[0], 1)  # type: ignore[method-assign]
-    StructureFromMotion._run = lambda self, job, progress, best: known.reconstruct(  # type: ignore[method-assign]
+    StructureFromMotion._run = lambda self, job, progress: known.reconstruct(  # type: ignore[method-assign]
         self.names, self.job["camera_params"]
     )

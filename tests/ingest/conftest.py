@@ -189,7 +189,7 @@ def recorded(tmp_path: Path, film: Path, monkeypatch: pytest.MonkeyPatch) -> Rec
     made = Recorded(World(tmp_path / "rec"))
     made.write()
 
-    def run(self: StructureFromMotion, job: dict[str, Any], progress: StageProgress, best: Attempt | None) -> SfmResult:
+    def run(self: StructureFromMotion, job: dict[str, Any], progress: StageProgress) -> SfmResult:
         progress("cameras: mapping", 1, 2)
         return made.reconstruct(self.names, self.job["camera_params"])
 

@@ -23,7 +23,7 @@ from neeco.ingest.registration.articulated_fit import (
     fit_articulated,
     with_pose_errors,
 )
-from neeco.ingest.registration.logged import CLOCK_SHIFTS_S, BasePrior
+from neeco.ingest.registration.base import CLOCK_SHIFTS_S, BasePrior
 from neeco.states.outline_model import ArticulatedModel, joint_values, with_motion
 
 FRAMES, RATE = 36, 8.0

@@ -6,12 +6,13 @@ import cv2
 import numpy as np
 import pytest
 from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, WORLD_FROM_BASE, disturbed, errors, make_world
+from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.foreground.silhouettes import shaft_lines, silhouettes_of
 from neeco.ingest.registration import silhouette_search
 from neeco.ingest.registration.articulated import LoggedMotion, find_base
-from neeco.ingest.registration.silhouette_search import Candidates, ShaftViews, search, uniform_rotations
+from neeco.ingest.registration.silhouette_search import Candidates, ShaftViews, search
 
 FRAMES = 44
 ROUGH = (5.0, 3.0)  # sd mm, deg of the prior: errors of 8 mm and 5 degrees are within
@@ -94,7 +95,7 @@ def test_lines_and_tips_alone_tell_the_rotation_of_a_base_of_which_nothing_is_kn
         base_from_instrument=world.poses_at(TRUE_CLOCK_S), center=np.array([0.0, 0.0, 90.0]), sd_mm=90.0, distance=90.0,
     )  # fmt: skip
     generator = np.random.default_rng(3)
-    found = search(views, uniform_rotations(2000, generator), generator, 0.2)
+    found = search(views, Rotation.random(2000, random_state=generator).as_matrix(), generator, 0.2)
     assert min(errors(base, world.poses_at(TRUE_CLOCK_S))[2] for base in found.world_from_base) < 12
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from neeco.ingest.frames.overlay import find_overlay
+from neeco.ingest.frames.images import find_overlay
 
 HEIGHT, WIDTH = 144, 192
 

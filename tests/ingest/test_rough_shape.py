@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from neeco.geometry.lens import Lens
-from neeco.ingest.foreground.residual_flow import FLOW, ResidualFlow
+from neeco.ingest.foreground.masks import FLOW, ResidualFlow
 from neeco.ingest.foreground.rough_shape import best_lag, carve_shape, lag_of, observations_on, project_mask
-from neeco.ingest.frames.images import SfmResult
+from neeco.ingest.frames.images import SfmResult, Views
 
 PINHOLE = Lens(60.0, 60.0, 32.0, 24.0, (), (64, 48))
 ROWS = np.arange(14)
@@ -105,7 +105,11 @@ def test_what_moves_is_told_alike_in_small_and_large_images(times: int) -> None:
     lens = Lens(
         300.0 * times, 300.0 * times, width * times / 2, height * times / 2, (), (times * width, times * height)
     )
-    evidence = ResidualFlow(load, sfm, np.arange(4) / 25, lens, visible).moving_pixels(np.array([0]), 1.5)[0]
+    views = Views(
+        rows=np.arange(4), frames=np.arange(4), times=np.arange(4) / 25, episodes=np.zeros(4),
+        world_from_camera=sfm.world_from_camera, load=load, pinhole=lens, visible=visible,
+    )  # fmt: skip
+    evidence = ResidualFlow(sfm, views).moving_pixels(np.array([0]), 1.5)[0]
     assert evidence.shape == (height // FLOW.step_px, width // FLOW.step_px)
     assert np.isnan(evidence[:, : 40 // FLOW.step_px]).all()
     assert not np.isnan(evidence[:, 60 // FLOW.step_px :]).any()

@@ -100,7 +100,7 @@ def test_a_dead_end_is_followed_by_another_way_from_the_same_features(search):
     assert tasks == [("match", "database.db"), ("map", "database.db"), ("map", "database.db")]
     assert motion.search[0].endswith("ends after 2 of 100 keyframes")
     assert motion.search[-1] == f"taken: {best.strategy.words}"
-    assert motion._parameters(best.strategy)["model"].endswith("attempt1")
+    assert motion._job_of(best.strategy)["model"].endswith("attempt1")
 
 
 def test_what_works_at_once_is_not_tried_again(search):

@@ -11,8 +11,7 @@ from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid
 from neeco.ingest.cameras.still_scene import stands_still
 from neeco.ingest.cameras.tissue_surface import epipolar_error, surface_behind
-from neeco.ingest.foreground.background import exposure, find_background
-from neeco.ingest.foreground.masks import moving_masks
+from neeco.ingest.foreground.masks import exposure, find_background, moving_masks
 
 WIDTH, HEIGHT, FRAMES = 160, 128, 40
 

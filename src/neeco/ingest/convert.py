@@ -40,9 +40,16 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
             report.problems.extend(parsed.absent)
         if not parsed.frames and not report.problems:
             report.error("frames", "", "no frame could be read", f"run `neeco check {shlex.quote(str(folder))}`")
-        tool_masks = _tool_masks(parsed, report) if parsed.is_endonerf else []
+        tool_masks = folder_images(parsed.root, MASKS, report) if parsed.is_endonerf else []
+        if tool_masks and len(tool_masks) != len(parsed.frames):
+            message = f"has {len(tool_masks)} masks for {len(parsed.frames)} images"
+            report.error(f"{MASKS}/", "", message, "each image needs one, in the order of the sorted names")
         report.raise_first(folder)
-        capture, notes = capture_of(parsed), _absent_images(parsed)
+        capture, notes = capture_of(parsed), list[str]()
+        if count := len(parsed.absent):
+            total, first = count + len(parsed.frames), parsed.absent[0]
+            lacking = f"{count} of {total} frames, which have no image ({first.field}: {first.message})"
+            notes.append(f"Left out: {lacking}.")
         frames = list(capture.frames)
         if tool_masks:
             frames, mask_notes = _with_tool_masks(frames, tool_masks, work / "tool")
@@ -64,14 +71,6 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
     return (*_lacking(parsed, masked=bool(tool_masks)), *warning_texts, *notes)
 
 
-def _absent_images(parsed: Parsed) -> list[str]:
-    """Return notes on frames whose images are missing."""
-    if not (count := len(parsed.absent)):
-        return []
-    total, first = count + len(parsed.frames), parsed.absent[0]
-    return [f"Left out: {count} of {total} frames, which have no image ({first.field}: {first.message})."]
-
-
 def _inverted_masks(capture: Capture) -> list[str]:
     """Return notes on loss masks that may be inverted."""
     masked = [frame for frame in capture.frames if frame.mask_path is not None]
@@ -91,15 +90,6 @@ def _shared_border(frames: Sequence[Frame]) -> Border | None:
         return None
     chosen = evenly_spaced(len(frames), BORDERS.max_frames, floor=True)
     return find_border(frames[index].load_image_bytes().numpy() for index in chosen)
-
-
-def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
-    """Return each frame's tool mask, in the order of the sorted names; [] without any."""
-    paths = folder_images(parsed.root, MASKS, report)
-    if paths and len(paths) != len(parsed.frames):
-        message = f"has {len(paths)} masks for {len(parsed.frames)} images"
-        report.error(f"{MASKS}/", "", message, "each image needs one, in the order of the sorted names")
-    return paths
 
 
 def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path) -> tuple[list[Frame], list[str]]:

@@ -23,7 +23,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.capture.model import BaseUncertainty, Capture, Frame, InstrumentState, State, Uncertainty
+from neeco.capture.model import (
+    BaseUncertainty,
+    Capture,
+    Frame,
+    FromVideo,
+    Instrument,
+    InstrumentState,
+    State,
+    Uncertainty,
+)
 from neeco.capture.writer import write_capture
 from neeco.ingest.cameras.still_scene import RightCamera
 from neeco.ingest.frames.images import DropReason, StageProgress, choose_images
@@ -32,7 +41,7 @@ from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.model import Recording, Splits
 from neeco.ingest.registration.clocks import note_frame_rates
 from neeco.ingest.result import IngestResult
-from neeco.ingest.shaft.from_video import NOT_VISIBLE, instruments_of, uncertainties
+from neeco.ingest.shaft.from_video import NOT_VISIBLE
 from neeco.ingest.staging import staged
 from neeco.ingest.timing.episodes import Episodes, States
 from neeco.ingest.timing.reading import read_episodes
@@ -79,7 +88,12 @@ def ingest(
         dropped = {**world.images.dropped, **_left_out(world, splits)}
         result = _result(world, output, capture, chosen, dropped, rule)
         write_capture(capture, folder / "capture")
-        _measure_roll(world, result, folder / "capture", progress)
+        item = world.data.video_instrument
+        if item is not None and item.roll is None and world.right is None and world.masks is not None:
+            # for `neeco view --annotate`; a second camera's images have no masks
+            progress("measuring roll and joints", 0, 0)
+            masks = world.masks[np.isin(world.views.frames, result.selected)]
+            prepare(folder / "capture", {item.name: lambda frame: masks[frame]})
         complete(result, folder / "capture")
         return result
 
@@ -87,13 +101,11 @@ def ingest(
 def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
     """Return the capture with the `chosen` rows of the views."""
     data, images, views, shaft = world.data, world.images, world.views, world.shaft
-    item = data.video_instrument
-    deviations = uncertainties(item, shaft) if item and shaft else None
     frames = tuple(
         Frame(
             images.rename(int(views.frames[row]), data.frame_name(int(views.frames[row]))),
             views.pinhole.camera(views.world_from_camera[row]),
-            _state(world.states, row, float(views.times[row]), None if deviations is None else deviations[row]),
+            _state(world.states, row, float(views.times[row]), None if shaft is None else shaft.uncertainties[row]),
             splits[row],
             images.mask_of(int(views.frames[row])),
         )
@@ -105,8 +117,17 @@ def _capture(world: World, splits: np.ndarray, chosen: np.ndarray) -> Capture:
     registered = world.registration is not None or set(data.parts[0].poses) <= set(data.world_from_base)
     lens = replace(images.lens, size=images.size, border=images.border)
     instruments = tuple(
-        replace(one, base_uncertainty=_shared_uncertainty(world, one.name, chosen))
-        for one in instruments_of(data.recording, shaft)
+        Instrument(
+            item.name,
+            {name: source.limits for name, source in item.joints.items()},
+            item.kinematics,
+            from_video=None
+            if shaft is None or item.from_video is None
+            else FromVideo(item.from_video.shaft_diameter_mm, shaft.working_length),
+            base_uncertainty=_shared_uncertainty(world, item.name, chosen),
+        )
+        for item in data.recording.instruments
+        if item.placed
     )
     return Capture(
         images.folder, frames, instruments, world.tissue, registered=registered, lens=lens, still=world.still
@@ -209,17 +230,6 @@ def _state(states: States, row: int, time: float, uncertainty: Uncertainty | Non
     return State(instruments, time)
 
 
-def _measure_roll(world: World, result: IngestResult, capture: Path, progress: StageProgress) -> None:
-    """Measure roll and joints of an instrument found in the video in the written capture, for `neeco view --annotate`;
-    not if the roll was logged, nor with a second camera, which has no masks."""
-    item = world.data.video_instrument
-    if item is None or item.roll is not None or world.right is not None or world.masks is None:
-        return
-    progress("measuring roll and joints", 0, 0)
-    masks = world.masks[np.isin(world.views.frames, result.selected)]
-    prepare(capture, {item.name: lambda frame: masks[frame]})
-
-
 def split_frames(data: Episodes, frames: np.ndarray, states: States, usable: np.ndarray) -> tuple[np.ndarray, str]:
     """Split video frames [M] by the first tracked instrument's states where these are `usable` [M]; LEFT_OUT elsewhere.
 
@@ -272,58 +282,48 @@ def assign_splits(
     every = SPLITS.test_every if rule.test_every is None else rule.test_every
     splits = np.full(len(frames), "train", dtype=object)
     if whole or rule.test:
-        splits[_inside(frames, whole, rule.test, episodes)] = "test"
-        words = f"test: {_listed(whole, rule.test)}"
+        inside, words = _spans(frames, whole, rule.test, episodes)
+        splits[inside], words = "test", f"test: {words}"
     elif every:
         splits[frames % every == every // 2] = "test"
         words = f"test: video frames whose number leaves {every // 2} when divided by {every}"
     else:
         words = "test: none"
     if rule.unseen_episodes or rule.unseen:
-        splits[_inside(frames, rule.unseen_episodes, rule.unseen, episodes)] = "unseen"
-        return splits, f"{words}; unseen: {_listed(rule.unseen_episodes, rule.unseen)}"
+        inside, unseen_words = _spans(frames, rule.unseen_episodes, rule.unseen, episodes)
+        splits[inside] = "unseen"
+        return splits, f"{words}; unseen: {unseen_words}"
     if rule.unseen_fraction == 0:
         return splits, f"{words}; unseen: none"
-    unseen, why = _extremes(poses, joints, rule.unseen_fraction, rule.unseen_by)
+    # the extreme of one joint, of the instrument's rotation from its mean direction, or half of each
+    moving = [name for name, values in joints.items() if np.ptp(values) > SPLITS.min_range]
+    joint = rule.unseen_by or (moving[0] if moving else None)
+    share = rule.unseen_fraction if rule.unseen_by or joint is None else rule.unseen_fraction / 2
+    unseen, why = np.zeros(len(poses), dtype=bool), []
+    if joint is not None:
+        limit = float(np.quantile(joints[joint], 1 - share))
+        unseen |= joints[joint] > limit
+        why.append(f"{joint} above {np.degrees(limit):.0f} deg")
+    if rule.unseen_by is None:
+        turn = Rotation.from_matrix(poses[:, :3, :3])
+        away = (turn.mean().inv() * turn).magnitude()
+        limit = float(np.quantile(away, 1 - share))
+        unseen |= away > limit
+        why.append(f"instrument turned more than {np.degrees(limit):.0f} deg from its mean direction")
     if not unseen.any():
         return splits, f"{words}; unseen: none, as nothing moves"
     splits[unseen] = "unseen"
     splits[~unseen & (np.abs(frames[:, None] - frames[unseen]).min(1) <= SPLITS.unseen_margin)] = LEFT_OUT
     left_out = f"frames within {SPLITS.unseen_margin} of an unseen one are left out of the capture"
-    return splits, f"{words}; unseen: {why}; {left_out}"
+    return splits, f"{words}; unseen: {' or '.join(why)}; {left_out}"
 
 
-def _inside(
+def _spans(
     frames: np.ndarray, names: Sequence[str], ranges: Sequence[tuple[int, int]], episodes: Mapping[str, tuple[int, int]]
-) -> np.ndarray:
-    """Return which frames [N] belong to the named episodes or, without any, to the ranges (first, last)."""
-    spans = [episodes[name] for name in names] or ranges
-    return np.any([(frames >= first) & (frames <= last) for first, last in spans], axis=0)
-
-
-def _listed(names: Sequence[str], ranges: Sequence[tuple[int, int]]) -> str:
-    if names:
-        return f"the recording{'s' * (len(names) > 1)} {', '.join(names)}"
-    return "video frames " + ", ".join(f"{first}-{last}" for first, last in ranges)
-
-
-def _extremes(
-    poses: np.ndarray, joints: Mapping[str, np.ndarray], fraction: float, by: str | None
 ) -> tuple[np.ndarray, str]:
-    """Return the frames [N] at the extreme of one joint, of the instrument's rotation from its mean direction, or half
-    of each; and a description of the rule."""
-    moving = [name for name, values in joints.items() if np.ptp(values) > SPLITS.min_range]
-    joint = by or (moving[0] if moving else None)
-    share = fraction if by or joint is None else fraction / 2
-    unseen, words = np.zeros(len(poses), dtype=bool), []
-    if joint is not None:
-        limit = float(np.quantile(joints[joint], 1 - share))
-        unseen |= joints[joint] > limit
-        words.append(f"{joint} above {np.degrees(limit):.0f} deg")
-    if by is None:
-        turn = Rotation.from_matrix(poses[:, :3, :3])
-        away = (turn.mean().inv() * turn).magnitude()
-        limit = float(np.quantile(away, 1 - share))
-        unseen |= away > limit
-        words.append(f"instrument turned more than {np.degrees(limit):.0f} deg from its mean direction")
-    return unseen, " or ".join(words)
+    """Return which frames [N] belong to the named episodes or, without any, to the ranges (first, last); in words."""
+    spans = [episodes[name] for name in names] or ranges
+    inside = np.any([(frames >= first) & (frames <= last) for first, last in spans], axis=0)
+    if names:
+        return inside, f"the recording{'s' * (len(names) > 1)} {', '.join(names)}"
+    return inside, "video frames " + ", ".join(f"{first}-{last}" for first, last in ranges)

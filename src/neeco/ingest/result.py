@@ -216,8 +216,10 @@ class _Evidence:
         return re.sub(r"(\.?)$", lambda end: usual[0] + end[1], self.warning, count=1)
 
     @classmethod
-    def of(cls, sentence: str, *, severe: bool) -> _Evidence:
+    def of(cls, text: str, *, severe: bool) -> _Evidence:
         """Evidence without a measured value."""
+        begun = text if re.match(r"\S+\.\w+:", text) else text[0].upper() + text[1:]  # a file's name stays
+        sentence = begun + ("" if text.endswith((".", "?")) else ".")
         return cls(_lower(sentence).rstrip("."), 2 if severe else 1, sentence)
 
     @classmethod
@@ -235,8 +237,8 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
     """Assess a finished ingest by its own numbers, contradictions in its recording, and problems that `check` detected
     in its capture; no ground truth is used."""
     grave = [problem for problem in problems if problem.severity == "error" or problem.contradicted]
-    evidence = [_Evidence.of(_sentence(item.sentence), severe=item.severe) for item in result.contradictions]
-    evidence += [_Evidence.of(_sentence(str(problem)), severe=True) for problem in grave]
+    evidence = [_Evidence.of(item.sentence, severe=item.severe) for item in result.contradictions]
+    evidence += [_Evidence.of(str(problem), severe=True) for problem in grave]
     evidence += _measured(result, capture)
     unusable = sum(not reason.frame_usable for _, reason in result.dropped)
     if unusable > 0.5 * result.video_frames:
@@ -254,18 +256,13 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
         words = "The instrument's roll is not known: log it, or pose frames by hand, before training."
         evidence.append(_Evidence.of(words, severe=False))
     minor = [problem for problem in problems if problem not in grave]
-    evidence += [_Evidence.of(_sentence(str(problem)), severe=False) for problem in minor]
+    evidence += [_Evidence.of(str(problem), severe=False) for problem in minor]
     if not capture.instruments:
         words = "No instrument was tracked: only methods without states, such as 3dgs, can be trained."
         evidence.append(_Evidence.of(words, severe=False))
     elif not capture.registered:
         words = f"Cameras and instrument do not meet: its poses are in a frame of their own; {HOW_TO_REGISTER}."
         evidence.append(_Evidence.of(words, severe=True))
-    return _judged(evidence, result, capture)
-
-
-def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -> Assessment:
-    """Return the assessment from all evidence, the worst first."""
     ordered = sorted(evidence, key=lambda item: -item.level)
     facts = tuple(item.fact for item in ordered[: LIMITS.facts])
     warnings = tuple(item.reason for item in ordered if item.level)
@@ -278,11 +275,6 @@ def _judged(evidence: list[_Evidence], result: IngestResult, capture: Capture) -
         return Assessment("careful", "Usable, with care: " + _lower(warnings[0]), warnings, facts)
     fit = "no measurement contradicts it" if result.registration is None else "cameras and instrument fit together"
     return Assessment("good", f"Ready to train: {fit}.", (), facts)
-
-
-def _sentence(text: str) -> str:
-    begun = text if re.match(r"\S+\.\w+:", text) else text[0].upper() + text[1:]  # a file's name stays
-    return begun + ("" if text.endswith((".", "?")) else ".")
 
 
 def _lower(sentence: str) -> str:
@@ -387,19 +379,14 @@ def clock_cost_mm(name: str, sd: float, capture: Capture) -> float | None:
 
     None for a joint's clock, and where the deviation is not known.
     """
-    joints = {joint for instrument in capture.instruments for joint in instrument.joints}
-    speeds = [instrument_speed(capture, instrument.name) for instrument in capture.instruments]
-    if name in joints or not speeds or not np.isfinite(sd):
+    if any(name in item.joints for item in capture.instruments) or not capture.instruments or not np.isfinite(sd):
         return None
-    return sd * max(speeds)
-
-
-def instrument_speed(capture: Capture, name: str) -> float:
-    """Return the 90th percentile of an instrument's speed between consecutive frames, mm/s; 0 for fewer than two."""
-    frames = sorted((f for f in capture.frames if name in f.state.instruments), key=lambda frame: frame.state.time)
-    if len(frames) < 2:
-        return 0.0
-    steps = np.diff([frame.state.time for frame in frames])
-    places = np.stack([frame.state.instruments[name].pose.numpy()[:3, 3] for frame in frames])
-    moved, usable = np.linalg.norm(np.diff(places, axis=0), axis=1), steps > 0
-    return float(np.quantile(moved[usable] / steps[usable], 0.9)) if usable.any() else 0.0
+    fastest = 0.0  # mm/s, of the instruments between consecutive frames
+    for item in capture.instruments:
+        frames = sorted((f for f in capture.frames if item.name in f.state.instruments), key=lambda f: f.state.time)
+        places = np.array([frame.state.instruments[item.name].pose.numpy()[:3, 3] for frame in frames]).reshape(-1, 3)
+        steps = np.diff([frame.state.time for frame in frames])
+        moved, usable = np.linalg.norm(np.diff(places, axis=0), axis=1), steps > 0
+        if usable.any():
+            fastest = max(fastest, float(np.quantile(moved[usable] / steps[usable], 0.9)))
+    return sd * fastest

@@ -3,7 +3,7 @@ motion and registered by its tracker; the frame of a still scope is the world.""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -18,15 +18,14 @@ from neeco.ingest.cameras.still_scene import (
     STILL_SCOPE,
     RightCamera,
     look_behind,
+    moving_shares,
     read_right_camera,
     same_place,
     stands_still,
     still_cameras,
 )
-from neeco.ingest.foreground.background import find_background
-from neeco.ingest.foreground.masks import moving_masks, passing_masks
-from neeco.ingest.foreground.residual_flow import ResidualFlow
-from neeco.ingest.foreground.rough_shape import RoughShape, best_lag, carve_shape, observations_on
+from neeco.ingest.foreground.masks import ResidualFlow, find_background, moving_masks, passing_masks
+from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shapes, observations_on
 from neeco.ingest.frames.images import ChosenImages, SfmResult, StageProgress, Views, undistort_images
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.recording.model import MIN_FRAMES, MOVING, STILL
@@ -82,31 +81,45 @@ class World:
     right: RightCamera | None = None
 
 
-def residual_flow(sfm: SfmResult, views: Views) -> ResidualFlow:
-    """Return the residual optical flow between the views, beyond that of a still scene."""
-    return ResidualFlow(views.load, sfm, views.times, views.pinhole, visible=views.visible, episodes=views.episodes)
+def tracked_in(data: Episodes, names: Iterable[str], views: Views, rows: np.ndarray | slice) -> dict[str, PosesAt]:
+    """Return what gives the poses of instruments in the cameras' frames of some rows of the views, by their names."""
+    camera_from_world = np.linalg.inv(views.world_from_camera[rows])
+
+    def poses_at(name: str, lag: float) -> tuple[np.ndarray, np.ndarray]:
+        poses, valid = data.instrument_poses(name, views.times[rows], lag)
+        return camera_from_world @ np.where(valid[:, None, None], poses, np.eye(4)), valid
+
+    return {name: partial(poses_at, name) for name in names}
 
 
-def longest_lag(data: Episodes) -> float:
-    """Return the maximum plausible clock error of a log, s: a longer one leaves half of the frames without poses."""
-    return float(max(np.ptp(part.times) for part in data.parts)) / 2
+def compare_motion(
+    data: Episodes,
+    tracked: Mapping[str, PosesAt],
+    shapes: Mapping[str, RoughShape],
+    evidence: np.ndarray,
+    pinhole: Lens,
+) -> None:
+    """Note instruments whose poses do not match any motion in the images, or match it at another time.
 
-
-def note_motion_contradiction(data: Episodes, name: str, moves: bool, lag: float) -> None:
-    """Note an instrument whose poses do not match any motion in the images, or match it at another time."""
-    logs = data.parts[0].poses
-    clock, sentence = logs[name].clock if name in logs else "", ""
-    if lag and not data.notes.is_contradicted(f"sync {clock}"):
-        after = "later" if lag > 0 else "earlier"
-        sentence = (
-            f"what moves in the images fits the poses of {name} that its log has {abs(lag):.1f} s {after}: if its "
-            f"clock {clock!r} is not that of the other logs, give it one of its own (poses: clock), else correct `sync`"
-        )
-    elif lag or not moves:
-        sentence = (
-            f"nothing in the images moves with the tracked pose of {name}: check its log, its frame and its clock"
-        )
-    data.notes.contradict(f"motion of {name}", sentence, severe=True)
+    evidence: moving pixels [R, h, w] of the rows of `tracked`, through `pinhole`.
+    """
+    longest = max(float(np.ptp(part.times)) for part in data.parts) / 2  # s; beyond, half of the frames have no poses
+    for name, poses_at in tracked.items():
+        lag = best_lag(evidence, poses_at, pinhole, longest)
+        logs = data.parts[0].poses
+        clock, sentence = logs[name].clock if name in logs else "", ""
+        if lag and not data.notes.is_contradicted(f"sync {clock}"):
+            after = "later" if lag > 0 else "earlier"
+            sentence = (
+                f"what moves in the images fits the poses of {name} that its log has {abs(lag):.1f} s {after}: if its "
+                f"clock {clock!r} is not that of the other logs, give it one of its own (poses: clock), else correct "
+                "`sync`"
+            )
+        elif lag or name not in shapes:
+            sentence = (
+                f"nothing in the images moves with the tracked pose of {name}: check its log, its frame and its clock"
+            )
+        data.notes.contradict(f"motion of {name}", sentence, severe=True)
 
 
 def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progress: StageProgress) -> World:
@@ -129,7 +142,14 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         episodes=data.episode_of(images.selected),
     )
     sfm = motion.reconstruct(progress)
-    _check_joined(data, images.selected[sfm.indices])
+    counts = np.bincount(data.episode_of(images.selected[sfm.indices]), minlength=len(data.parts))
+    for part, placed_count in zip(data.parts, counts, strict=True):
+        if placed_count < MIN_FRAMES and not data.single:
+            raise NeecoError(
+                f"{part.recording.path}: {part.name} stands alone: {placed_count} of its frames show enough of what "
+                "the other recordings show to find their cameras together (at least "
+                f"{MIN_FRAMES} are needed); where it shows another tissue, {SEPARATE_TISSUES}, else leave it out"
+            )
     if lens is None:
         assert sfm.lens is not None
         data.notes.add(
@@ -139,7 +159,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         images = undistort_images(images, sfm.lens, data.video, progress)
 
     views = images.views(data, sfm.indices, sfm.world_from_camera)
-    flow = residual_flow(sfm, views)
+    flow = ResidualFlow(sfm, views)
 
     def foreground(rows: np.ndarray) -> np.ndarray:
         return passing_masks(views.load, flow, rows, settings.moving_px, views.visible)
@@ -155,13 +175,13 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     if registration is None:
         require_no_base(data)
     else:
-        before = _registered(views, registration)
+        before, first_points = _in_mm(sfm, views, registration, settings.scene_distance_mm)
         data, bases = find_bases(data, before, foreground, progress, registration)
         data, corrected = correct_placement(data, before, registration, foreground, progress)
         bases |= corrected
         data = data.with_assumed_clocks()
         progress("finding the instrument", 0, 0)
-        on_instruments, shapes, evidence = _carve_instruments(data, sfm, views, flow, registration)
+        on_instruments, shapes, evidence = _carve_instruments(data, sfm, before, first_points, flow)
     if data.video_instrument is not None:
         progress("finding what moves", 0, 0)
         masks = foreground(np.arange(len(sfm.indices)))
@@ -184,7 +204,13 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         placed, points = _in_mm(sfm, views, registration, shaft.axes.scale * distance)
     data = data.with_assumed_clocks()
     if registration is not None and evidence:
-        _compare_motion(data, placed, shapes, evidence, flow.pinhole)
+        rows = np.flatnonzero(np.isin(views.frames, list(evidence)))
+        moved = np.stack([evidence[frame] for frame in views.frames[rows].tolist()])
+        compare_motion(data, tracked_in(data, data.parts[0].poses, placed, rows), shapes, moved, flow.pinhole)
+    reliable = sfm.reliable_points()
+    if not reliable.any():
+        reliable = np.ones(len(points), dtype=bool)
+        data.notes.add("no tissue point is observed by several frames and fits well: all of them are kept")
     states, usable = data.states_at(views.times)
     return World(
         data=data,
@@ -192,7 +218,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         views=placed,
         states=states,
         usable=usable,
-        tissue=_reliable(data, sfm, points),
+        tissue=PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32)),
         shapes=shapes,
         bases=bases,
         shaft=shaft,
@@ -205,28 +231,13 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     )
 
 
-def _check_joined(data: Episodes, placed: np.ndarray) -> None:
-    """Raise NeecoError for an episode that structure from motion did not join. placed [M]: frames with a camera."""
-    counts = np.bincount(data.episode_of(placed), minlength=len(data.parts))
-    for part, count in zip(data.parts, counts, strict=True):
-        if count < MIN_FRAMES and not data.single:
-            raise NeecoError(
-                f"{part.recording.path}: {part.name} stands alone: {count} of its frames show enough of what the other "
-                f"recordings show to find their cameras together (at least {MIN_FRAMES} are needed); where it "
-                f"shows another tissue, {SEPARATE_TISSUES}, else leave it out"
-            )
-
-
-def _registered(views: Views, registration: Registration) -> Views:
-    return replace(views, world_from_camera=registration.cameras(views.world_from_camera))
-
-
 def _in_mm(
     sfm: SfmResult, views: Views, registration: Registration | None, distance_mm: float
 ) -> tuple[Views, np.ndarray]:
     """Return views and points [P, 3] in the tracker's frame, or in SfM's with the tissue `distance_mm` away."""
     if registration is not None:
-        return _registered(views, registration), registration.points(sfm.points)
+        placed = replace(views, world_from_camera=registration.cameras(views.world_from_camera))
+        return placed, registration.points(sfm.points)
     scale = distance_mm / float(np.median(_distances(sfm.points, sfm.world_from_camera)))
     cameras = sfm.world_from_camera.copy()
     cameras[:, :3, 3] *= scale
@@ -238,60 +249,25 @@ def _distances(points: np.ndarray, cameras: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(points[:, None] - cameras[None, ::10, :3, 3], axis=-1))
 
 
-def _reliable(data: Episodes, sfm: SfmResult, points: np.ndarray) -> PointCloud:
-    """Return the tissue: points [P, 3] mm of a reconstruction with several observations and a small residual."""
-    reliable = sfm.reliable_points()
-    if not reliable.any():
-        reliable = np.ones(len(points), dtype=bool)
-        data.notes.add("no tissue point is observed by several frames and fits well: all of them are kept")
-    return PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
-
-
 def _carve_instruments(
-    data: Episodes, sfm: SfmResult, views: Views, flow: ResidualFlow, registration: Registration
+    data: Episodes, sfm: SfmResult, views: Views, points: np.ndarray, flow: ResidualFlow
 ) -> tuple[np.ndarray, dict[str, RoughShape], dict[int, np.ndarray]]:
     """Carve the rough shape of every tracked instrument from pixels that move with its pose.
 
-    Return the observations bool [Q] on instruments, the shapes, and moving pixels [h, w] by video frame.
+    views, points [P, 3]: in mm. Return the observations bool [Q] on instruments, the shapes, and moving pixels [h, w]
+    by video frame.
     """
     settings = data.recording.settings
     rows = np.unique(np.linspace(0, len(sfm.indices) - 1, settings.shape_frames).astype(int))
     evidence = flow.moving_pixels(rows, settings.moving_px)
-    points, views = registration.points(sfm.points), _registered(views, registration)
-    camera_from_world = np.linalg.inv(views.world_from_camera)
-    on_instruments, shapes = np.zeros(len(sfm.observations), dtype=bool), {}
-    for name in data.parts[0].poses:
-        poses, valid = data.instrument_poses(name, views.times)
-        camera_from_instrument = camera_from_world @ np.where(valid[:, None, None], poses, np.eye(4))
-        usable = valid[rows]
-        shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], flow.pinhole)
-        if shape is None:
-            continue
-        shapes[name] = shape
+    on_instruments, names = np.zeros(len(sfm.observations), dtype=bool), data.parts[0].poses
+    shapes = carve_shapes(evidence, tracked_in(data, names, views, rows), flow.pinhole)
+    for name, poses_at in tracked_in(data, shapes, views, slice(None)).items():
+        poses, valid = poses_at(0.0)
         for row in np.flatnonzero(valid):
             camera = flow.pinhole.camera(views.world_from_camera[row])
-            on_instruments |= observations_on(shape, camera_from_instrument[row], sfm, int(row), points, camera)
+            on_instruments |= observations_on(shapes[name], poses[row], sfm, int(row), points, camera)
     return on_instruments, shapes, dict(zip(views.frames[rows].tolist(), evidence, strict=True))
-
-
-def _compare_motion(
-    data: Episodes, views: Views, shapes: Mapping[str, RoughShape], evidence: Mapping[int, np.ndarray], pinhole: Lens
-) -> None:
-    """Note instruments whose motion in the images differs from their poses, given the capture's clocks and cameras.
-
-    evidence: moving pixels [h, w] by video frame.
-    """
-    rows = np.flatnonzero(np.isin(views.frames, list(evidence)))
-    moved = np.stack([evidence[frame] for frame in views.frames[rows].tolist()])
-    camera_from_world = np.linalg.inv(views.world_from_camera[rows])
-    for name in data.parts[0].poses:
-
-        def before_cameras(lag: float, of: str = name) -> tuple[np.ndarray, np.ndarray]:
-            poses, valid = data.instrument_poses(of, views.times[rows], lag)
-            return camera_from_world @ np.where(valid[:, None, None], poses, np.eye(4)), valid
-
-        lag = best_lag(moved, before_cameras, pinhole, longest_lag(data))
-        note_motion_contradiction(data, name, name in shapes, lag)
 
 
 def is_still(data: Episodes, images: ChosenImages, progress: StageProgress) -> bool:
@@ -329,7 +305,7 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     def moving(rows: np.ndarray) -> np.ndarray:
         return moving_masks(views.load, count, rows, views.visible)
 
-    data = find_instrument_clocks(data, residual_flow(cameras, views), views, progress)
+    data = find_instrument_clocks(data, ResidualFlow(cameras, views), views, progress)
     in_camera = [name for name, log in data.parts[0].poses.items() if log.frame == CAMERA]
     data = replace(data, world_from_base={name: np.eye(4) for name in in_camera})
     data, bases = find_bases(data, views, moving, progress)
@@ -346,14 +322,16 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
         data, shaft = find_in_video(data, data.video_instrument, views, masks, None)
     data = data.with_assumed_clocks()
     names = (*data.world_from_base, *data.video_poses)
-    tracked = {name: partial(data.instrument_poses, name, views.times) for name in names}
     progress("finding the tissue behind the instrument", 0, 0)
-    behind = look_behind(views, tracked, longest_lag(data), data.recording.settings, right)
-    for note in behind.notes:
-        data.notes.add(note)
-    data.notes.contradict("stereo", behind.doubt, severe=True)
-    for name, lag in behind.lags.items():
-        note_motion_contradiction(data, name, name in behind.shapes, lag)
+    settings, shapes = data.recording.settings, dict[str, RoughShape]()
+    if names:
+        rows = np.unique(np.linspace(0, count - 1, settings.shape_frames).astype(int))
+        moved, tracked = moving_shares(views, rows), tracked_in(data, names, views, rows)
+        shapes = carve_shapes(moved, tracked, views.reduced_pinhole)
+    poses = {name: poses_at(0.0) for name, poses_at in tracked_in(data, names, views, slice(None)).items()}
+    tissue, how = look_behind(data.notes, views, shapes, poses, settings, right)
+    if names:
+        compare_motion(data, tracked, shapes, moved, views.reduced_pinhole)
     states, usable = data.states_at(views.times)
     return World(
         data=data,
@@ -361,13 +339,13 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
         views=views,
         states=states,
         usable=usable,
-        tissue=PointCloud(behind.points.astype(np.float32), (behind.colors / 255).astype(np.float32)),
-        shapes=behind.shapes,
+        tissue=tissue,
+        shapes=shapes,
         bases=bases,
         shaft=shaft,
         masks=masks,
         still=True,
-        depth_source=behind.how,
+        depth_source=how,
         right=right,
     )
 

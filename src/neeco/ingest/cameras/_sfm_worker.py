@@ -102,21 +102,16 @@ def pipeline_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions
     return options
 
 
-def set_focal_length(database: Path, focal: float) -> None:
-    """Set the initial focal length, px, of every estimate, without distortion."""
-    with pycolmap.Database.open(str(database)) as opened:
-        (camera,) = opened.read_all_cameras()
-        camera.params = [focal, camera.width / 2, camera.height / 2, 0.0]
-        camera.has_prior_focal_length = True
-        opened.update_camera(camera)
-
-
 def map_keyframes(job: dict[str, Any], database: Path) -> None:
     """Map the keyframes once: writes the largest model to the folder `model`, its description to `attempt.json`."""
     folder = Path(job["model"])
     folder.mkdir()
-    if job["focal"]:
-        set_focal_length(database, job["focal"])
+    if job["focal"]:  # px, from which every estimate begins, without distortion
+        with pycolmap.Database.open(str(database)) as opened:
+            (camera,) = opened.read_all_cameras()
+            camera.params = [job["focal"], camera.width / 2, camera.height / 2, 0.0]
+            camera.has_prior_focal_length = True
+            opened.update_camera(camera)
     say("mapping", done=0, total=len(job["names"]))
     models = global_mapping(job, database, folder) if job["global"] else incremental_mapping(job, database, folder)
     stats: dict[str, Any] = {"models": [], "focal": 0.0, "distortion": 0.0, "points": 0, "error": 0.0, "parallax": 0.0}

@@ -148,23 +148,18 @@ def judge(attempt: Attempt, size: tuple[int, int], least: int) -> Attempt:
     elif attempt.error > SETTINGS.max_error_px:
         fault = f"points are off by {attempt.error:.1f} px on average"
     elif attempt.strategy.focal:
-        fault = _lens_fault(attempt, size)
+        half, focal = math.hypot(*size) / 2, max(attempt.focal, 1e-9)
+        sees = 2 * math.degrees(math.atan(half / focal))
+        if not SETTINGS.min_field_of_view <= sees <= SETTINGS.max_field_of_view:
+            fault = f"ends at a focal length of {attempt.focal:.0f} px, which no endoscope has"
+        elif abs(attempt.distortion) * (half / focal) ** 2 > SETTINGS.max_distortion:
+            fault = f"ends at a radial distortion of {attempt.distortion:.2f}, which no endoscope has"
+        else:
+            try:
+                estimated_lens(attempt.focal, attempt.distortion, size).pinhole(size)
+            except NeecoError:
+                fault = f"ends at a radial distortion of {attempt.distortion:.2f}, which folds the image over"
     return replace(attempt, fault=fault)
-
-
-def _lens_fault(attempt: Attempt, size: tuple[int, int]) -> str:
-    half = math.hypot(*size) / 2
-    sees = 2 * math.degrees(math.atan(half / attempt.focal)) if attempt.focal > 0 else 180.0
-    bends = abs(attempt.distortion) * (half / max(attempt.focal, 1e-9)) ** 2
-    if not SETTINGS.min_field_of_view <= sees <= SETTINGS.max_field_of_view:
-        return f"ends at a focal length of {attempt.focal:.0f} px, which no endoscope has"
-    if bends > SETTINGS.max_distortion:
-        return f"ends at a radial distortion of {attempt.distortion:.2f}, which no endoscope has"
-    try:
-        estimated_lens(attempt.focal, attempt.distortion, size).pinhole(size)
-    except NeecoError:
-        return f"ends at a radial distortion of {attempt.distortion:.2f}, which folds the image over"
-    return ""
 
 
 def estimated_lens(focal: float, distortion: float, size: tuple[int, int]) -> Lens:
@@ -283,16 +278,14 @@ class StructureFromMotion:
     def reconstruct(self, progress: StageProgress) -> SfmResult:
         """Return cameras and points before joint adjustment. Raises NeecoError if too few images get a camera."""
         best = self._search(progress)
-        return self._run(self.job | self._parameters(best.strategy) | {"task": "register"}, progress, best)
+        return self._run(self._job_of(best.strategy) | {"task": "register"}, progress)
 
     def adjust(self, result: SfmResult, outliers: np.ndarray, progress: StageProgress) -> SfmResult:
         """Return the reconstruction after bundle adjustment without the observations marked in `outliers` [Q]."""
         rows = result.observations[outliers]
         names = [self.names[index] for index in result.indices]
         drop = [(names[int(row)], int(number)) for row, number in zip(rows[:, 0], rows[:, 4], strict=True)]
-        best = best_attempt(self.attempts)
-        job = self.job | {"task": "adjust", "drop": drop, "database": ""}
-        return self._run(job, progress, best)
+        return self._run(self.job | {"task": "adjust", "drop": drop, "database": ""}, progress)
 
     @property
     def search(self) -> tuple[str, ...]:
@@ -309,16 +302,26 @@ class StructureFromMotion:
     def _search(self, progress: StageProgress) -> Attempt:
         """Try strategies until one places nearly all keyframes; return the best. Raises NeecoError if none is
         usable."""
-        matched: set[str] = set()
         for strategy in strategies(None if self.pinhole else self._radius()):
             self.stopped = bool(self.attempts) and self.seconds > 60 * self.settings.sfm_minutes
             if self.stopped:
                 break
-            parameters = self._parameters(strategy)
-            if parameters["database"] not in matched:
-                self._match(strategy, progress)
-                matched.add(parameters["database"])
-            self.attempts.append(self._try(strategy, parameters, progress))
+            job = self._job_of(strategy)
+            if all(attempt.strategy.dense != strategy.dense for attempt in self.attempts):  # others share the features
+                pairs = [(self.names[a], self.names[b]) for a, b in self.pairs]
+                features = {"features": self.settings.sfm_features, "peak": SETTINGS.peak}
+                if strategy.dense:
+                    features = {"features": SETTINGS.dense_factor * self.settings.sfm_features, "first_octave": -1}
+                    features["peak"] = SETTINGS.dense_peak
+                self._work(job | {"task": "match", "pairs": pairs, **features}, progress)
+            try:
+                self._work(job | {"task": "map"}, progress)
+                facts = read_json(Path(job["model"]) / "attempt.json")
+                attempt = Attempt(strategy, len(self.keys), **facts | {"models": tuple(facts["models"])})
+                self.attempts.append(judge(attempt, self.size, self._least))
+            except NeecoError as error:  # others may need less memory
+                fault = str(error).removeprefix(f"{self.source}: ")
+                self.attempts.append(Attempt(strategy, len(self.keys), fault=fault))
             if self.attempts[-1].complete:
                 break
         best = best_attempt(self.attempts)
@@ -326,19 +329,17 @@ class StructureFromMotion:
             raise NeecoError(self._failure(progress))
         return best
 
-    def _parameters(self, strategy: Strategy) -> dict[str, Any]:
-        """Parameters of a strategy for the worker."""
-        number = next(
-            (i for i, attempt in enumerate(self.attempts) if attempt.strategy == strategy), len(self.attempts)
-        )
-        return {
+    def _job_of(self, strategy: Strategy) -> dict[str, Any]:
+        """The worker's job for a strategy, without its task."""
+        tried = [attempt.strategy for attempt in self.attempts]
+        return self.job | {
             "focal": strategy.focal,
             "free_lens": strategy.free_lens,
             "first_angle": strategy.first_angle,
             "several_models": strategy.several_models,
             "global": strategy.global_mapping,
             "database": str(self.work / ("dense.db" if strategy.dense else "database.db")),
-            "model": str(self.work / f"attempt{number}"),
+            "model": str(self.work / f"attempt{[*tried, strategy].index(strategy)}"),
             "keyframes": [self.names[index] for index in self.keys],
             "least": self._least,
         }
@@ -355,25 +356,6 @@ class StructureFromMotion:
             return float(np.hypot(width, height) / 2)
         rows, columns = np.nonzero(np.asarray(open_image(self.masks / f"{self.names[0]}.png")))
         return float(np.hypot(columns + 0.5 - width / 2, rows + 0.5 - height / 2).max())
-
-    def _match(self, strategy: Strategy, progress: StageProgress) -> None:
-        """Extract and match features of all frames, into the database shared by similar strategies."""
-        pairs = [(self.names[a], self.names[b]) for a, b in self.pairs]
-        features = self.settings.sfm_features
-        job = {"task": "match", "pairs": pairs, "features": features, "peak": SETTINGS.peak}
-        job |= self._parameters(strategy)
-        if strategy.dense:
-            job |= {"features": SETTINGS.dense_factor * features, "peak": SETTINGS.dense_peak, "first_octave": -1}
-        self._work(self.job | job, progress)
-
-    def _try(self, strategy: Strategy, parameters: dict[str, Any], progress: StageProgress) -> Attempt:
-        try:
-            self._work(self.job | parameters | {"task": "map"}, progress)
-        except NeecoError as error:  # others may need less memory
-            return Attempt(strategy, len(self.keys), fault=str(error).removeprefix(f"{self.source}: "))
-        facts = read_json(Path(parameters["model"]) / "attempt.json")
-        facts["models"] = tuple(facts["models"])
-        return judge(Attempt(strategy, len(self.keys), **facts), self.size, self._least)
 
     def _failure(self, progress: StageProgress) -> str:
         """Explain why no strategy succeeded, and the remedy."""
@@ -399,8 +381,8 @@ class StructureFromMotion:
         job_file.write_text(json.dumps(job))
         self.seconds += run_worker(job_file, self.source, progress)
 
-    def _run(self, job: dict[str, Any], progress: StageProgress, best: Attempt | None) -> SfmResult:
-        result = self.work / "result.npz"
+    def _run(self, job: dict[str, Any], progress: StageProgress) -> SfmResult:
+        result, best = self.work / "result.npz", best_attempt(self.attempts)
         result.unlink(missing_ok=True)
         self._work(job, progress)
         with np.load(result) as saved:  # plain arrays; object arrays are refused by default

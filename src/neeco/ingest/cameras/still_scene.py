@@ -18,17 +18,16 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_unsynced
 from neeco.capture.images import encoded_rgb, open_image, write_labels
-from neeco.capture.model import evenly_spaced
+from neeco.capture.model import PointCloud, evenly_spaced
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
 from neeco.ingest.cameras.tissue_surface import TissueSurface, epipolar_error, surface_behind, surface_from_stereo
-from neeco.ingest.foreground.background import Background, find_background
-from neeco.ingest.foreground.masks import moving_masks
-from neeco.ingest.foreground.residual_flow import FLOW
-from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shape, project_mask
+from neeco.ingest.foreground.masks import FLOW, Background, find_background, moving_masks
+from neeco.ingest.foreground.rough_shape import RoughShape, project_mask
 from neeco.ingest.frames.images import SfmResult, StageProgress, Views, reduced
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import IngestSettings, Recording, VideoFile
+from neeco.ingest.timing.episodes import Notes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +48,6 @@ class StillScopeSettings:
 STILL_SCOPE = StillScopeSettings()
 
 TRACKING: dict[str, Any] = {"winSize": (15, 15), "maxLevel": 1, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-Tracked = Mapping[str, PosesAt]  # instrument -> camera_from_instrument [K, 4, 4] of the chosen frames
 
 
 def stands_still(load: Callable[[int], np.ndarray], count: int) -> bool:
@@ -108,19 +106,6 @@ def _features(grey: np.ndarray) -> np.ndarray:
                 row, column = np.unravel_index(cell.argmax(), cell.shape)
                 places.append((left + column, top + row))
     return np.array(places, np.float32).reshape(-1, 1, 2)
-
-
-@dataclass(frozen=True, kw_only=True)
-class StillScene:
-    """Tissue, instruments and remarks from a still scope's images."""
-
-    points: np.ndarray  # [P, 3] mm, of the tissue
-    colors: np.ndarray  # uint8 [P, 3]
-    shapes: dict[str, RoughShape]  # by instrument
-    lags: dict[str, float]  # by instrument, s, lag at which its poses fit motion better (0: none)
-    how: str  # source of the tissue's depth, in words
-    notes: tuple[str, ...]  # one sentence each
-    doubt: str  # about the second camera's calibration, in a sentence; "" without
 
 
 @dataclass(frozen=True)
@@ -219,15 +204,18 @@ def still_cameras(count: int) -> SfmResult:
 
 
 def look_behind(
-    views: Views, tracked: Tracked, longest_lag: float, settings: IngestSettings, right: RightCamera | None
-) -> StillScene:
-    """Estimate the instruments' rough shapes in the views of a still scope, and the tissue behind them.
+    notes: Notes,
+    views: Views,
+    shapes: Mapping[str, RoughShape],
+    tracked: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    settings: IngestSettings,
+    right: RightCamera | None,
+) -> tuple[PointCloud, str]:
+    """Estimate the tissue behind the instruments in the views of a still scope, and say where its depth is from.
 
-    tracked: instruments with known poses in its frame; longest_lag: maximum clock error of their logs, s.
+    notes: of the recording; shapes: of instruments; tracked: camera_from_instrument [M, 4, 4] of those with known
+    poses, and where known [M].
     """
-    shapes, lags = _rough_shapes(views, tracked, longest_lag, settings.shape_frames)
-    poses = {name: poses_at(0.0) for name, poses_at in tracked.items()}
-    notes, doubt = [], ""
 
     def hidden_from(lens: Lens, world_from_camera: np.ndarray, rows: list[int]) -> Callable[[int], np.ndarray] | None:
         camera, camera_from_world = lens.camera(np.eye(4)), np.linalg.inv(world_from_camera)
@@ -236,7 +224,7 @@ def look_behind(
         def hidden(place: int) -> np.ndarray:
             row, mask = rows[place], none
             for name, shape in shapes.items():
-                placed, valid = poses[name]
+                placed, valid = tracked[name]
                 if valid[row]:
                     mask = mask | project_mask(shape, camera_from_world @ placed[row], camera)
             return mask
@@ -250,65 +238,46 @@ def look_behind(
         rows = sorted(right.names)
         hidden = hidden_from(right.pinhole, right.world_from_camera, rows)
         other = find_background(lambda place: right.load(rows[place]), len(rows), hidden)
-        surface, doubt = _by_stereo(background, other, views, right)
+        surface = _by_stereo(notes, background, other, views, right)
         if surface is None:
-            notes.append("the stereo partner's images match too little for depth; check its calibration")
+            notes.add("the stereo partner's images match too little for depth; check its calibration")
     if surface is None:
-        deepest = [float(placed[valid, 2, 3].max()) for placed, valid in poses.values() if valid.any()]
-        swept = [(shape, poses[name][0][poses[name][1]]) for name, shape in shapes.items()]
+        deepest = [float(placed[valid, 2, 3].max()) for placed, valid in tracked.values() if valid.any()]
+        swept = [(shape, tracked[name][0][tracked[name][1]]) for name, shape in shapes.items()]
         small = views.reduced_pinhole
         surface = surface_behind(swept, small, max(deepest, default=None), settings.scene_distance_mm)
     points, colors = surface.points(background.colors, pinhole, visible)
-    return StillScene(
-        points=points, colors=colors, shapes=shapes, lags=lags, how=surface.how, notes=tuple(notes), doubt=doubt
-    )
+    return PointCloud(points.astype(np.float32), (colors / 255).astype(np.float32)), surface.how
 
 
 def _by_stereo(
-    left: Background, right: Background, views: Views, other: RightCamera
-) -> tuple[TissueSurface | None, str]:
-    """Return the surface from two backgrounds (None with too few matches), and doubts about the calibration."""
+    notes: Notes, left: Background, right: Background, views: Views, other: RightCamera
+) -> TissueSurface | None:
+    """Return the surface from two backgrounds; None with too few matches. Note doubts about the calibration."""
     visible = left.seen > 0 if views.visible is None else (left.seen > 0) & views.visible
     if right.colors.shape != left.colors.shape:
-        return None, ""
+        return None
     size = views.reduced_pinhole.size
     assert size is not None
-    right_from_left = np.linalg.inv(other.world_from_camera)
-    lenses = (views.pinhole, other.pinhole)
+    right_from_left, lenses = np.linalg.inv(other.world_from_camera), (views.pinhole, other.pinhole)
     error = epipolar_error(left.colors, right.colors, lenses, right_from_left)
-    limit, doubt = STILL_SCOPE.max_epipolar * left.colors.shape[1], ""
+    limit = STILL_SCOPE.max_epipolar * left.colors.shape[1]
     if error is not None and error > limit:
         doubt = (
             f"what the second camera shows lies {error:.1f} px off where its calibration puts it (median; up to "
             f"{limit:.1f} px is usual): check that the calibration is this scope's and of these images"
         )
-    return surface_from_stereo(left.colors, right.colors, lenses, right_from_left, visible, size), doubt
+        notes.contradict("stereo", doubt, severe=True)
+    return surface_from_stereo(left.colors, right.colors, lenses, right_from_left, visible, size)
 
 
-def _rough_shapes(
-    views: Views, tracked: Tracked, longest_lag: float, n_frames: int
-) -> tuple[dict[str, RoughShape], dict[str, float]]:
-    """Carve every tracked instrument that moves in the images; return the shapes and the lags of all poses."""
-    if not tracked:
-        return {}, {}
-    count, small = len(views.times), views.reduced_pinhole
-    rows = np.unique(np.linspace(0, count - 1, n_frames).astype(int))
-    masks = moving_masks(views.load, count, rows, views.visible).astype(np.float32)  # [R, h, w]
+def moving_shares(views: Views, rows: np.ndarray) -> np.ndarray:
+    """Shares [R, h, w] of moving pixels about places `FLOW.step_px` apart in rows [R] of a still scope's views, as from
+    `ResidualFlow.moving_pixels`."""
+    masks = moving_masks(views.load, len(views.times), rows, views.visible).astype(np.float32)
     size = -(-masks.shape[2] // FLOW.step_px), -(-masks.shape[1] // FLOW.step_px)
-    evidence = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in masks])
+    shares = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in masks])
     if views.visible is not None:
         visible = cv2.resize(reduced(views.visible.astype(np.uint8) * 255), size, interpolation=cv2.INTER_AREA) == 255
-        evidence[:, ~visible] = np.nan
-    shapes, lags = {}, {}
-    for name, poses_at in tracked.items():
-        poses, valid = (values[rows] for values in poses_at(0.0))
-        shape = carve_shape(evidence[valid], poses[valid], small)
-        if shape is not None:
-            shapes[name] = shape
-
-        def at_rows(lag: float, of: PosesAt = poses_at) -> tuple[np.ndarray, np.ndarray]:
-            poses, valid = of(lag)
-            return poses[rows], valid[rows]
-
-        lags[name] = best_lag(evidence, at_rows, small, longest_lag)
-    return shapes, lags
+        shares[:, ~visible] = np.nan
+    return shares

@@ -82,7 +82,21 @@ def surface_behind(
     """
     assert pinhole.size is not None
     width, height = pinhole.size
-    bound = _deepest_instrument(shapes, pinhole)
+    columns, rows = -(-width // SETTINGS.cell_px), -(-height // SETTINGS.cell_px)
+    nearest = np.zeros((rows, columns))  # greatest depth mm of the middle of an instrument in each cell; 0: none was
+    for shape, poses in shapes:
+        for pose in poses:
+            points = shape.points @ pose[:3, :3].T + pose[:3, 3]
+            x, y = project(points, *pinhole.intrinsics, nearest=1.0)
+            with np.errstate(invalid="ignore"):
+                column, row = np.floor(x / SETTINGS.cell_px), np.floor(y / SETTINGS.cell_px)
+                inside = (points[:, 2] > 1) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+            cell = row[inside].astype(int) * columns + column[inside].astype(int)
+            count = np.bincount(cell, minlength=nearest.size)
+            total = np.bincount(cell, points[inside, 2], minlength=nearest.size)
+            # the mean: observed from one side only, a rough shape reaches too far to the back and to the front
+            nearest = np.maximum(nearest, (total / np.maximum(count, 1)).reshape(rows, columns))
+    bound = nearest > 0
     if not bound.any():
         deepest = deepest if deepest is not None and deepest > 0 else None
         flat = (otherwise if deepest is None else SETTINGS.behind_ratio * deepest) * np.ones((height, width))
@@ -92,64 +106,36 @@ def surface_behind(
             else f"not known; a plane well behind the deepest recorded pose ({deepest:.0f} mm) stands for it"
         )
         return TissueSurface(flat, source)
-    inverse = _smoothest_behind(1 / (SETTINGS.behind_ratio * np.where(bound > 0, bound, np.inf)))
+    # the inverse depths that bend least, nowhere above `most`, and near it, or near its minimum elsewhere: cells where
+    # the surface would be in front of an instrument are constrained, until none is
+    most = 1 / (SETTINGS.behind_ratio * np.where(bound, nearest, np.inf))
+    least = most[bound].min()
+    weight = np.full(most.shape, SETTINGS.pull_weight)
+    for _ in range(SETTINGS.max_rounds):
+        smooth = _smoothed(np.where(bound, most, least), weight)
+        before = bound & (smooth > most * 1.001) & (weight < 1)
+        if not before.any():
+            break
+        weight[before] = 1.0
+    inverse = np.maximum(smooth, SETTINGS.min_inverse_ratio * least)  # beyond all that is known it may bend to infinity
     depth = 1 / cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
     low, high = np.quantile(depth, (0.05, 0.95))
     source = f"not measured: a smooth surface well behind all places of the instruments ({low:.0f} to {high:.0f} mm)"
     return TissueSurface(depth, source)
 
 
-def _deepest_instrument(shapes: Iterable[tuple[RoughShape, np.ndarray]], pinhole: Lens) -> np.ndarray:
-    """Greatest depth [rows, columns] mm of the middle of an instrument in each cell; 0 where none was."""
-    assert pinhole.size is not None
-    columns, rows = -(-pinhole.size[0] // SETTINGS.cell_px), -(-pinhole.size[1] // SETTINGS.cell_px)
-    bound = np.zeros((rows, columns))
-    for shape, poses in shapes:
-        for pose in poses:
-            points = shape.points @ pose[:3, :3].T + pose[:3, 3]
-            x, y = project(points, *pinhole.intrinsics, nearest=1.0)
-            with np.errstate(invalid="ignore"):
-                column, row = np.floor(x / SETTINGS.cell_px), np.floor(y / SETTINGS.cell_px)
-                inside = (points[:, 2] > 1) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-            cell = row[inside].astype(int) * columns + column[inside].astype(int)
-            count = np.bincount(cell, minlength=rows * columns)
-            total = np.bincount(cell, points[inside, 2], minlength=rows * columns)
-            # the mean: observed from one side only, a rough shape reaches too far to the back and to the front
-            bound = np.maximum(bound, (total / np.maximum(count, 1)).reshape(rows, columns))
-    return bound
-
-
-def _smoothest_behind(most: np.ndarray) -> np.ndarray:
-    """Return the inverse depths [rows, columns] that bend least, nowhere above `most` (0: unknown), and near it, or
-    near the minimum: cells where the surface would be in front of an instrument are constrained, until none is."""
-    bound = most > 0
-    wanted, weight = np.where(bound, most, most[bound].min()), np.full(most.shape, SETTINGS.pull_weight)
-    for _ in range(SETTINGS.max_rounds):
-        smooth = _smoothed(wanted, weight)
-        before = bound & (smooth > most * 1.001) & (weight < 1)
-        if not before.any():
-            break
-        weight[before] = 1.0
-    # beyond all that is known it may bend to infinity
-    return np.maximum(smooth, SETTINGS.min_inverse_ratio * most[bound].min())
-
-
 def _smoothed(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return values [rows, columns] smoothed by their `weight`: a thin plate on springs."""
     rows, columns = values.shape
-    across, down = (sparse.kron(sparse.eye(rows), _bend(columns)), sparse.kron(_bend(rows), sparse.eye(columns)))
-    twist = sparse.kron(_step(rows), _step(columns))
+    step_across, step_down = (sparse.diags([-1.0, 1.0], [0, 1], shape=(side - 1, side)) for side in (columns, rows))
+    bend_across, bend_down = (
+        sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(side - 2, side)) for side in (columns, rows)
+    )
+    across, down = sparse.kron(sparse.eye(rows), bend_across), sparse.kron(bend_down, sparse.eye(columns))
+    twist = sparse.kron(step_down, step_across)
     plate = across.T @ across + down.T @ down + 2 * twist.T @ twist
     system = sparse.diags(weight.ravel()) + SETTINGS.stiffness * weight.mean() * plate
     return np.asarray(spsolve(system.tocsc(), (weight * values).ravel())).reshape(rows, columns)
-
-
-def _step(count: int) -> sparse.spmatrix:
-    return sparse.diags([-1.0, 1.0], [0, 1], shape=(count - 1, count))
-
-
-def _bend(count: int) -> sparse.spmatrix:
-    return sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
 
 
 def surface_from_stereo(
@@ -170,13 +156,19 @@ def surface_from_stereo(
     if np.isfinite(depth).mean() < SETTINGS.min_matched:
         return None
     columns, rows = -(-size[0] // SETTINGS.cell_px), -(-size[1] // SETTINGS.cell_px)
-    inverse = _in_cells(1 / depth, rows, columns)
+    inverse = np.full((rows, columns), np.nan)  # medians in cells of which half is known
+    for row, band in enumerate(np.array_split(1 / depth, rows, axis=0)):
+        for column, cell in enumerate(np.array_split(band, columns, axis=1)):
+            finite = cell[np.isfinite(cell)]
+            if 2 * len(finite) >= cell.size:
+                inverse[row, column] = np.median(finite)
     for _ in range(2):  # what is far from its surroundings was matched wrongly
         weight = np.isfinite(inverse).astype(float)
         smooth = _smoothed(np.where(weight > 0, inverse, 0.0), weight)
         inverse[np.abs(inverse / smooth - 1) > SETTINGS.max_deviation] = np.nan
     filled = cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR)
-    fine = 1 / cv2.resize(_median_filled(depth), size, interpolation=cv2.INTER_NEAREST)
+    filtered = cv2.medianBlur(np.nan_to_num(depth, nan=0.0).astype(np.float32), 5)  # without single outliers
+    fine = 1 / cv2.resize(np.where(filtered > 0, filtered, np.nan), size, interpolation=cv2.INTER_NEAREST)
     fine = np.where(np.abs(fine / filled - 1) < SETTINGS.max_deviation, fine, filled)
     share, far = float(weight.mean()), 1 / np.quantile(fine, (0.95, 0.05))
     return TissueSurface(
@@ -215,24 +207,6 @@ def epipolar_error(
     normals = np.cross(right_from_left[:3, 3], rays[0] @ right_from_left[:3, :3].T)  # of the epipolar planes
     slopes = np.linalg.norm(normals[:, :2] / (pinholes[1].fl_x, pinholes[1].fl_y), axis=1)
     return float(np.median(np.abs((normals * rays[1]).sum(axis=1)) / np.maximum(slopes, 1e-12)))
-
-
-def _median_filled(depth: np.ndarray) -> np.ndarray:
-    """Return depth [H, W] mm without single outliers; NaN stays."""
-    filtered = cv2.medianBlur(np.nan_to_num(depth, nan=0.0).astype(np.float32), 5)
-    return np.where(filtered > 0, filtered, np.nan)
-
-
-def _in_cells(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Medians [rows, columns] of values [H, W] in cells; NaN where fewer than half are known."""
-    tall = np.array_split(values, rows, axis=0)
-    medians = np.full((rows, columns), np.nan)
-    for row, band in enumerate(tall):
-        for column, cell in enumerate(np.array_split(band, columns, axis=1)):
-            finite = cell[np.isfinite(cell)]
-            if 2 * len(finite) >= cell.size:
-                medians[row, column] = np.median(finite)
-    return medians
 
 
 def _matched_depth(

@@ -6,7 +6,7 @@ Unlike `methods/carving`, which needs a scene of the tissue, it serves before th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation
 from neeco.geometry.camera import Camera
 from neeco.geometry.lens import Lens
 from neeco.geometry.projection import project, project_world
-from neeco.ingest.foreground.residual_flow import FLOW
+from neeco.ingest.foreground.masks import FLOW
 from neeco.ingest.frames.images import SfmResult
 
 
@@ -53,6 +53,16 @@ class RoughShape:
     points: np.ndarray
     spacing: float
     agreement: float  # share of frames in which a point of it lies on moving pixels, [0, 1]
+
+
+def carve_shapes(evidence: np.ndarray, tracked: Mapping[str, PosesAt], pinhole: Lens) -> dict[str, RoughShape]:
+    """Carve the shapes of instruments by their poses in the camera's frame; see `carve_shape`."""
+    shapes = {}
+    for name, poses_at in tracked.items():
+        poses, valid = poses_at(0.0)
+        if (shape := carve_shape(evidence[valid], poses[valid], pinhole)) is not None:
+            shapes[name] = shape
+    return shapes
 
 
 def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens) -> RoughShape | None:

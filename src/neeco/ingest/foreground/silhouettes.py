@@ -55,10 +55,6 @@ class Silhouettes:
         size = np.array(self.distances.shape[:0:-1])
         return np.asarray(((pixels > margin) & (pixels < size - margin)).all(-1))
 
-    def overlap(self, filled: np.ndarray) -> float:
-        """Intersection over union of filled silhouettes bool [F, h, w] with the masks, over all frames."""
-        return int((filled & self.masks).sum()) / max(int((filled | self.masks).sum()), 1)
-
     def take(self, rows: np.ndarray) -> Silhouettes:
         """Return those of some of the frames."""
         return Silhouettes(self.masks[rows], self.distances[rows], self.intrinsics, self.shafts.take(rows))
@@ -115,25 +111,45 @@ def border_of(size: tuple[int, ...], hidden: np.ndarray | None) -> np.ndarray:
     return border
 
 
+def largest_piece(mask: np.ndarray) -> np.ndarray:
+    """Return the centres [N, 2] px of the pixels of the largest connected piece of a mask bool [h, w]; none without."""
+    pieces, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])) if pieces > 1 else pieces
+    v, u = np.nonzero(labels == largest)
+    return np.stack([u, v], -1) + 0.5
+
+
+def slices_across(
+    places: np.ndarray, border: np.ndarray, point: np.ndarray, direction: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut a piece's pixels [N, 2] px across a line through `point` along `direction` into slices 1 px long.
+
+    Return numbers [S], middles [S, 2] px and widths [S] px of those that no border, bool [h, w], cuts off.
+    """
+    along = (places - point) @ direction
+    bins = (along - along.min()).astype(int)
+    u, v = places.astype(int).T
+    count = np.bincount(bins)
+    whole = np.flatnonzero((count > 0) & (np.bincount(bins, border[v, u]) == 0))
+    middles = np.stack([np.bincount(bins, places[:, k])[whole] for k in (0, 1)], -1) / count[whole, None]
+    return whole, middles, count[whole]
+
+
 def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLines:
     """Return lines and tips of the largest elongated piece of each mask [F, h, w] that enters at the image's border."""
     count = len(masks)
     points, directions, tips, entries, courses = (np.full((count, 2), np.nan) for _ in range(5))
     border = border_of(masks.shape[1:], hidden)
     for row, mask in enumerate(masks):
-        pieces, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-        if pieces < 2:
+        places = largest_piece(mask)
+        if len(places) < max(SHAFT_LINES.min_area * mask.size, 1):
             continue
-        largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-        if stats[largest, cv2.CC_STAT_AREA] < SHAFT_LINES.min_area * mask.size:
-            continue
-        v, u = np.nonzero(labels == largest)
-        places = np.stack([u, v], -1) + 0.5
         center = places.mean(0)
         values, vectors = np.linalg.eigh(np.cov((places - center).T))
         if values[1] < SHAFT_LINES.min_elongation**2 * max(values[0], 1e-9):
             continue
         along = (places - center) @ vectors[:, 1]
+        u, v = places.astype(int).T
         touching = border[v, u]
         if not touching.any():
             continue
@@ -141,7 +157,7 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
         sign = -1.0 if np.median(along[touching]) > 0 else 1.0
         direction, along = sign * vectors[:, 1], sign * along
         points[row], directions[row] = center, direction
-        entries[row], courses[row] = _entering_line(places, touching, center, direction)
+        entries[row], courses[row] = _entering_line(places, border, center, direction)
         end = along > along.max() - 2.0
         if not touching[end].any():
             tips[row] = places[end].mean(0)
@@ -149,22 +165,17 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
 
 
 def _entering_line(
-    places: np.ndarray, touching: np.ndarray, point: np.ndarray, direction: np.ndarray
+    places: np.ndarray, border: np.ndarray, point: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a point [2] on the middle line of a piece's pixels [N, 2], and its unit direction, by the share of it
-    where it enters: what lies beyond may be a wrist that bends, or jaws. touching: bool [N], at the border; point and
-    direction: of the whole piece, from there."""
+    where it enters: what lies beyond may be a wrist that bends, or jaws. border: bool [h, w]; point and direction: of
+    the whole piece, from there."""
     for _ in range(SHAFT_LINES.line_rounds):
-        along = (places - point) @ direction
-        bins = (along - along.min()).astype(int)
-        count = np.bincount(bins)
-        inside = np.flatnonzero((count > 0) & (np.bincount(bins, touching) == 0))  # the border cuts slices off
-        inside = (
-            inside[inside <= inside[0] + SHAFT_LINES.entering * (inside[-1] - inside[0])] if len(inside) else inside
-        )
-        if len(inside) < SHAFT_LINES.min_slices:
+        slices, middles, _ = slices_across(places, border, point, direction)
+        if len(slices):
+            middles = middles[slices <= slices[0] + SHAFT_LINES.entering * (slices[-1] - slices[0])]
+        if len(middles) < SHAFT_LINES.min_slices:
             break
-        middles = np.stack([np.bincount(bins, places[:, k])[inside] for k in (0, 1)], -1) / count[inside, None]
         weights = np.ones(len(middles))
         for _ in range(SHAFT_LINES.line_rounds):
             point = np.average(middles, 0, weights)

@@ -1,5 +1,6 @@
 """The chosen frames of a recording: sharp ones that differ, spread over states and views; as images, they are written,
-undistorted once the lens is known, and their dark border is masked. Also their cameras, once these are found."""
+undistorted once the lens is known; their dark border and a console's overlay are masked. Also their cameras, once these
+are found."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from scipy import ndimage
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_unsynced
@@ -19,7 +21,6 @@ from neeco.capture.images import PIXELS, encoded_rgb, is_repeated, open_image, w
 from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
 from neeco.geometry.lens import Border, Lens
 from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
-from neeco.ingest.frames.overlay import find_overlay
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import MIN_FRAMES
 from neeco.ingest.timing.episodes import Episodes
@@ -169,46 +170,38 @@ def choose_frames(
     for i in range(len(usable)):
         if i in dropped:
             continue
-        if last is not None and _same(features, states, last, i):
-            dropped[i] = DropReason(f"the same as frame {last}: neither picture nor state changed")
-        else:
-            last = i
+        if last is not None:
+            moved, turned = (
+                np.linalg.norm((states[last] - states[i])[:3]),
+                np.linalg.norm((states[last] - states[i])[3:]),
+            )
+            changes = np.abs(features.thumbnails[last] - features.thumbnails[i])
+            # no state is known yet, and something small moved
+            small = not states.any() and changes.max() > SETTINGS.noise_at_a_place
+            same = changes.mean() < SETTINGS.noise and moved < SETTINGS.noise_mm and turned < SETTINGS.noise_rad
+            if same and not small:
+                dropped[i] = DropReason(f"the same as frame {last}: neither picture nor state changed")
+                continue
+        last = i
     selected = np.array([i for i in range(len(usable)) if i not in dropped], dtype=int)
     if len(selected) > count:
-        chosen = selected[_farthest_points(_embedding(features, states)[selected], count)]
+        # states, main components of the views, and time (SfM needs neighbours), each of unit spread
+        pictures = features.thumbnails.reshape(len(states), -1)
+        pictures = pictures - pictures.mean(0)
+        basis = np.linalg.svd(pictures[:: max(1, len(pictures) // 400)], full_matrices=False)[2][:3]
+        columns = np.concatenate([states, pictures @ basis.T, np.arange(len(states))[:, None]], 1)
+        spread = columns.std(0)
+        rows = (columns[:, spread > 1e-9] / spread[spread > 1e-9])[selected]
+        farthest = [0, len(rows) - 1]  # farthest-point sampling, with the first and last in time
+        distance = np.minimum(*(np.linalg.norm(rows - rows[i], axis=1) for i in farthest))
+        while len(farthest) < count:
+            farthest.append(int(distance.argmax()))
+            distance = np.minimum(distance, np.linalg.norm(rows - rows[farthest[-1]], axis=1))
+        chosen = selected[farthest[:count]]
         reason = DropReason(f"not among the {count} that cover states and views best", frame_usable=True)
         dropped |= dict.fromkeys((int(i) for i in set(selected) - set(chosen)), reason)
         selected = np.sort(chosen)
     return selected, dropped
-
-
-def _same(features: FrameFeatures, states: np.ndarray, a: int, b: int) -> bool:
-    moved, turned = np.linalg.norm(states[a, :3] - states[b, :3]), np.linalg.norm(states[a, 3:] - states[b, 3:])
-    changes = np.abs(features.thumbnails[a] - features.thumbnails[b])
-    # no state is known yet, and something small moved
-    if not states.any() and changes.max() > SETTINGS.noise_at_a_place:
-        return False
-    return bool(changes.mean() < SETTINGS.noise and moved < SETTINGS.noise_mm and turned < SETTINGS.noise_rad)
-
-
-def _embedding(features: FrameFeatures, states: np.ndarray) -> np.ndarray:
-    """Return state, main components of the view, and time (SfM needs neighbours) [N, D], each of unit spread."""
-    pictures = features.thumbnails.reshape(len(states), -1)
-    pictures = pictures - pictures.mean(0)
-    basis = np.linalg.svd(pictures[:: max(1, len(pictures) // 400)], full_matrices=False)[2][:3]
-    columns = np.concatenate([states, pictures @ basis.T, np.arange(len(states))[:, None]], 1)
-    spread = columns.std(0)
-    return columns[:, spread > 1e-9] / spread[spread > 1e-9]
-
-
-def _farthest_points(rows: np.ndarray, count: int) -> np.ndarray:
-    """Return indices of `count` rows [N, D] by farthest-point sampling, with the first and last in time."""
-    chosen = [0, len(rows) - 1]
-    distance = np.minimum(*(np.linalg.norm(rows - rows[i], axis=1) for i in chosen))
-    while len(chosen) < count:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(rows - rows[chosen[-1]], axis=1))
-    return np.array(chosen[:count])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -274,6 +267,53 @@ class ChosenImages:
         return image.rename(image.with_name(f"{name}.png"))
 
 
+@dataclass(frozen=True, kw_only=True)
+class OverlaySettings:
+    """Thresholds for overlays. Brightness is of 255."""
+
+    min_images: int = 8
+    percentiles: tuple[float, float] = (5.0, 95.0)  # percentiles of a pixel's brightness whose difference is its spread
+    min_motion: float = 12.0  # minimum median spread of a moving scene
+    max_spread: float = 8.0  # maximum spread of an overlay, by compression alone
+    min_edge: float = 30.0  # minimum step of the median image; moving content has no sharp edges there
+    reach: int = 4  # px of compression artefacts around such an edge, by which masks are dilated
+    min_sharp: float = 0.6  # minimum share of a region's boundary with a sharp edge; a shaft's is sharp at one end
+    min_region_px: int = 6  # minimum size of a stroke or bar
+    min_share: float = 2e-4  # of the image; smaller ones are coincidences
+    max_share: float = 0.4  # of the image; larger ones are side panels, or a still scene
+
+
+OVERLAY = OverlaySettings()
+
+
+def find_overlay(images: Iterable[np.ndarray], visible: np.ndarray | None) -> np.ndarray | None:
+    """Return the pixels bool [H, W] that are drawn over the scene in all images uint8 [H, W, 3] of a recording; None
+    where there are none, or the scene does not move. visible: bool [H, W], the field of view; None: all of it.
+
+    They keep their brightness, and edges nearly all around them are sharp in the median image.
+    """
+    stack = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images])
+    if len(stack) < OVERLAY.min_images:
+        return None
+    low, median, high = np.percentile(stack, [OVERLAY.percentiles[0], 50, OVERLAY.percentiles[1]], axis=0)
+    field = np.ones(median.shape, bool) if visible is None else visible
+    spread = high - low
+    if not field.any() or np.median(spread[field]) < OVERLAY.min_motion:
+        return None
+    still = field & (spread <= OVERLAY.max_spread)
+    steps = ndimage.morphological_gradient(median, size=3)  # among a pixel and its neighbours
+    sharp = ndimage.maximum_filter(steps, 2 * OVERLAY.reach + 1) > OVERLAY.min_edge
+    regions, count = ndimage.label(still, np.ones((3, 3)))
+    around = ndimage.grey_dilation(regions, size=3) * ~still  # the region beside a pixel
+    pixels = np.bincount(around[field], minlength=count + 1)
+    share = np.bincount(around[field & sharp], minlength=count + 1) / np.maximum(pixels, 1)
+    large = np.bincount(regions.ravel(), minlength=count + 1) >= OVERLAY.min_region_px
+    overlay = still & (large & (share > OVERLAY.min_sharp))[regions]
+    if not OVERLAY.min_share <= overlay.mean() <= OVERLAY.max_share:
+        return None
+    return ndimage.binary_dilation(overlay, iterations=OVERLAY.reach)
+
+
 def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> ChosenImages:
     """Choose the frames to keep and write them into `folder`, undistorted where the lens is given.
 
@@ -282,8 +322,6 @@ def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> Chos
     lens = read_lens(data)
     selected, dropped = _choose(data, progress)
     size = data.video.size
-    images = ChosenImages(folder=folder, size=size, lens=lens, selected=selected, dropped=dropped)
-    _write(images, data.video, progress)
     sample = selected[evenly_spaced(len(selected), BORDERS.max_frames, floor=True)]
     sampled = [image for _, image in data.video.read(sample.tolist())]
     visible = None
@@ -293,8 +331,10 @@ def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> Chos
     if (overlay := find_overlay(sampled[::2], visible)) is not None:
         kinds = "text, icons or bars drawn over the video"
         data.notes.add(f"what never moves while the scene does ({kinds}; {overlay.mean():.1%} of the image) is masked")
-    images = replace(images, border=border, overlay=overlay)
-    _write_masks(images)
+    images = ChosenImages(
+        folder=folder, size=size, lens=lens, selected=selected, dropped=dropped, border=border, overlay=overlay
+    )
+    _write(images, data.video, progress)
     return images
 
 
@@ -302,7 +342,6 @@ def undistort_images(images: ChosenImages, lens: Lens, video: VideoSource, progr
     """Rewrite images and masks, undistorted by an estimated lens."""
     images = replace(images, lens=lens)
     _write(images, video, progress)
-    _write_masks(images)
     return images
 
 
@@ -314,23 +353,30 @@ def _write(images: ChosenImages, video: VideoSource, progress: StageProgress) ->
         straight = images.lens.undistort(image) if images.lens else image
         write_unsynced(folder / name, encoded_rgb(straight))
 
-
-def _write_masks(images: ChosenImages) -> None:
-    visible, folder = images.field_of_view, images.masks
-    if visible is None or folder is None:
-        return
-    folder.mkdir(exist_ok=True)
-    first, *later = (folder / f"{name}.png" for name in images.names)
-    write_labels(first, torch.from_numpy(visible.astype(np.uint8) * 255))
-    for other in later:
-        shutil.copyfile(first, other)
+    if (visible := images.field_of_view) is not None and images.masks is not None:
+        images.masks.mkdir(exist_ok=True)
+        first, *later = (images.masks / f"{name}.png" for name in names)
+        write_labels(first, torch.from_numpy(visible.astype(np.uint8) * 255))
+        for other in later:
+            shutil.copyfile(first, other)
 
 
 def read_lens(data: Episodes) -> Lens | None:
-    """Return the lens given, checked against the video's size. Raises NeecoError naming where it was given."""
+    """Return the lens given, checked against the video's size; note one whose focal lengths contradict the pixels'
+    shape. Raises NeecoError naming where it was given, and for pixels that are not square with an unknown lens:
+    structure from motion estimates one focal length."""
     lens, where = data.recording.read_lens()
-    for part in data.parts:
-        _check_pixels(part.video, lens, where, data)
+    for video in (part.video for part in data.parts if part.video.pixel_aspect != 1):
+        if lens is None:
+            raise NeecoError(
+                f"{video.path}: its pixels are not square ({video.pixel_aspect:.3g} times as wide as high); give the "
+                "intrinsics of the frames as stored, or square pixels: ffmpeg -vf scale=iw*sar:ih,setsar=1"
+            )
+        ratio, expected = lens.fl_x / lens.fl_y, 1 / video.pixel_aspect
+        if abs(ratio / expected - 1) > SETTINGS.aspect_tolerance:
+            data.notes.add(
+                f"{where}: fl_x / fl_y is {ratio:.3g}, the shape of {video.path.name}'s pixels says {expected:.3g}"
+            )
     if lens is not None:
         lens.check_size(data.video.size, where)
         try:
@@ -338,22 +384,6 @@ def read_lens(data: Episodes) -> Lens | None:
         except NeecoError as error:  # it does not know where it came from
             raise NeecoError(f"{where}: {str(error).removeprefix('lens: ')}") from error
     return lens
-
-
-def _check_pixels(video: VideoSource, lens: Lens | None, where: str, data: Episodes) -> None:
-    """Note a lens whose focal lengths contradict the pixels' shape. Raises NeecoError for pixels that are not square
-    with an unknown lens: structure from motion estimates one focal length."""
-    if lens is None and video.pixel_aspect != 1:
-        raise NeecoError(
-            f"{video.path}: its pixels are not square ({video.pixel_aspect:.3g} times as wide as high); give the "
-            "intrinsics of the frames as stored, or square pixels: ffmpeg -vf scale=iw*sar:ih,setsar=1"
-        )
-    if lens is not None and video.pixel_aspect != 1:
-        ratio, expected = lens.fl_x / lens.fl_y, 1 / video.pixel_aspect
-        if abs(ratio / expected - 1) > SETTINGS.aspect_tolerance:
-            data.notes.add(
-                f"{where}: fl_x / fl_y is {ratio:.3g}, the shape of {video.path.name}'s pixels says {expected:.3g}"
-            )
 
 
 def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[int, DropReason]]:

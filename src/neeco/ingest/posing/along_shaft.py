@@ -5,20 +5,27 @@ every frame two unit vectors across the shaft belong to the view: `towards` the 
 is the angle about z from `towards` to the instrument's x axis; at roll 0 that points at the camera.
 
 Textures of the unrolled part, compared between pairs of frames, tell how far the instrument rolled from one to the
-other.
+other; silhouettes beyond the wrist, their widths and which of them are similar, tell of joints. Both are kept in the
+capture: solving again then takes seconds.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
+from safetensors import safe_open
+from safetensors.numpy import save_file
 
 from neeco.base.errors import NeecoError
+from neeco.base.files import require_content, require_like, write_atomically
+from neeco.capture.images import open_image
 from neeco.capture.model import Capture, Instrument
 from neeco.geometry.lines import unit
 from neeco.geometry.projection import project
@@ -53,6 +60,8 @@ class TextureSettings:
 
 SETTINGS = TextureSettings()
 
+FILE, FORMAT = "from_video.safetensors", "neeco-from-video/1"  # what is kept in a capture
+JAWS = "jaw_angle"  # name of a joint that nothing logged
 Load = Callable[[int], np.ndarray]  # frame's index -> image uint8 [H, W, 3]
 
 
@@ -102,16 +111,6 @@ class Shafts:
         across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
         return np.cross(across, self.directions), across
 
-    def rolls(self, x_axes: np.ndarray) -> np.ndarray:
-        """Roll [F] rad of instruments whose x axis is [F, 3] in the camera's axes."""
-        towards, across = self.view_axes
-        return np.arctan2((x_axes * across).sum(-1), (x_axes * towards).sum(-1))
-
-    def x_axes(self, rolls: np.ndarray) -> np.ndarray:
-        """Return the inverse of `rolls`: [F, 3] in the camera's axes."""
-        towards, across = self.view_axes
-        return np.cos(rolls)[:, None] * towards + np.sin(rolls)[:, None] * across
-
     def rotation(self, frame: int, roll: float) -> np.ndarray:
         """world_from_instrument [3, 3] of one frame at a roll, rad."""
         towards, across = (axis[frame] for axis in self.view_axes)
@@ -132,36 +131,22 @@ class Shafts:
         moved = cosine * moved + np.cross(normal, moved) + normal * inner / np.maximum(1 + cosine, 1e-9)
         return np.arctan2((moved * across[1:]).sum(-1), (moved * towards[1:]).sum(-1))
 
-    def project(self, points: np.ndarray, frames: np.ndarray) -> np.ndarray:
-        """Return pixels [N, ..., 2] (centres at +0.5) of points [N, ..., 3] in the camera's axes of `frames` [N]; far
-        outside the image for points behind the camera."""
-        fx, fy, cx, cy = (value.reshape(-1, *[1] * (points.ndim - 2)) for value in self.intrinsics[frames].T)
+    def sample(self, frame: int, image: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Sample an image [H, W(, C)] where points [A, B, 3] mm in the camera's axes of a frame are observed:
+        [A, B(, C)], black outside the image and behind the camera."""
+        fx, fy, cx, cy = self.intrinsics[frame]
         pixels = np.stack(project(points, fx, fy, cx, cy, nearest=SETTINGS.nearest_mm), -1)
-        return np.where(points[..., 2:] < SETTINGS.nearest_mm, -1e4, pixels)
+        places = (np.where(points[..., 2:] < SETTINGS.nearest_mm, -1e4, pixels) - 0.5).astype(np.float32)
+        return np.asarray(
+            cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        )
 
 
 def crop(shafts: Shafts, frame: int, image: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndarray:
     """Sample an image [H, W(, C)] in the plane through the shaft that faces the camera: [A, B(, C)] at `along` [A] mm
-    from the origin towards the tip and `across` [B] mm. Black outside the image."""
-    sideways = shafts.view_axes[1][frame]
-    points = shafts.origins[frame] + along[:, None, None] * shafts.directions[frame] + across[None, :, None] * sideways
-    return _sample(image, shafts.project(points[None], np.array([frame]))[0])
-
-
-def unroll(shafts: Shafts, frame: int, image: np.ndarray, along: np.ndarray, azimuths: np.ndarray) -> np.ndarray:
-    """Sample an image [H, W, C] on the shaft's cylinder: [A, B, C] at `along` [A] mm and `azimuths` [B] rad about the
-    shaft, from the direction `towards` the camera. Black outside the image."""
-    towards, sideways = (axis[frame] for axis in shafts.view_axes)
-    round_ = np.cos(azimuths)[:, None] * towards + np.sin(azimuths)[:, None] * sideways
-    points = shafts.origins[frame] + along[:, None, None] * shafts.directions[frame] + shafts.diameter_mm / 2 * round_
-    return _sample(image, shafts.project(points[None], np.array([frame]))[0])
-
-
-def _sample(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    places = (pixels - 0.5).astype(np.float32)
-    return np.asarray(
-        cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    )
+    from the origin towards the tip and `across` [B] mm."""
+    middle = shafts.origins[frame] + along[:, None, None] * shafts.directions[frame]
+    return shafts.sample(frame, image, middle + across[None, :, None] * shafts.view_axes[1][frame])
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,29 +168,25 @@ def unrolled_textures(shafts: Shafts, load: Load) -> tuple[np.ndarray, np.ndarra
     azimuths = np.arange(-SETTINGS.max_azimuth, SETTINGS.max_azimuth + 0.01, SETTINGS.column_rad)
     visible = np.empty(len(shafts), bool)
     textures = np.empty((len(shafts), len(along), len(azimuths), 3), np.float32)
-    for frame in range(len(shafts)):
-        pixels = unroll(shafts, frame, load(frame), along, azimuths)
+    for frame, (towards, sideways) in enumerate(zip(*shafts.view_axes, strict=True)):
+        radial = np.cos(azimuths)[:, None] * towards + np.sin(azimuths)[:, None] * sideways
+        middle = shafts.origins[frame] + along[:, None, None] * shafts.directions[frame]
+        pixels = shafts.sample(frame, load(frame), middle + shafts.diameter_mm / 2 * radial)
         visible[frame] = (pixels.max(-1) > 0).mean() > SETTINGS.min_visible
         textures[frame] = np.log(pixels.astype(np.float32) + 10)
     textures -= np.median(textures, axis=(1, 2), keepdims=True)
-    if visible.any():
-        _take_out_shading(textures, visible)
+    if visible.any():  # the temporal mean, over which the instrument has rotated, is the view's shading
+        frames = np.arange(len(textures))
+        weights = np.exp(-0.5 * ((frames[:, None] - frames) / SETTINGS.shading_frames) ** 2) * visible
+        weights += 1e-3 * visible  # a frame without neighbours: the mean over the whole video
+        flat = textures.reshape(len(textures), -1)
+        flat -= (weights / weights.sum(1, keepdims=True)).astype(np.float32) @ flat
     np.clip(textures, -SETTINGS.max_contrast, SETTINGS.max_contrast, out=textures)
     for texture in textures:
         cv2.GaussianBlur(texture, (0, 0), 0.8, dst=texture)
         # light from elsewhere varies slowly across the shaft
         texture -= cv2.blur(texture, (15, 1), borderType=cv2.BORDER_REPLICATE)
     return textures, visible
-
-
-def _take_out_shading(textures: np.ndarray, visible: np.ndarray) -> None:
-    """Subtract from each texture the temporal mean, over which the instrument has rotated."""
-    frames = np.arange(len(textures))
-    weights = np.exp(-0.5 * ((frames[:, None] - frames) / SETTINGS.shading_frames) ** 2) * visible
-    # a frame without neighbours: the mean over the whole video
-    weights = weights + 1e-3 * visible
-    flat = textures.reshape(len(textures), -1)
-    flat -= (weights / weights.sum(1, keepdims=True)).astype(np.float32) @ flat
 
 
 def _correlations(textures: np.ndarray, rows: slice) -> np.ndarray:
@@ -232,47 +213,167 @@ def _normalised(textures: np.ndarray) -> np.ndarray:
 
 def roll_pairs(textures: np.ndarray, visible: np.ndarray) -> RollPairs:
     """Compare frames close in time, and every frame with the most similar distant ones; only `visible` ones."""
-    blocks = [
-        RollPairs(
-            *(
-                np.zeros((0, *shape), kind)
-                for shape, kind in ((((), int),) * 2 + (((SETTINGS.max_hypotheses,), float),) * 2)
-            )
-        )
-    ]
+    blocks = []
     for start in range(0, len(textures), SETTINGS.block):
         # pairs are counted once: the second comes later
         scores = _correlations(textures[start:], slice(0, SETTINGS.block))
-        first, second = _chosen(scores.max(-1), visible[start:])
-        turns, peaks = _peaks(scores[first, second])
+        best, later = scores.max(-1), visible[start:]
+        apart = np.arange(best.shape[1]) - np.arange(best.shape[0])[:, None]
+        both = later & later[: len(best), None]
+        far = np.where((apart > SETTINGS.far_frames) & both, best, -1.0)
+        similar = np.argsort(-far, axis=1, kind="stable")[:, : SETTINGS.far_pairs]
+        chosen = np.isin(apart, SETTINGS.near_frames)
+        np.put_along_axis(chosen, similar, True, axis=1)
+        first, second = np.nonzero(chosen & both & (apart > 0))
+        # the highest local maxima of correlations over the shift, at subcolumn precision
+        before, middle, after = (scores[first, second, low : low - 2 or None] for low in (0, 1, 2))
+        ranked = np.where((middle >= before) & (middle > after), middle, 0.0)
+        order = np.argsort(-ranked, axis=1, kind="stable")[:, : SETTINGS.max_hypotheses]
+        a, b, c = (np.take_along_axis(values, order, 1) for values in (before, middle, after))
+        fraction = 0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-6)
+        turns = (order + 1 - SETTINGS.max_columns + np.clip(fraction, -0.5, 0.5)) * SETTINGS.column_rad
+        peaks = np.maximum(np.take_along_axis(ranked, order, 1), 0.0)
         good = peaks[:, 0] >= SETTINGS.min_score
-        blocks.append(RollPairs(first[good] + start, second[good] + start, turns[good], peaks[good]))
-    return RollPairs(
-        *(np.concatenate([getattr(block, name) for block in blocks]) for name in ("first", "second", "turns", "scores"))
+        blocks.append((first[good] + start, second[good] + start, turns[good], peaks[good]))
+    return RollPairs(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasurementSettings:
+    """Measures of silhouettes beyond the wrist."""
+
+    min_opening: float = 0.5  # minimum change of the silhouettes' width of jaws, share of the shaft's diameter
+    step_mm: float = 0.5  # size of a pixel of stabilised silhouettes
+    along: tuple[float, float] = (0.3, 1.2)  # range of the working length, from the origin: beyond the wrist
+    across: float = 0.8  # range to either side, share of the working length
+    max_distance_mm: float = 1.5  # maximum distance from an outline, at which distances saturate
+    width_rank: int = 3  # rank of the cross section by width that counts: the first may be a glint on the tissue
+    blur_mm: float = 1.0  # standard deviation of the silhouettes' blur
+    median_frames: int = 5  # frames of a median outline: glints on the tissue stay behind when the instrument moves on
+    n_components: int = 24  # number of principal components
+
+
+SILHOUETTE = MeasurementSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Measurements of one instrument: pairs of frames with turns between them; widths [F] mm of the silhouettes beyond
+    the wrist, across the shaft; shapes [F, C]: principal components of the stabilised outlines, mm; frames [F] that
+    show its wrist; and the joints that nothing logged."""
+
+    pairs: RollPairs
+    widths: np.ndarray
+    shapes: np.ndarray
+    seen: np.ndarray
+    joints: tuple[str, ...] = ()
+
+
+def silhouette_shapes(shafts: Shafts, load_mask: Load) -> tuple[np.ndarray, np.ndarray]:
+    """Return widths [F] mm and shapes [F, C] of silhouettes.
+
+    load_mask: frame's index -> bool [H, W], where the instrument is, of any size in the image's proportions.
+    """
+    length = shafts.working_length_mm
+    along = np.arange(SILHOUETTE.along[0] * length, SILHOUETTE.along[1] * length, SILHOUETTE.step_mm)
+    across = np.arange(
+        -SILHOUETTE.across * length, SILHOUETTE.across * length + SILHOUETTE.step_mm / 2, SILHOUETTE.step_mm
     )
+    signed = np.empty((len(shafts), len(along), len(across)), np.float32)
+    for frame in range(len(shafts)):
+        inside = crop(shafts, frame, load_mask(frame).astype(np.uint8) * 255, along, across) > 127
+        within, beyond = (
+            cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 3) * SILHOUETTE.step_mm
+            for part in (inside, ~inside)
+        )
+        signed[frame] = np.clip(within - beyond, -SILHOUETTE.max_distance_mm, SILHOUETTE.max_distance_mm)
+    half = SILHOUETTE.median_frames // 2
+    padded = np.concatenate([signed[:1]] * half + [signed] + [signed[-1:]] * half)
+    widths = np.empty(len(shafts))
+    outlines = np.empty((len(shafts), signed[0].size), np.float32)
+    for frame in range(len(shafts)):
+        usual = np.median(padded[frame : frame + SILHOUETTE.median_frames], 0)
+        inside = usual > 0
+        first, last = inside.argmax(1), inside.shape[1] - 1 - inside[:, ::-1].argmax(1)
+        widths[frame] = np.sort(np.where(inside.any(1), (last - first + 1) * SILHOUETTE.step_mm, 0.0))[
+            -SILHOUETTE.width_rank
+        ]
+        outlines[frame] = cv2.GaussianBlur(usual, (0, 0), SILHOUETTE.blur_mm / SILHOUETTE.step_mm).ravel()
+    outlines -= outlines.mean(0)
+    values, vectors = np.linalg.eigh((outlines @ outlines.T).astype(np.float64))
+    order = np.argsort(-values)[: SILHOUETTE.n_components]
+    shapes = vectors[:, order] * np.sqrt(np.maximum(values[order], 0.0))
+    return widths, shapes / np.sqrt(outlines.shape[1])
 
 
-def _chosen(best: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Choose pairs [R, F] from their highest correlations."""
-    apart = np.arange(best.shape[1]) - np.arange(best.shape[0])[:, None]
-    both = visible & visible[: len(best), None]
-    far = np.where((apart > SETTINGS.far_frames) & both, best, -1.0)
-    similar = np.argsort(-far, axis=1, kind="stable")[:, : SETTINGS.far_pairs]
-    chosen = np.isin(apart, SETTINGS.near_frames)
-    np.put_along_axis(chosen, similar, True, axis=1)
-    first, second = np.nonzero(chosen & both & (apart > 0))
-    return first, second
+def measure(capture: Capture, load_mask: Mapping[str, Load]) -> dict[str, Measurements]:
+    """Measure all instruments found in the video. load_mask: by instrument: frame's index -> bool [H, W], where it is.
+    One without a logged joint whose silhouette opens and closes has jaws. Raises NeecoError for an image that cannot be
+    read."""
+
+    def load(frame: int) -> np.ndarray:
+        return np.asarray(open_image(capture.frames[frame].image_path).convert("RGB"))
+
+    measured = {}
+    for instrument in capture.instruments:
+        if instrument.from_video is None:
+            continue
+        shafts = Shafts.of(capture, instrument)
+        textures, seen = unrolled_textures(shafts, load)
+        widths, shapes = silhouette_shapes(shafts, load_mask[instrument.name])
+        opened = np.quantile(widths, 0.95) - np.quantile(widths, 0.05)
+        joints = (JAWS,) if not instrument.joints and opened > SILHOUETTE.min_opening * shafts.diameter_mm else ()
+        measured[instrument.name] = Measurements(roll_pairs(textures, seen), widths, shapes, seen, joints)
+    return measured
 
 
-def _peaks(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the highest local maxima of correlations [P, 2 M + 1] over the shift, at subcolumn precision: rotations
-    rad and scores [P, K] of K hypotheses."""
-    before, middle, after = scores[:, :-2], scores[:, 1:-1], scores[:, 2:]
-    is_peak = (middle >= before) & (middle > after)
-    ranked = np.where(is_peak, middle, 0.0)
-    order = np.argsort(-ranked, axis=1, kind="stable")[:, : SETTINGS.max_hypotheses]
-    rows = np.arange(len(scores))[:, None]
-    a, b, c = before[rows, order], middle[rows, order], after[rows, order]
-    fraction = 0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-6)
-    turns = (order + 1 - SETTINGS.max_columns + np.clip(fraction, -0.5, 0.5)) * SETTINGS.column_rad
-    return turns, np.maximum(ranked[rows, order], 0.0)
+def write_measurements(capture: Capture, measured: Mapping[str, Measurements]) -> None:
+    """Write them into the capture's folder, whole or not at all. Raises NeecoError."""
+    tensors: dict[str, np.ndarray] = {}
+    for number, item in enumerate(measured.values()):
+        arrays = {**vars(item.pairs), "widths": item.widths, "shapes": item.shapes, "seen": item.seen}
+        for name, values in arrays.items():
+            smaller = {"i": np.int32, "f": np.float32}.get(values.dtype.kind, values.dtype)
+            tensors[f"{number}/{name}"] = np.ascontiguousarray(values.astype(smaller))
+    joints = json.dumps({name: item.joints for name, item in measured.items()}, allow_nan=False)
+    notes = {"format": FORMAT, "frames": _frames(capture), "joints": joints}
+    write_atomically(capture.root / FILE, lambda path: save_file(tensors, path, metadata=notes))
+
+
+def read_measurements(capture: Capture) -> dict[str, Measurements]:
+    """Read what `write_measurements` wrote. Raises NeecoError where it is missing, damaged or of other frames."""
+    path = capture.root / FILE
+    again = "make the capture again with `neeco ingest`"
+    if not path.is_file():
+        raise NeecoError(f"{path}: no such file: nothing was measured for posing by hand; {again}")
+    require_content(path)
+    try:
+        with safe_open(path, framework="numpy") as file:
+            notes = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            joints = require_like(json.loads(notes.get("joints", "")), {str: [str]}, str(path), again)
+    except Exception as error:  # safetensors raises its own, undocumented types
+        raise NeecoError(f"{path}: not readable: {' '.join(str(error).split())}; {again}") from error
+    if notes.get("format") != FORMAT or notes.get("frames") != _frames(capture):
+        raise NeecoError(f"{path}: was measured in other frames than transforms.json has; {again}")
+    count = len(capture.frames)
+    measurements = {}
+    for number, (name, by_hand) in enumerate(joints.items()):
+        part = {key.partition("/")[2]: value for key, value in tensors.items() if key.startswith(f"{number}/")}
+        try:
+            pairs = RollPairs(*(part.pop(key) for key in ("first", "second", "turns", "scores")))
+            measurements[name] = Measurements(pairs, part["widths"], part["shapes"], part["seen"], tuple(by_hand))
+            ends = np.concatenate([pairs.first, pairs.second, [0]])
+            whole = pairs.turns.shape == pairs.scores.shape == (len(pairs.first), pairs.turns.shape[1])
+            whole &= len(pairs.first) == len(pairs.second) and bool(0 <= ends.min() <= ends.max() < count)
+            whole &= all(len(value) == count for value in part.values())
+        except (KeyError, IndexError, ValueError):
+            whole = False
+        if not whole:
+            raise NeecoError(f"{path}: {name}: is not in neeco's format; {again}")
+    return measurements
+
+
+def _frames(capture: Capture) -> str:
+    """Hash of the capture's frames."""
+    return hashlib.sha256("\n".join(frame.name for frame in capture.frames).encode()).hexdigest()

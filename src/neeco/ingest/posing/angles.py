@@ -7,14 +7,12 @@ the rolls, by expectation maximisation with deterministic annealing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from neeco.capture.model import UNKNOWN_DEG
-from neeco.ingest.posing.along_shaft import RollPairs
-from neeco.ingest.posing.measurements import Shapes
+from neeco.ingest.posing.along_shaft import Measurements, RollPairs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,14 +74,13 @@ class AnglePosterior:
 
 
 def solve_rolls(
-    pairs: RollPairs, carried: np.ndarray, times: np.ndarray, posed: Mapping[int, Sequence[float]]
+    pairs: RollPairs, carried: np.ndarray, times: np.ndarray, frames: np.ndarray, angles: np.ndarray
 ) -> AnglePosterior:
-    """Solve the rolls of all frames [F] at `times` [F] s, with hand-posed ones (frame -> answers, rad).
+    """Solve the rolls of all frames [F] at `times` [F] s, with hand-posed angles [A] rad of some frames [A].
 
     carried [F - 1]: the view's changes (`Shafts.carried`). Without hand-posed frames the first roll is called 0.
     """
     view = np.concatenate([[0.0], np.cumsum(carried)])
-    frames, angles = _answers(posed)
     alone = _chained(pairs, view, times, np.array([0]), np.array([0.0]))
     if not len(frames):
         return alone
@@ -110,45 +107,59 @@ def _chained(
     for sharpness in np.linspace(0.0, 1.6, SETTINGS.n_rounds).clip(max=1.0):
         widened = SETTINGS.first_widening + (1 - SETTINGS.first_widening) * sharpness
         weights, turns = _likely(pairs, texture_rolls, view, share, widened)
-        between, toward = _differences(pairs, weights, turns, len(times))
+        first, second = pairs.first, pairs.second
+        between, toward = np.zeros((len(times), len(times))), np.zeros(len(times))  # normal equations of the pairs
+        np.add.at(between, (first, first), weights)
+        np.add.at(between, (second, second), weights)
+        np.add.at(between, (first, second), -weights)
+        np.add.at(between, (second, first), -weights)
+        np.add.at(toward, second, weights * turns)
+        np.add.at(toward, first, -weights * turns)
         # textures show the roll and an error of each frame, which is solved for, too
         inner = np.linalg.solve(between + noise_precision, np.column_stack([noise_precision, toward]))
         information = precision + noise_precision - noise_precision @ inner[:, :-1]
         rolls = np.linalg.solve(information, pull + noise_precision @ inner[:, -1])
         texture_rolls = inner[:, :-1] @ rolls + inner[:, -1]
         if len(frames) >= SETTINGS.min_gain_answers:
-            share = _share_shown(pairs, rolls + view, weights, turns, view, share)
+            # the share of a turn that textures show: shading that stays with the view reduces it, in all pairs
+            turned = (rolls + view)[second] - (rolls + view)[first]
+            measured = (turns + view[second] - view[first]) * share
+            together = (weights * turned**2).sum()
+            prior = SETTINGS.gain_prior * together + 1e-12
+            gain = ((weights * measured * turned).sum() + prior) / (together + prior)
+            share = float(np.clip(gain, *SETTINGS.gain_range))
     return AnglePosterior(rolls + center + view, np.linalg.inv(information))
 
 
 def solve_joint(
-    shapes: Shapes,
+    measured: Measurements,
     rolls: AnglePosterior,
     times: np.ndarray,
-    posed: Mapping[int, Sequence[float]],
+    frames: np.ndarray,
+    angles: np.ndarray,
     limits: tuple[float, float] | None,
 ) -> AnglePosterior:
-    """Solve one joint of all frames, with hand-posed values (frame -> answers, rad), within its limits. Without
-    hand-posed frames: by the silhouette's width, over a typical range."""
+    """Solve one joint of all frames, with hand-posed angles [A] rad of some frames [A], within its limits. Without
+    any: by the silhouette's width, over a typical range."""
     foreshortening = np.maximum(np.abs(np.cos(rolls.values)), SETTINGS.min_cosine)
-    opening = np.maximum(shapes.widths - np.quantile(shapes.widths, 0.03), 0.0) / foreshortening
+    opening = np.maximum(measured.widths - np.quantile(measured.widths, 0.03), 0.0) / foreshortening
     opening /= max(np.quantile(opening, 0.95), 1e-6)
-    apart = np.maximum(_squares(shapes.shapes), 0.0)
+    squares = (measured.shapes**2).sum(1)
+    apart = np.maximum(squares[:, None] + squares - 2 * measured.shapes @ measured.shapes.T, 0.0)  # [F, F]
     covariance = (
         SETTINGS.width_sd**2 * np.outer(opening, opening)
         + SETTINGS.shape_sd**2 * np.exp(-0.5 * apart / max(SETTINGS.shape_scale**2 * np.median(apart), 1e-9))
         + SETTINGS.joint_sd**2 * _correlation(times, SETTINGS.correlation_s * 2 / 3)
         + np.diag((np.radians(SETTINGS.width_noise_deg) / foreshortening) ** 2)
     )
-    frames, angles = _answers(posed)
-    if not len(frames):
-        return AnglePosterior(_within(opening * SETTINGS.width_sd, limits), SETTINGS.joint_sd_scale**2 * covariance)
-    center = angles.mean()
-    covariance += 0.5
-    answered = covariance[np.ix_(frames, frames)] + np.eye(len(frames)) * np.radians(SETTINGS.hand_sd_deg) ** 2
-    gain = np.linalg.solve(answered, covariance[frames]).T
-    posterior = covariance - gain @ covariance[frames]
-    return AnglePosterior(_within(center + gain @ (angles - center), limits), SETTINGS.joint_sd_scale**2 * posterior)
+    values = opening * SETTINGS.width_sd
+    if len(frames):
+        covariance += 0.5
+        answered = covariance[np.ix_(frames, frames)] + np.eye(len(frames)) * np.radians(SETTINGS.hand_sd_deg) ** 2
+        gain = np.linalg.solve(answered, covariance[frames]).T
+        values = angles.mean() + gain @ (angles - angles.mean())
+        covariance = covariance - gain @ covariance[frames]
+    return AnglePosterior(values if limits is None else values.clip(*limits), SETTINGS.joint_sd_scale**2 * covariance)
 
 
 def chain_breaks(pairs: RollPairs, rolls: AnglePosterior) -> list[int]:
@@ -165,40 +176,12 @@ def chain_breaks(pairs: RollPairs, rolls: AnglePosterior) -> list[int]:
     return [int(first + last + 1) // 2 for first, last in edges.reshape(-1, 2)]
 
 
-def _answers(posed: Mapping[int, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Frames [A] and angles [A] in the order of time."""
-    flat = [(frame, angle) for frame in sorted(posed) for angle in posed[frame]]
-    return np.array([frame for frame, _ in flat], int), np.array([angle for _, angle in flat], float)
-
-
 def _correlation(times: np.ndarray, scale: float) -> np.ndarray:
     return np.asarray(np.exp(-0.5 * ((times[:, None] - times) / scale) ** 2))
 
 
-def _squares(points: np.ndarray) -> np.ndarray:
-    """[F, F] squared distances between rows."""
-    norms = (points**2).sum(1)
-    return np.asarray(norms[:, None] + norms - 2 * points @ points.T)
-
-
 def _wrapped(angles: np.ndarray) -> np.ndarray:
     return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi)
-
-
-def _within(values: np.ndarray, limits: tuple[float, float] | None) -> np.ndarray:
-    return values if limits is None else values.clip(*limits)
-
-
-def _share_shown(
-    pairs: RollPairs, rolls: np.ndarray, weights: np.ndarray, turns: np.ndarray, view: np.ndarray, share: float
-) -> float:
-    """Share of a turn that textures show: shading that stays with the view reduces it, in all pairs. weights and turns
-    [P] of the pairs by the `share` so far."""
-    turned = rolls[pairs.second] - rolls[pairs.first]
-    measured = (turns + view[pairs.second] - view[pairs.first]) * share
-    together = (weights * turned**2).sum()
-    prior = SETTINGS.gain_prior * together + 1e-12
-    return float(np.clip(((weights * measured * turned).sum() + prior) / (together + prior), *SETTINGS.gain_range))
 
 
 def _likely(
@@ -218,16 +201,3 @@ def _likely(
     weights = SETTINGS.pair_weight * fits / (fits.sum(1, keepdims=True) + wrong) / deviation**2
     total = weights.sum(1)
     return total, (weights * turns).sum(1) / np.maximum(total, 1e-12)
-
-
-def _differences(pairs: RollPairs, weights: np.ndarray, turns: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations [F, F], [F] of the pairs."""
-    first, second = pairs.first, pairs.second
-    between, toward = np.zeros((count, count)), np.zeros(count)
-    np.add.at(between, (first, first), weights)
-    np.add.at(between, (second, second), weights)
-    np.add.at(between, (first, second), -weights)
-    np.add.at(between, (second, first), -weights)
-    np.add.at(toward, second, weights * turns)
-    np.add.at(toward, first, -weights * turns)
-    return between, toward

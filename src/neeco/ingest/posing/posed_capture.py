@@ -26,9 +26,8 @@ from neeco.base.settings import Fault, faults_in, printable, read
 from neeco.capture.documents import Node
 from neeco.capture.model import UNKNOWN_DEG, Capture, Instrument
 from neeco.capture.readers import read_capture
-from neeco.ingest.posing.along_shaft import Load, Shafts
+from neeco.ingest.posing.along_shaft import Load, Measurements, Shafts, measure, read_measurements, write_measurements
 from neeco.ingest.posing.angles import SETTINGS, AnglePosterior, chain_breaks, solve_joint, solve_rolls
-from neeco.ingest.posing.measurements import Measurements, measure, read_measurements, write_measurements
 from neeco.ingest.recording.sections import Name
 
 FILE = "hand_posed.yaml"
@@ -36,7 +35,6 @@ HEADER = """\
 # Frames posed by hand (`neeco view CAPTURE --annotate`), one answer a line; lines may be added, mended and removed.
 # roll_deg: about the shaft, from the direction towards the camera to the hinge's axis. joints_deg: as they stand.
 """
-OPTIONAL = ("when", "who")
 REMEDY = "mend or remove that line"
 
 
@@ -85,6 +83,11 @@ class HandPose:
     when: Annotated[str, _remark] | None = None
     who: Annotated[str, _remark] | None = None
 
+    @property
+    def degrees(self) -> dict[str, float]:
+        """Roll and joints by name."""
+        return {"roll": self.roll_deg, **self.joints_deg}
+
 
 def read_answers(capture: Path) -> list[HandPose]:
     """Read the answers of a capture, in the file's order; none where there is no file. Raises NeecoError."""
@@ -98,39 +101,14 @@ def read_answers(capture: Path) -> list[HandPose]:
 
 def write_answers(capture: Path, answers: Iterable[HandPose]) -> None:
     """Write the file anew, whole or not at all. Raises NeecoError."""
-    write_text(capture / FILE, HEADER + "".join(f"- {_line(answer)}\n" for answer in answers))
-
-
-def answers_for(
-    answers: Sequence[HandPose], instrument: str, frames: Sequence[str], joints: Iterable[str], place: Path
-) -> list[tuple[int, HandPose]]:
-    """Return those of one instrument, each with the index of its frame. Raises NeecoError for a frame that the capture
-    at `place` has not, and for joints other than the instrument's."""
-    index = {name: number for number, name in enumerate(frames)}
-    wanted = set(joints)
-    matching = []
-    for answer in answers:
-        if answer.instrument != instrument:
-            continue
-        if answer.frame not in index:
-            raise NeecoError(f"{place / FILE}: frame {answer.frame}: the capture has no such frame; {REMEDY}")
-        if set(answer.joints_deg) != wanted:
-            expected = ", ".join(sorted(wanted)) or "none"
-            raise NeecoError(f"{place / FILE}: frame {answer.frame}: joints_deg: expected {expected}; {REMEDY}")
-        matching.append((index[answer.frame], answer))
-    return matching
-
-
-def _line(answer: HandPose) -> str:
-    value: dict[str, Any] = {
-        "frame": answer.frame,
-        "instrument": answer.instrument,
-        "roll_deg": round(answer.roll_deg, 1),
-        "joints_deg": {name: round(angle, 1) for name, angle in answer.joints_deg.items()},
-    }
-    value |= {key: getattr(answer, key) for key in OPTIONAL if getattr(answer, key) is not None}
     style: dict[str, Any] = {"default_flow_style": True, "sort_keys": False, "width": math.inf, "allow_unicode": True}
-    return str(yaml.dump(value, Dumper=YamlDumper, **style)).strip()
+    lines = []
+    for answer in answers:
+        value = {key: item for key, item in vars(answer).items() if item is not None}
+        value["roll_deg"] = round(answer.roll_deg, 1)
+        value["joints_deg"] = {name: round(angle, 1) for name, angle in answer.joints_deg.items()}
+        lines.append(f"- {str(yaml.dump(value, Dumper=YamlDumper, **style)).strip()}\n")
+    write_text(capture / FILE, HEADER + "".join(lines))
 
 
 @dataclass(frozen=True)
@@ -170,41 +148,32 @@ class SolvedPosing:
         """Roll and joints by name."""
         return {"roll": self.rolls, **self.joints}
 
-    @property
-    def breaks(self) -> list[int]:
-        """Frames before which texture alone does not determine the roll."""
-        return chain_breaks(self.measured.pairs, self.rolls)
-
     def suggestions(self, count: int = POSING.n_suggested) -> list[Suggestion]:
         """The frames whose answers would help most, each as if those before it were answered already."""
         solved = list(self.angles.values())
         usable = self.measured.seen.copy()
         usable[[frame for frame, _ in self.answers]] = False
         chosen: list[Suggestion] = []
-        breaks = np.array(self.breaks)
+        # frames before which texture alone does not determine the roll
+        breaks = np.array(chain_breaks(self.measured.pairs, self.rolls))
         for _ in range(min(count, int(usable.sum()))):
             variance = np.asarray(sum(np.diag(some.covariance) for some in solved))
             if not self.answers and not chosen:  # all are equal; open jaws show their hinge best
-                variance = self.measured.shapes.widths
+                variance = self.measured.widths
             frame = int(np.argmax(np.where(usable, variance, -np.inf)))
-            chosen.append(
-                Suggestion(frame, self._reason(frame, [some.deviations_deg[frame] for some in solved], breaks))
-            )
+            widths, reason = self.measured.widths, "the chain of rolls breaks here"
+            if self.joints and widths[frame] >= np.quantile(widths, 1 - POSING.extreme):
+                reason = "jaws at their widest"
+            elif not len(breaks) or np.abs(breaks - frame).min() > POSING.near_break:
+                deviations = {name: some.deviations_deg[frame] for name, some in zip(self.angles, solved, strict=True)}
+                least = max(deviations, key=lambda name: deviations[name])
+                reason = f"largest deviation: {least} ± {deviations[least]:.0f}°"
+                if self.joints and widths[frame] <= np.quantile(widths, POSING.extreme):
+                    reason = "jaws at their narrowest"
+            chosen.append(Suggestion(frame, reason))
             usable[frame] = False
             solved = [some.with_answer(frame) for some in solved]
         return chosen
-
-    def _reason(self, frame: int, deviations: Sequence[float], breaks: np.ndarray) -> str:
-        widths = self.measured.shapes.widths
-        if self.joints and widths[frame] >= np.quantile(widths, 1 - POSING.extreme):
-            return "jaws at their widest"
-        if len(breaks) and np.abs(breaks - frame).min() <= POSING.near_break:
-            return "the chain of rolls breaks here"
-        if self.joints and widths[frame] <= np.quantile(widths, POSING.extreme):
-            return "jaws at their narrowest"
-        names = list(self.angles)
-        least = int(np.argmax(deviations))
-        return f"largest deviation: {names[least]} ± {deviations[least]:.0f}°"
 
     def outliers(self) -> list[OutlierAnswer]:
         """Answers that differ from an earlier one of the same frame; and of roll and of each joint the one that differs
@@ -213,9 +182,10 @@ class SolvedPosing:
         for which, solved in self.angles.items():
             worst, least = None, POSING.outlier_sd
             for position, (frame, answer) in enumerate(self.answers):
-                angle = _angle(answer, which)
+                angle = answer.degrees[which]
                 earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
-                if earlier is not None and abs(apart := half_turn(angle - _angle(earlier, which))) > POSING.outlier_deg:
+                apart = 0.0 if earlier is None else half_turn(angle - earlier.degrees[which])
+                if abs(apart) > POSING.outlier_deg:
                     outliers.append(OutlierAnswer(frame, which, apart, "an earlier answer"))
                 # leaving one answer out of a Gaussian posterior
                 share = max(1 - (float(solved.deviations[frame]) / math.radians(SETTINGS.hand_sd_deg)) ** 2, 0.02)
@@ -279,19 +249,33 @@ class PosedCapture:
     def solve(self, answers: Sequence[HandPose] | None = None) -> dict[str, SolvedPosing]:
         """Solve all instruments from the answers; those in the file where none are given. Raises NeecoError."""
         answers = read_answers(self.root) if answers is None else answers
+        joints = {
+            name: [joint for joint in self.measured[name].joints if joint in item.joints]
+            for name, item in self.instruments.items()
+        }
         for answer in answers:
-            if answer.instrument not in self.instruments:
-                names = ", ".join(self.instruments)
-                raise NeecoError(f"{self.root}: hand_posed.yaml: no instrument {answer.instrument!r}; known: {names}")
+            if answer.instrument not in joints:
+                known = ", ".join(joints)
+                raise NeecoError(f"{self.root}: hand_posed.yaml: no instrument {answer.instrument!r}; known: {known}")
+            where = f"{self.root / FILE}: frame {answer.frame}"
+            if answer.frame not in self.frames:
+                raise NeecoError(f"{where}: the capture has no such frame; {REMEDY}")
+            if set(answer.joints_deg) != set(joints[answer.instrument]):
+                expected = ", ".join(sorted(joints[answer.instrument])) or "none"
+                raise NeecoError(f"{where}: joints_deg: expected {expected}; {REMEDY}")
         posings = {}
         for name, instrument in self.instruments.items():
             measured, shafts = self.measured[name], self.shafts[name]
-            joints = [joint for joint in measured.joints if joint in instrument.joints]
-            hand = answers_for(answers, name, self.frames, joints, self.root)
-            rolls = solve_rolls(measured.pairs, shafts.carried(), self.times, _by_frame(hand, "roll"))
+            hand = [(self.frames.index(answer.frame), answer) for answer in answers if answer.instrument == name]
+            in_time = sorted(hand, key=lambda item: item[0])
+            frames = np.array([frame for frame, _ in in_time], int)
+            angles = {
+                angle: np.radians([answer.degrees[angle] for _, answer in in_time]) for angle in ("roll", *joints[name])
+            }
+            rolls = solve_rolls(measured.pairs, shafts.carried(), self.times, frames, angles.pop("roll"))
             solved = {
-                joint: solve_joint(measured.shapes, rolls, self.times, _by_frame(hand, joint), instrument.joints[joint])
-                for joint in joints
+                joint: solve_joint(measured, rolls, self.times, frames, values, instrument.joints[joint])
+                for joint, values in angles.items()
             }
             posings[name] = SolvedPosing(instrument, shafts, measured, hand, rolls, solved)
         return posings
@@ -303,37 +287,23 @@ class PosedCapture:
         document = read_json(path)
         for index, frame in enumerate(document["frames"]):
             for item in frame["instruments"]:
-                if item["name"] in posings:
-                    self._write_state(item, posings[item["name"]], index)
+                if (posing := posings.get(item["name"])) is None:
+                    continue
+                pose = np.array(item["pose"], float)
+                pose[:3, :3] = posing.shafts.rotation(index, float(posing.rolls.values[index]))
+                item["pose"] = pose.tolist()
+                values = {name: float(solved.values[index]) for name, solved in posing.joints.items()}
+                item["joints"] = item.get("joints", {}) | values
+                deviations = {name: float(solved.deviations_deg[index]) for name, solved in posing.angles.items()}
+                roll = deviations.pop("roll")
+                stated = item.get("uncertainty", {})
+                tilts = stated.get("rotation_deg", [0.0, 0.0, 0.0])[:2]
+                item["uncertainty"] = {
+                    "translation_mm": stated.get("translation_mm", [0.0, 0.0, 0.0]),
+                    "rotation_deg": [*tilts, roll if posing.answers else UNKNOWN_DEG],
+                    "joints_deg": stated.get("joints_deg", {}) | deviations,
+                }
         write_json(path, document)
-
-    def _write_state(self, item: dict[str, Any], posing: SolvedPosing, frame: int) -> None:
-        pose = np.array(item["pose"], float)
-        pose[:3, :3] = posing.shafts.rotation(frame, float(posing.rolls.values[frame]))
-        item["pose"] = pose.tolist()
-        item["joints"] = item.get("joints", {}) | {
-            name: float(solved.values[frame]) for name, solved in posing.joints.items()
-        }
-        stated = item.get("uncertainty", {})
-        tilts = stated.get("rotation_deg", [0.0, 0.0, 0.0])[:2]
-        roll = float(posing.rolls.deviations_deg[frame]) if posing.answers else UNKNOWN_DEG
-        item["uncertainty"] = {
-            "translation_mm": stated.get("translation_mm", [0.0, 0.0, 0.0]),
-            "rotation_deg": [*tilts, roll],
-            "joints_deg": stated.get("joints_deg", {})
-            | {name: float(solved.deviations_deg[frame]) for name, solved in posing.joints.items()},
-        }
-
-
-def _by_frame(answers: Sequence[tuple[int, HandPose]], what: str) -> dict[int, list[float]]:
-    angles: dict[int, list[float]] = {}
-    for frame, answer in answers:
-        angles.setdefault(frame, []).append(math.radians(_angle(answer, what)))
-    return angles
-
-
-def _angle(answer: HandPose, what: str) -> float:
-    return answer.roll_deg if what == "roll" else answer.joints_deg[what]
 
 
 def half_turn(degrees: float) -> float:

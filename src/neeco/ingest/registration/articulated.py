@@ -39,24 +39,20 @@ from neeco.ingest.registration.articulated_fit import (
 )
 from neeco.ingest.registration.base import (
     BASES,
-    BaseRegistration,
-    in_camera,
-    moved_from,
-    sd_motion,
-    too_few_shafts,
-    unmoved,
-    with_prior,
-)
-from neeco.ingest.registration.logged import (
     CLOCK_SHIFTS_S,
     MIDDLE,
     BasePrior,
+    BaseRegistration,
     Prior,
+    in_camera,
     moved_base,
+    moved_from,
     poses_at_clock,
+    sd_motion,
     step_between,
+    with_prior,
 )
-from neeco.ingest.registration.silhouette_search import distance_to, search_bases
+from neeco.ingest.registration.silhouette_search import search_bases
 from neeco.states.outline_model import MODEL, ArticulatedModel, bends, joint_values, with_motion
 
 
@@ -161,12 +157,26 @@ def find_base(
     if model is None or prior is None:
         fits = _explaining(problem, searched_starts(problem, model, seed))
     else:
-        fits = _explaining(problem, known_starts(problem, model))
+        base = prior[0]  # as stated, and shifted along the shaft or turned about it: there it is the least certain
+        shaft = unit((base[:3, :3] @ problem.poses[MIDDLE][:, :3, :3] @ model.axis).mean(0))
+        steps = [np.append(np.zeros(3), along * shaft) for along in (0.0, *LINKED.along_mm)]
+        steps += [np.append(roll * shaft, np.zeros(3)) for roll in LINKED.rolls_rad]
+        bases = [moved_base(base, problem.pivot(base), step) for step in steps]
+        fits = _explaining(problem, [ArticulatedFit.start(model, base) for base in bases])
         reached = overlap(problem, fits[0]) if fits else 0.0
         if reached < LINKED.usual_overlap and (words := _elsewhere(problem, model, reached, seed)):
             raise NeecoError(words)
+    if not fits and prior is not None:
+        raise NeecoError(
+            "nothing in the images moves with its poses; check which arm and which clock its log is of, or give the "
+            "exact transform"
+        )
     if not fits:
-        raise NeecoError(unmoved(stated=prior is not None, linked=tree is not None))
+        links = "the links of a wrist that bends (kinematics), or " if tree is None else ""
+        raise NeecoError(
+            f"of all bases none was found from which its poses explain what moves; state {links}the base as far as it "
+            "is known (transform, sd_mm, sd_deg); check which arm and which clock its log is of"
+        )
     return _result(problem, fits, tree)
 
 
@@ -243,7 +253,11 @@ def problem_of(
 def _require_shafts(shafts: ShaftLines) -> ShaftLines:
     """Raise NeecoError where too few masks show a shaft."""
     if shafts.visible.sum() < BASES.min_frames:
-        raise NeecoError(too_few_shafts(shafts))
+        raise NeecoError(
+            f"what moves looks like a shaft in {int(shafts.visible.sum())} of {len(shafts.visible)} frames, at least "
+            f"{BASES.min_frames} are needed; give the transform, exactly or, before a still scope, of an arm with a "
+            "trocar, roughly (sd_mm, sd_deg), or a recording that shows more of it"
+        )
     return shafts
 
 
@@ -316,15 +330,6 @@ def _resized(problem: ArticulatedProblem, factor: float, fit: ArticulatedFit) ->
     return replace(moved, parameters=parameters)
 
 
-def known_starts(problem: ArticulatedProblem, model: ArticulatedModel) -> list[ArticulatedFit]:
-    """The base as stated, and shifted along the shaft or turned about it: there it is the least certain."""
-    base = problem.prior.world_from_base
-    shaft = unit((base[:3, :3] @ problem.poses[MIDDLE][:, :3, :3] @ model.axis).mean(0))
-    steps = [np.append(np.zeros(3), along * shaft) for along in (0.0, *LINKED.along_mm)]
-    steps += [np.append(roll * shaft, np.zeros(3)) for roll in LINKED.rolls_rad]
-    return [ArticulatedFit.start(model, moved_base(base, problem.pivot(base), step)) for step in steps]
-
-
 def searched_starts(problem: ArticulatedProblem, model: ArticulatedModel | None, seed: int) -> list[ArticulatedFit]:
     """The best bases near the stated one, or of all, by lines and tips of the masks' shafts; without a model each with
     the tube that they show. Raises NeecoError where too few show one."""
@@ -335,26 +340,23 @@ def searched_starts(problem: ArticulatedProblem, model: ArticulatedModel | None,
         outermost = [2 + index for index, cone in enumerate(model.cones) if cone.child is None]
         stated = {"axis": model.axis, "end": model.rest[model.first][:3, 3]}
         stated |= {"lines": shafts.entering, "tips": ends[:, outermost or [1], 1].mean(1)}
-    distance, generator = distance_to(problem, problem.prior), np.random.default_rng(seed)
-    found = search_bases(problem, problem.prior, distance, generator, **stated)
+    found = search_bases(problem, np.random.default_rng(seed), **stated)
     return [
         ArticulatedFit.start(model or _tube_model(tip, axis), base)
         for base, tip, axis in zip(found.world_from_base, found.tips, found.axes, strict=True)
     ]
 
 
-def _swinging_links(end: np.ndarray, basis: np.ndarray) -> tuple[Link, ...]:
-    """A tube to `end` [3] mm and a head with the joints of `ArticulatedFit.swings`; basis [3, 3]: columns across and
-    along."""
-    pitch = Link("pitch", "shaft", REVOLUTE, rigid(np.eye(3), end), basis[:, 0], body=False)
-    yaw = Link("yaw", "pitch", REVOLUTE, np.eye(4), basis[:, 1], body=False)
-    return Link("shaft"), pitch, yaw, Link("head", "yaw", PRISMATIC, np.eye(4), basis[:, 2])
-
-
 def _tube_model(tip: np.ndarray, axis: np.ndarray) -> ArticulatedModel:
     """A tube with a head, of roughly a tip [3] mm and a direction [3] in the instrument's frame."""
-    links = _swinging_links(tip - LINKED.head_mm * axis, frame_about(axis))
-    model = ArticulatedModel(KinematicTree(links), np.eye(4)[None])
+    across, aside, along = frame_about(axis).T
+    end = rigid(np.eye(3), tip - LINKED.head_mm * axis)
+    pitch, yaw = (  # the joints of `ArticulatedFit.swings`, as is the head's
+        Link("pitch", "shaft", REVOLUTE, end, across, body=False),
+        Link("yaw", "pitch", REVOLUTE, np.eye(4), aside, body=False),
+    )
+    tree = KinematicTree((Link("shaft"), pitch, yaw, Link("head", "yaw", PRISMATIC, np.eye(4), along)))
+    model = ArticulatedModel(tree, np.eye(4)[None])
     model.axis = axis
     pivot, head = model.first_pivot, model.cones[-1]
     shape = [*range(model.tube, model.tube + 2), *range(head.radii, head.radii + 4)]

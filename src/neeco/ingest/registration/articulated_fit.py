@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.ingest.foreground.silhouettes import SHAFT_LINES, Silhouettes, border_of
-from neeco.ingest.registration.logged import (
+from neeco.ingest.registration.base import (
     BASE,
     CLOCK_SHIFTS_S,
     MIDDLE,
@@ -424,4 +424,5 @@ def overlap(problem: ArticulatedProblem, fit: ArticulatedFit) -> float:
     for row, cone in np.argwhere(projected.valid):
         cv2.fillPoly(filled[row], [corners[row, cone]], 1)
         cv2.circle(filled[row], ends[row, cone].tolist(), int(min(projected.widths[row, cone, 1], 1e3)), 1, -1)
-    return problem.silhouettes.overlap(filled.astype(bool))
+    masks, inside = problem.silhouettes.masks, filled.astype(bool)
+    return int((inside & masks).sum()) / max(int((inside | masks).sum()), 1)

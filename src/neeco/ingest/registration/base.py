@@ -1,15 +1,73 @@
-"""A robot's base as images show it: its uncertainty, in the directions of a camera, and what is said of it."""
+"""A robot's base that is not known: the poses that its arm logs, on a clock that may be off, priors, and the base as
+images show it, with its uncertainty in the directions of a camera."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import BaseUncertainty
-from neeco.ingest.foreground.silhouettes import ShaftLines
-from neeco.ingest.registration.logged import BasePrior, step_between
+
+CLOCK_SHIFTS_S = np.arange(-0.16, 0.161, 0.02)  # about the clock's first guess, at which poses are known
+MIDDLE = len(CLOCK_SHIFTS_S) // 2  # of these, the first guess itself
+BASE = 7  # parameters of the base (turn rad [3], shift mm [3]) and the clock (s)
+
+Prior = tuple[np.ndarray, float, float]  # world_from_base [4, 4], standard deviations mm at the instrument, and degrees
+
+
+@dataclass(frozen=True, eq=False)
+class BasePrior:
+    """Prior on world_from_base [4, 4]: standard deviations rad about it, mm at the instrument (None: nothing is known),
+    and of the clock s (0: it is known)."""
+
+    world_from_base: np.ndarray
+    sd_rad: float | None
+    sd_mm: float | None
+    sd_clock: float
+
+    @classmethod
+    def of(cls, stated: Prior | None, sd_clock: float) -> Self:
+        """Return that of a base [4, 4] with standard deviations mm and degrees; None: nothing is known of it."""
+        if stated is None:
+            return cls(np.eye(4), None, None, sd_clock)
+        return cls(stated[0], np.radians(stated[2]), stated[1], sd_clock)
+
+    def offsets(self, middle: np.ndarray, base: np.ndarray, clock: float) -> tuple[np.ndarray, np.ndarray]:
+        """Turn, shift and clock [BASE] of a base [4, 4] from the prior, at the instrument's mean position [3] mm in it,
+        and the standard deviations [BASE], inf where nothing is known and where the clock is."""
+        off, sds = np.zeros(BASE), np.full(BASE, np.inf)
+        if self.sd_rad is not None and self.sd_mm is not None:
+            off[:6] = step_between(self.world_from_base, base, middle)
+            sds[:3], sds[3:6] = self.sd_rad, self.sd_mm
+        if self.sd_clock > 0:
+            off[6], sds[6] = clock, self.sd_clock
+        return off, sds
+
+
+def poses_at_clock(poses: np.ndarray, clock: float) -> np.ndarray:
+    """Interpolate poses [S, F, 4, 4] at CLOCK_SHIFTS_S linearly to a clock s: [F, 4, 4]."""
+    step = CLOCK_SHIFTS_S[1] - CLOCK_SHIFTS_S[0]
+    place = np.clip((clock - CLOCK_SHIFTS_S[0]) / step, 0, len(CLOCK_SHIFTS_S) - 1.001)
+    low = int(place)
+    return np.asarray(poses[low] + (place - low) * (poses[low + 1] - poses[low]))
+
+
+def moved_base(base: np.ndarray, pivot: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """A base [4, 4] turned about a pivot [3] by a rotation vector and shifted, by step [6] rad and mm."""
+    turn, moved = Rotation.from_rotvec(step[:3]).as_matrix(), base.copy()
+    moved[:3, :3] = turn @ base[:3, :3]
+    moved[:3, 3] = turn @ (base[:3, 3] - pivot) + pivot + step[3:6]
+    return moved
+
+
+def step_between(first: np.ndarray, second: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Rotation vector rad and shift mm [6], world, from one base [4, 4] to another at a point [3] mm in their frames:
+    the step of `moved_base`."""
+    turn = Rotation.from_matrix(second[:3, :3] @ first[:3, :3].T).as_rotvec()
+    return np.append(turn, second[:3, :3] @ middle + second[:3, 3] - (first[:3, :3] @ middle + first[:3, 3]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,30 +158,6 @@ class BaseRegistration:
         }
 
 
-def too_few_shafts(shafts: ShaftLines) -> str:
-    """Error where too few masks show a shaft."""
-    return (
-        f"what moves looks like a shaft in {int(shafts.visible.sum())} of {len(shafts.visible)} frames, at least "
-        f"{BASES.min_frames} are needed; give the transform, exactly or, before a still scope, of an arm with a "
-        "trocar, roughly (sd_mm, sd_deg), or a recording that shows more of it"
-    )
-
-
-def unmoved(*, stated: bool, linked: bool = False) -> str:
-    """Error where nothing in the images moves as an instrument's log says; stated: whether its base was, roughly;
-    linked: whether its links were."""
-    if stated:
-        return (
-            "nothing in the images moves with its poses; check which arm and which clock its log is of, or give the "
-            "exact transform"
-        )
-    links = "" if linked else "the links of a wrist that bends (kinematics), or "
-    return (
-        f"of all bases none was found from which its poses explain what moves; state {links}the base as far as it is "
-        "known (transform, sd_mm, sd_deg); check which arm and which clock its log is of"
-    )
-
-
 def moved_from(reference: np.ndarray, base: np.ndarray, middle: np.ndarray) -> dict[str, Any]:
     """Distance mm and degrees between a base and a given one, at the instrument's mean position [3] mm in its frame."""
     turn, shift = np.linalg.norm(step_between(reference, base, middle).reshape(2, 3), axis=1)
@@ -154,25 +188,20 @@ def with_prior(covariance: np.ndarray, prior: BasePrior, shaft: np.ndarray) -> t
     if prior.sd_rad is not None and prior.sd_mm is not None:
         units, limit = np.repeat([prior.sd_rad, prior.sd_mm], 3), BASES.open_share**2
     values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
-    words = [
-        _direction(shaft, vector) for value, vector in zip(values[::-1], vectors.T[::-1], strict=True) if value > limit
-    ]
+    words = []
+    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        if value <= limit:
+            continue
+        turns = np.square(vector[:3]).sum() > 0.5 * np.square(vector).sum()
+        way = vector[:3] if turns else vector[3:]
+        way = way / np.linalg.norm(way)
+        largest = int(np.argmax(np.abs(way)))
+        to = f"({', '.join(f'{part:+.1f}' for part in way)}) (right, down, forward)"
+        if abs(way @ shaft) > 0.9:
+            to = "the shaft"
+        elif way[largest] ** 2 > 0.75:
+            to = ("the image's width", "the image's height", "the view (depth)")[largest]
+        words.append(f"{'a turn about' if turns else 'a shift along'} {to}")
     if prior.sd_mm is not None:
         covariance = (vectors * np.minimum(values, 1.0)) @ vectors.T * np.outer(units, units)
     return covariance, tuple(dict.fromkeys(words))
-
-
-def _direction(shaft: np.ndarray, vector: np.ndarray) -> str:
-    """Describe a direction in which the base may move: turns and shifts [6], at `lever_mm`, along a camera's axes."""
-    turns = np.square(vector[:3]).sum() > 0.5 * np.square(vector).sum()
-    way = vector[:3] if turns else vector[3:]
-    way = way / np.linalg.norm(way)
-    what, at = ("a turn", "about") if turns else ("a shift", "along")
-    if abs(way @ shaft) > 0.9:
-        return f"{what} {at} the shaft"
-    names = ("the image's width", "the image's height", "the view (depth)")
-    largest = int(np.argmax(np.abs(way)))
-    if way[largest] ** 2 > 0.75:
-        return f"{what} {at} {names[largest]}"
-    parts = ", ".join(f"{value:+.1f}" for value in way)
-    return f"{what} {at} ({parts}) (right, down, forward)"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.foreground.residual_flow import ResidualFlow
+from neeco.ingest.foreground.masks import ResidualFlow
 from neeco.ingest.frames.images import StageProgress, Views
 from neeco.ingest.readers.logs import PoseLog
 from neeco.ingest.registration.hand_eye import Registration, register_with_laparoscope

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import evenly_spaced
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid
@@ -22,9 +20,8 @@ from neeco.ingest.readers.logs import ReadingLog
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
 from neeco.ingest.registration.articulated import LoggedMotion, find_base
-from neeco.ingest.registration.base import BASES, BaseRegistration
+from neeco.ingest.registration.base import BASES, BaseRegistration, Prior
 from neeco.ingest.registration.hand_eye import HAND_EYE, Registration
-from neeco.ingest.registration.logged import Prior
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, VIDEOS_OWN, ClockOffset
 from neeco.ingest.timing.episodes import Episode, Episodes
 
@@ -130,7 +127,7 @@ def find_bases(
                 frames=0,
             )
             continue
-        base = _find(arm, observed, arms)
+        base = _find(data, arm, observed, arms)
         if clock.source not in KNOWN:
             clock = replace(clock.later(base.clock_s), sd=base.clock_sd_s, source=FOUND)
         data = data.with_base(name, base.world_from_base).with_moved_clock(logs[name].clock, clock)
@@ -178,7 +175,7 @@ def correct_placement(
     observed = _Observed(views, moving)
     arm = _among_cameras(_arm(data, replace(items[0], world_from_base=stated), observed), registration)
     try:
-        base = _find(arm, observed, [arm])
+        base = _find(data, arm, observed, [arm])
     except NeecoError:  # the images do not determine it
         return data, {}
     least = max(PLACING.min_overlap, base.overlap_before + PLACING.min_overlap_gain)
@@ -212,40 +209,14 @@ def follow_cameras(
     return data, followed
 
 
-@dataclass(frozen=True, eq=False)
 class _Observed:
-    """`n_frames` rows [F] of the views, or all, and what is derived from them once."""
+    """Evenly spaced rows [F] of the views, at most `n_frames`, with their masks of what moves, bool [F, h, w]."""
 
-    views: Views
-    moving: Callable[[np.ndarray], np.ndarray]
-
-    @cached_property
-    def rows(self) -> np.ndarray:
-        return np.array(evenly_spaced(len(self.views.times), PLACING.n_frames))
-
-    @cached_property
-    def masks(self) -> np.ndarray:
-        """Pixels that move, bool [F, h, w]."""
-        return self.moving(self.rows)
-
-    @cached_property
-    def hidden(self) -> np.ndarray | None:
-        """Pixels beyond a round border, bool [h, w]."""
-        return self.views.reduced_border
-
-    @property
-    def intrinsics(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy px of the reduced images."""
-        return self.views.reduced_pinhole.intrinsics
-
-    @property
-    def times(self) -> np.ndarray:
-        return self.views.times[self.rows]
-
-    @property
-    def cameras(self) -> np.ndarray:
-        """world_from_camera [F, 4, 4]."""
-        return self.views.world_from_camera[self.rows]
+    def __init__(self, views: Views, moving: Callable[[np.ndarray], np.ndarray]) -> None:
+        rows = np.array(evenly_spaced(len(views.times), PLACING.n_frames))
+        self.times, self.cameras, self.masks = views.times[rows], views.world_from_camera[rows], moving(rows)
+        self.hidden = views.reduced_border  # pixels beyond a round border, bool [h, w]
+        self.intrinsics = views.reduced_pinhole.intrinsics  # of the reduced images
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -253,23 +224,17 @@ class _Arm:
     """An instrument whose base is to be found, and its log's poses and readings."""
 
     item: InstrumentLogs
-    where: str
     clock: ClockOffset
     prior: Prior | None
-    readings_at: Callable[[float], dict[str, np.ndarray]]  # [F] by joint, so many s later, NaN where a log has none
-    poses_at: Callable[[float], np.ndarray]  # base_from_instrument [F, 4, 4], so many s later; with links, the root's
+    motion: LoggedMotion
     places: np.ndarray  # [F, 3] mm in the base's frame, where the frame is that is logged
 
     @property
     def travel(self) -> float:
         """Root mean square distance from its mean place, mm."""
-        places = self.poses_at(0.0)[:, :3, 3]
+        places = self.motion.poses_at(0.0)[:, :3, 3]
         places = places[np.isfinite(places[:, 0])]
         return float(np.sqrt(places.var(0).sum())) if len(places) else 0.0
-
-
-def _reading(part: Episode, name: str, joint: str) -> ReadingLog:
-    return part.joints[name][joint]
 
 
 def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
@@ -280,7 +245,11 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
     def readings_later(shift: float) -> dict[str, np.ndarray]:
         later_readings = {}
         for joint in item.joints:
-            reading = data.joint_log(partial(_reading, name=item.name, joint=joint))
+
+            def of_joint(part: Episode, joint: str = joint) -> ReadingLog:
+                return part.joints[item.name][joint]
+
+            reading = data.joint_log(of_joint)
             reading_clock = data.clock(reading.clock) or clock
             # a clock that is known does not move with the pose's
             later = 0.0 if reading_clock.source in KNOWN else shift
@@ -289,25 +258,22 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
 
     tree = None if item.kinematics is None or item.kinematics.pose_of is None else item.kinematics
 
-    def root_from_logged(tree: KinematicTree, shift: float) -> np.ndarray:
-        """[F, 4, 4] of the link whose pose is logged, with readings of the same moments; NaN where one is missing."""
-        values = readings_later(shift)
-        states = ({name: float(read[row]) for name, read in values.items()} for row in range(len(times)))
-        return np.stack([tree.root_from_recorded(state) for state in states])
-
-    def base_from_shaft(shift: float) -> np.ndarray:
+    def base_from_root(shift: float) -> np.ndarray:
         poses, _ = poses_at(log, clock.at(times) + shift)
-        return poses if tree is None else poses @ np.linalg.inv(root_from_logged(tree, shift))
+        if tree is None:
+            return poses
+        values = readings_later(shift)  # NaN where one is missing
+        states = ({name: float(read[row]) for name, read in values.items()} for row in range(len(times)))
+        return poses @ np.linalg.inv([tree.root_from_recorded(state) for state in states])
 
     prior = None
     if stated.matrix is not None:
         assert stated.sd_mm is not None
         assert stated.sd_deg is not None
         prior = (_in_world(stated, observed.cameras), stated.sd_mm, stated.sd_deg)
-    return _Arm(
-        item=item, where=str(data.recording.path), clock=clock, prior=prior, readings_at=readings_later,
-        poses_at=base_from_shaft, places=poses_at(log, clock.at(times))[0][:, :3, 3],
-    )  # fmt: skip
+    motion = LoggedMotion(tree=item.kinematics, poses_at=base_from_root, readings_at=readings_later)
+    places = poses_at(log, clock.at(times))[0][:, :3, 3]
+    return _Arm(item=item, clock=clock, prior=prior, motion=motion, places=places)
 
 
 def _among_cameras(arm: _Arm, registration: Registration | None) -> _Arm:
@@ -315,7 +281,7 @@ def _among_cameras(arm: _Arm, registration: Registration | None) -> _Arm:
     if registration is None or arm.prior is None:
         return arm
     base, sd_mm, sd_deg = arm.prior
-    places = (base @ arm.poses_at(0.0))[:, :3, 3]
+    places = (base @ arm.motion.poses_at(0.0))[:, :3, 3]
     places = places[np.isfinite(places).all(1)]
     if not len(places):
         return arm
@@ -324,17 +290,16 @@ def _among_cameras(arm: _Arm, registration: Registration | None) -> _Arm:
     return replace(arm, prior=(base, float(np.hypot(sd_mm, placed_mm)), float(np.hypot(sd_deg, placed_deg))))
 
 
-def _find(arm: _Arm, observed: _Observed, arms: Sequence[_Arm]) -> BaseRegistration:
+def _find(data: Episodes, arm: _Arm, observed: _Observed, arms: Sequence[_Arm]) -> BaseRegistration:
     """Find a base from the outlines of what moves, of several arms from what is nearest to its own."""
-    motion = LoggedMotion(tree=arm.item.kinematics, poses_at=arm.poses_at, readings_at=arm.readings_at)
+    masks, cameras, known = _own_masks(arm, observed, arms), np.linalg.inv(observed.cameras), arm.clock.source in KNOWN
     try:
         return find_base(
-            _own_masks(arm, observed, arms), observed.intrinsics, np.linalg.inv(observed.cameras), motion, arm.prior,
-            hidden=observed.hidden, clock_known=arm.clock.source in KNOWN,
-        )  # fmt: skip
+            masks, observed.intrinsics, cameras, arm.motion, arm.prior, hidden=observed.hidden, clock_known=known
+        )
     except NeecoError as error:
-        assert arm.item.base is not None
-        raise NeecoError(f"{arm.where}: instrument {arm.item.name!r}: {arm.item.base.key}: {error}") from error
+        key = arm.item.base and arm.item.base.key
+        raise NeecoError(f"{data.recording.path}: instrument {arm.item.name!r}: {key}: {error}") from error
 
 
 def _own_masks(arm: _Arm, observed: _Observed, arms: Sequence[_Arm]) -> np.ndarray:

@@ -288,12 +288,13 @@ def _sensor_poses(times: np.ndarray, log: PoseLog, clock: ClockOffset) -> tuple[
     return poses, valid
 
 
-_Start = tuple[float, Rotation, np.ndarray, Rotation, np.ndarray]
-# scale, world_from_sfm, translation, camera_from_sensor, and the sensor's origin in the camera's frame [3] mm
+def _closed_form(
+    world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog, clock: ClockOffset
+) -> tuple[float, Rotation, np.ndarray, Rotation, np.ndarray]:
+    """Solve the hand-eye rotation from relative turns (rotation vectors differ by it alone), the rest linearly.
 
-
-def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog, clock: ClockOffset) -> _Start:
-    """Solve the hand-eye rotation from relative turns (rotation vectors differ by it alone), the rest linearly."""
+    Return scale, world_from_sfm, translation, camera_from_sensor, and the sensor's origin in the camera's frame [3] mm.
+    """
     poses, valid = _sensor_poses(times, log, clock)
     cameras, sensors = world_from_camera[valid], poses[valid]
     camera_turns, sensor_turns = Rotation.from_matrix(cameras[:, :3, :3]), Rotation.from_matrix(sensors[:, :3, :3])

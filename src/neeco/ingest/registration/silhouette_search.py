@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from neeco.geometry.lines import unit
 from neeco.ingest.foreground.silhouettes import ShaftLines
 from neeco.ingest.registration.articulated_fit import ArticulatedProblem
-from neeco.ingest.registration.logged import MIDDLE, BasePrior
+from neeco.ingest.registration.base import MIDDLE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,11 +94,6 @@ class Candidates:
         return Candidates(*(values[rows] for values in vars(self).values()))
 
 
-def uniform_rotations(count: int, generator: np.random.Generator) -> np.ndarray:
-    """Rotations [count, 3, 3], uniform over SO(3)."""
-    return Rotation.random(count, random_state=generator).as_matrix()
-
-
 def rotations_about(center: np.ndarray, sd_rad: float, count: int, generator: np.random.Generator) -> np.ndarray:
     """Rotations [count, 3, 3] turned from `center` [3, 3] by normal rotation vectors; the first is itself."""
     vectors = generator.normal(0, sd_rad, (count, 3))
@@ -106,35 +101,26 @@ def rotations_about(center: np.ndarray, sd_rad: float, count: int, generator: np
     return Rotation.from_rotvec(vectors).as_matrix() @ center
 
 
-def distance_to(problem: ArticulatedProblem, prior: BasePrior) -> float:
-    """Approximate mm from the cameras to the instrument: by the prior, else by a shaft of typical size."""
-    half = float(np.median([mask.max() for mask in problem.silhouettes.distances]))
-    guess = COARSE.typical_radius_mm * problem.silhouettes.intrinsics[0] / max(half, 0.5)
-    if prior.sd_mm is None:
-        return guess
-    place = problem.pivot(prior.world_from_base)
-    depth = float(np.median(problem.camera_from_world[:, 2, :3] @ place + problem.camera_from_world[:, 2, 3]))
-    return depth if depth > 0.2 * guess else guess
-
-
 def search_bases(
     problem: ArticulatedProblem,
-    prior: BasePrior,
-    distance: float,
     generator: np.random.Generator,
     lines: ShaftLines | None = None,
     **stated: np.ndarray,
 ) -> Candidates:
-    """The best bases by lines (the masks' shafts where None) and tips of the masks. distance: as `distance_to` has it;
-    stated: what links say of the shaft (see `ShaftViews`)."""
+    """The best bases by lines (the masks' shafts where None) and tips of the masks; stated: what links say of the shaft
+    (see `ShaftViews`)."""
+    prior, base, cameras = problem.prior, problem.prior.world_from_base, np.linalg.inv(problem.camera_from_world)
+    half = float(np.median([mask.max() for mask in problem.silhouettes.distances]))
+    distance = guess = COARSE.typical_radius_mm * problem.silhouettes.intrinsics[0] / max(half, 0.5)
     if prior.sd_rad is None or prior.sd_mm is None:
-        rotations = uniform_rotations(COARSE.n_uniform, generator)
-        cameras = np.linalg.inv(problem.camera_from_world)  # the instrument is where most of them look
-        center, sd_mm, step = (cameras[:, :3, 3] + distance * cameras[:, :3, 2]).mean(0), distance, 0.2
+        rotations = Rotation.random(COARSE.n_uniform, random_state=generator).as_matrix()
+        # the instrument is where most of the cameras look
+        center, sd_mm, step = (cameras[:, :3, 3] + guess * cameras[:, :3, 2]).mean(0), guess, 0.2
     else:
-        base = prior.world_from_base
         rotations = rotations_about(base[:3, :3], prior.sd_rad, COARSE.n_rotations, generator)
         center, sd_mm, step = problem.pivot(base), prior.sd_mm, 0.5 * prior.sd_rad
+        depth = float(np.median(problem.camera_from_world[:, 2, :3] @ center + problem.camera_from_world[:, 2, 3]))
+        distance = depth if depth > 0.2 * guess else guess
     views = ShaftViews(
         lines=problem.silhouettes.shafts if lines is None else lines,
         intrinsics=problem.silhouettes.intrinsics,

@@ -152,7 +152,7 @@ class ShaftVideo:
 
 def solve_axes(video: ShaftVideo, start: ShaftAxes, edges: ShaftEdges, *, covariance: bool = False) -> ShaftAxes:
     """Solve the axes of all frames jointly from `start`, fitting the edges, smoothness of motion and the trocar.
-    covariance: whether to compute it."""
+    covariance: whether to compute that of each axis, and of the scale, at the minimum."""
     axes = start
     if video.trocar and axes.trocar is None:
         points, directions = (item[edges.observed] for item in video.world_lines(axes))
@@ -166,7 +166,17 @@ def solve_axes(video: ShaftVideo, start: ShaftAxes, edges: ShaftEdges, *, covari
         damping=SETTINGS.damping,
         tolerance=SETTINGS.tolerance,
     )
-    return problem.with_covariance(axes) if covariance else axes
+    if not covariance:
+        return axes
+    information = sparse.csc_matrix(problem.linearise(axes).information)
+    solver = splu((information + sparse.diags(1e-12 * information.diagonal() + 1e-12)).tocsc())
+    size, blocks, scale_sd = information.shape[0], [], None
+    for frame in range(len(axes.points)):
+        part = slice(LOCAL * frame, LOCAL * (frame + 1))
+        blocks.append(solver.solve(np.eye(size, LOCAL, -part.start))[part])
+    if not video.scaled:
+        scale_sd = float(np.hypot(np.sqrt(solver.solve(np.eye(size)[-1])[-1]), SETTINGS.scale_drift))
+    return replace(axes, covariance=np.stack(blocks), scale_sd=scale_sd)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,10 +262,7 @@ class _AxesProblem:
 
     def cost(self, axes: ShaftAxes) -> float:
         """Return half the sum of squares; with a Cauchy loss on the edges."""
-        return self._cost(self.residuals(axes))
-
-    def _cost(self, residuals: np.ndarray) -> float:
-        edges, prior_residuals = np.split(residuals, [self.edges.deviations.size])
+        edges, prior_residuals = np.split(self.residuals(axes), [self.edges.deviations.size])
         return float(
             0.5 * SETTINGS.edge_loss_sd**2 * np.log1p((edges / SETTINGS.edge_loss_sd) ** 2).sum()
             + 0.5 * (prior_residuals**2).sum()
@@ -268,20 +275,7 @@ class _AxesProblem:
         weights = 1 / (1 + (base / SETTINGS.edge_loss_sd) ** 2)
         weights[self.edges.deviations.size :] = 1.0
         weighted = sparse.diags(weights) @ slopes
-        return Linearisation(slopes.T @ weighted, weighted.T @ base, self._cost(base), self.cost)
-
-    def with_covariance(self, axes: ShaftAxes) -> ShaftAxes:
-        """Return the axes with the covariance of each, and of the scale, at the minimum."""
-        information = sparse.csc_matrix(self.linearise(axes).information)
-        solver = splu((information + sparse.diags(1e-12 * information.diagonal() + 1e-12)).tocsc())
-        size, blocks = information.shape[0], []
-        for frame in range(len(axes.points)):
-            part = slice(LOCAL * frame, LOCAL * (frame + 1))
-            blocks.append(solver.solve(np.eye(size, LOCAL, -part.start))[part])
-        scale_sd = None
-        if not self.video.scaled:
-            scale_sd = float(np.hypot(np.sqrt(solver.solve(np.eye(size)[-1])[-1]), SETTINGS.scale_drift))
-        return replace(axes, covariance=np.stack(blocks), scale_sd=scale_sd)
+        return Linearisation(slopes.T @ weighted, weighted.T @ base, self.cost(axes), self.cost)
 
 
 def _across(vectors: np.ndarray, directions: np.ndarray) -> np.ndarray:

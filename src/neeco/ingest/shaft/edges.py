@@ -16,6 +16,7 @@ import numpy as np
 from neeco.capture.model import evenly_spaced
 from neeco.geometry.lines import places_nearest_to_rays, unit
 from neeco.ingest.foreground.masks import MASKS, color_odds
+from neeco.ingest.foreground.silhouettes import border_of, largest_piece, slices_across
 from neeco.ingest.shaft.axis import Intrinsics, ShaftAxes, ShaftEdges, axis_between, contour_normals, image_lines
 
 
@@ -24,11 +25,8 @@ class EdgeSettings:
     """Settings of the detection of a shaft's edges, and of its end."""
 
     # from masks
-    strip_width: int = 160  # px, width of the strip along the shaft to which a mask is resampled
-    strip_length: int = 720  # px, the same along the shaft
-    ransac_samples: int = 200  # samples of two points
-    inlier_px: float = 1.2  # distance from the line of an inlier
-    max_slope: float = 0.35  # of an edge relative to the mask's centre line
+    inlier_px: float = 1.2  # scale of the robust loss of an edge's points
+    line_rounds: int = 8  # rounds of reweighting
     min_length_px: int = 12  # minimum visible length of the shaft
     head_margin_px: float = 2.0  # margin at the distal end that is ignored
     places: int = 12  # points per edge
@@ -65,6 +63,8 @@ class EdgeSettings:
 
 EDGE = EdgeSettings()
 
+OFFSETS = np.arange(-EDGE.inside_px, EDGE.outside_px + EDGE.sample_px / 2, EDGE.sample_px)  # px outwards, of samples
+CANDIDATES = np.arange(-EDGE.reach_px, EDGE.reach_px + EDGE.step_px / 2, EDGE.step_px)  # px outwards, of an edge
 LINEAR_LIGHT = (255 * (np.arange(256) / 255) ** 2.2).astype(np.float32)  # of the values of an image
 
 
@@ -77,118 +77,40 @@ def outline_edges(
     Returns the axes, each from its own image, with points at the shaft's end; points on both edges; and which frames
     have them [F].
     """
-    random = np.random.default_rng(0)
-    count = len(masks)
+    count, border = len(masks), border_of(masks.shape[1:], None)
     points, axes = np.tile([0.0, 0.0, 1.0], (2, count, 1))
     pixels, deviations = np.zeros((count, 2, EDGE.places, 2)), np.full((count, 2, EDGE.places), np.inf)
     valid = np.zeros(count, dtype=bool)
     for frame in np.flatnonzero(np.isfinite(ends[:, 0])):
-        both = _both_edges(masks[frame], ends[frame], directions[frame], random)
-        if both is None:
-            continue
-        places, end, direction = both
-        through = np.cross(np.insert(places[:, 0], 2, 1.0, 1), np.insert(places[:, -1], 2, 1.0, 1))
-        point, axis = axis_between(through, end, direction, radius, intrinsics)
-        if not np.isfinite(point).all() or point[2] <= radius:
-            continue
-        points[frame], axes[frame], pixels[frame] = point, axis, places
-        deviations[frame] = EDGE.outline_sd_px * np.sqrt(EDGE.places)
-        valid[frame] = True
+        piece, end, direction = largest_piece(masks[frame]), ends[frame], directions[frame]
+        for _ in range(2):  # the second time about the shaft's own middle
+            _, middles, widths = slices_across(piece, border, end, direction)
+            aside = np.array([-direction[1], direction[0]])
+            shaft = (middles - end) @ direction < -EDGE.head_margin_px
+            if shaft.sum() < EDGE.min_length_px:
+                break
+            x, middle = (middles[shaft] - end) @ direction, (middles[shaft] - end) @ aside
+            # in the order of `contour_normals`: looking along the shaft, its right edge first
+            sides = [middle + sign * widths[shaft] / 2 for sign in (1, -1)]
+            lines = [np.array([0.0, np.median(side)]) for side in sides]  # slope, offset
+            for _ in range(EDGE.line_rounds):  # least squares under a Cauchy loss
+                weights = [
+                    1 / np.hypot(1, (side - np.polyval(line, x)) / EDGE.inlier_px)
+                    for side, line in zip(sides, lines, strict=True)
+                ]
+                lines = [np.polyfit(x, side, 1, w=weight) for side, weight in zip(sides, weights, strict=True)]
+            reach = np.linspace(x[0], x[-1], EDGE.places)
+            places = [end + np.outer(reach, direction) + np.outer(a * reach + b, aside) for a, b in lines]
+            slope, offset = np.mean(lines, 0)
+            end, direction = end + offset * aside, (direction + slope * aside) / np.hypot(1, slope)
+        else:
+            pixels[frame] = places
+            through = np.cross(*(np.insert(pixels[frame][:, which], 2, 1.0, 1) for which in (0, -1)))
+            points[frame], axes[frame] = axis_between(through, end, direction, radius, intrinsics)
+            valid[frame] = points[frame][2] > radius  # NaN is not
+    deviations[valid] = EDGE.outline_sd_px * np.sqrt(EDGE.places)
+    points[~valid] = axes[~valid] = (0.0, 0.0, 1.0)
     return ShaftAxes(points=points, directions=axes), ShaftEdges(pixels, deviations), valid
-
-
-def _both_edges(
-    mask: np.ndarray, end: np.ndarray, direction: np.ndarray, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Places [2, P, 2] px on both edges of a shaft that ends about `end` px and goes along `direction`, the end on
-    the line midway, and that line's direction. None: there are none."""
-    places = np.zeros((2, EDGE.places, 2))
-    for _ in range(2):  # the second time about the shaft's own middle
-        aside = np.array([-direction[1], direction[0]])
-        along, left, right = _outline(mask, end, direction)
-        behind = along < -EDGE.head_margin_px
-        if behind.sum() < EDGE.min_length_px:
-            return None
-        x = along[behind]
-        weights = np.clip(1.2 - (x - x[0]) / max(float(np.ptp(x)), 1.0), 0.2, None)  # masks are best far from the head
-        # in the order of `contour_normals`: looking along the shaft, its right edge first
-        fits = [_line(x, side[behind], weights, random) for side in (right, left)]
-        if fits[0] is None or fits[1] is None:
-            return None
-        lines = np.array([fits[0], fits[1]])  # slope, offset
-        reach = np.linspace(x[0], x[-1], EDGE.places)[:, None]
-        places = np.stack([end + reach * direction + (slope * reach + offset) * aside for slope, offset in lines])
-        slope, offset = lines.mean(0)
-        end = end + offset * aside
-        direction = (direction + slope * aside) / np.hypot(1, slope)
-    return places, end, direction
-
-
-def _outline(mask: np.ndarray, point: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Outline of the mask left and right of a line through `point` px along `direction`: places along it, from behind
-    to the tip, and both offsets across it, px; only where both lie in the image."""
-    aside = np.array([-direction[1], direction[0]])
-    x = np.arange(EDGE.strip_length) - EDGE.strip_length / 2
-    y = np.arange(EDGE.strip_width) - EDGE.strip_width / 2
-    places = (point + x[None, :, None] * direction + y[:, None, None] * aside - 0.5).astype(np.float32)
-    level = cv2.remap(mask.astype(np.float32), places[..., 0], places[..., 1], cv2.INTER_LINEAR)
-    height, width = mask.shape
-    inside = (places[..., 0] > 0) & (places[..., 0] < width - 1) & (places[..., 1] > 0) & (places[..., 1] < height - 1)
-    on = level > 0.5
-    first, last = on.argmax(0), EDGE.strip_width - 1 - on[::-1].argmax(0)
-    column = np.arange(EDGE.strip_length)
-    good = on.any(0) & (first > 0) & (last < EDGE.strip_width - 1)
-    before, after = np.maximum(first - 1, 0), np.minimum(last + 1, EDGE.strip_width - 1)
-    good &= inside[before, column] & inside[after, column]
-    low, high = level[before, column], level[first, column]
-    left = y[first] - (high - 0.5) / np.maximum(high - low, 1e-6)
-    low, high = level[after, column], level[last, column]
-    right = y[last] + (high - 0.5) / np.maximum(high - low, 1e-6)
-    return x[good], left[good], right[good]
-
-
-def _line(x: np.ndarray, y: np.ndarray, weights: np.ndarray, random: np.random.Generator) -> tuple[float, float] | None:
-    """Return slope and offset of the line through most points x, y [N] px, by weight (RANSAC); or None."""
-    if len(x) < 6:
-        return None
-    pairs = random.integers(0, len(x), (EDGE.ransac_samples, 2))
-    pairs = pairs[np.abs(x[pairs[:, 0]] - x[pairs[:, 1]]) > min(8.0, 0.5 * np.ptp(x))]
-    slopes = (y[pairs[:, 0]] - y[pairs[:, 1]]) / (x[pairs[:, 0]] - x[pairs[:, 1]])
-    offsets = y[pairs[:, 0]] - slopes * x[pairs[:, 0]]
-    missed = np.abs(y - slopes[:, None] * x - offsets[:, None])  # [T, N]
-    votes = (weights * np.clip(1 - (missed / EDGE.inlier_px) ** 2, 0, None)).sum(1) * (np.abs(slopes) < EDGE.max_slope)
-    if not len(votes) or votes.max() <= 0:
-        return None
-    slope, offset = float(slopes[votes.argmax()]), float(offsets[votes.argmax()])
-    for _ in range(3):
-        near = np.abs(y - slope * x - offset) < EDGE.inlier_px
-        if near.sum() < 4:
-            return None
-        slope, offset = (float(value) for value in np.polyfit(x[near], y[near], 1, w=weights[near]))
-    return slope, offset
-
-
-def with_shafts(
-    masks: np.ndarray, axes: ShaftAxes, radius: float, intrinsics: Intrinsics, which: np.ndarray
-) -> np.ndarray:
-    """Return masks bool [F, h, w] that end, behind the points of the axes, at these shafts' contours, in the frames
-    `which` bool [F]."""
-    trimmed = masks.copy()
-    _, height, width = masks.shape
-    v, u = np.mgrid[:height, :width] + 0.5
-    places = np.stack([u, v, np.ones(u.shape)], -1)
-    for frame in np.flatnonzero(which):
-        point, direction = axes.points[frame], axes.directions[frame]
-        seen = _visible(point, direction, radius, intrinsics, masks.shape[1:])
-        if seen is None:
-            continue
-        (behind, before), wide = seen
-        along = (before - behind) / max(float(np.linalg.norm(before - behind)), 1e-6)
-        shaft = places[..., :2] @ along < before @ along
-        lines = image_lines(contour_normals(point, direction, radius), intrinsics)
-        inside = (places @ lines.T).min(-1)  # px, within the nearer contour
-        trimmed[frame] = np.where(shaft & (inside > -wide), inside > 0, trimmed[frame])
-    return trimmed
 
 
 def shaded_edges(
@@ -202,11 +124,17 @@ def shaded_edges(
     count = len(images)
     pixels, deviations = np.zeros((count, 2, EDGE.max_places, 2)), np.full((count, 2, EDGE.max_places), np.inf)
     diameters, misfits = np.zeros(count), []
+    fx, fy, cx, cy = intrinsics
+    back = np.linspace(EDGE.max_diameters * 2, EDGE.margin_radii, 400) * radius
     for frame in range(count):
-        seen = _visible(axes.points[frame], axes.directions[frame], radius, intrinsics, images.shape[1:3])
-        if seen is None:
+        axis = axes.points[frame] - back[:, None] * axes.directions[frame]
+        deep = np.maximum(axis[:, 2], 1e-6)
+        places = np.stack([fx * axis[:, 0] / deep + cx, fy * axis[:, 1] / deep + cy], 1)
+        inside = (axis[:, 2] > radius) & (places > 0).all(1) & (places < images.shape[2:0:-1]).all(1)
+        if inside.sum() < 2:
             continue
-        ends, width = seen
+        ends = places[np.flatnonzero(inside)[[0, -1]]]  # from the border to where the shaft ends
+        width = float((2 * radius * np.sqrt(fx * fy) / deep[inside]).mean())
         length = float(np.linalg.norm(ends[1] - ends[0]))
         diameters[frame] = length / width
         if length < EDGE.min_length_px:
@@ -223,29 +151,6 @@ def shaded_edges(
     return ShaftEdges(pixels, deviations), diameters, float(np.mean(misfits)) if misfits else np.inf
 
 
-def _visible(
-    point: np.ndarray,
-    direction: np.ndarray,
-    radius: float,
-    intrinsics: Intrinsics,
-    size: tuple[int, ...],
-) -> tuple[np.ndarray, float] | None:
-    """Ends [2, 2] px of the shaft's axis in the image, from the border to where the shaft ends, and its mean width px;
-    None: none of it is in the image."""
-    fx, fy, cx, cy = intrinsics
-    height, width = size[:2]
-    back = np.linspace(EDGE.max_diameters * 2, EDGE.margin_radii, 400) * radius
-    axis = point - back[:, None] * direction
-    deep = np.maximum(axis[:, 2], 1e-6)
-    places = np.stack([fx * axis[:, 0] / deep + cx, fy * axis[:, 1] / deep + cy], 1)
-    inside = (axis[:, 2] > radius) & (places > 0).all(1) & (places[:, 0] < width) & (places[:, 1] < height)
-    if inside.sum() < 2:
-        return None
-    rows = np.flatnonzero(inside)
-    widths = 2 * radius * np.sqrt(fx * fy) / deep[rows]
-    return places[rows[[0, -1]]], float(widths.mean())
-
-
 def _edge(
     light: np.ndarray, ends: np.ndarray, line: np.ndarray, radius_px: float, blur: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -255,9 +160,7 @@ def _edge(
     middle = ends[0] + (np.arange(length) / max(length, 1))[:, None] * (ends[1] - ends[0])
     foot = middle - (middle @ line[:2] + line[2])[:, None] * line[:2]
     bases, used = _profile_bases(round(2 * radius_px) / 2, blur)
-    offsets = _offsets()
-    outwards = -line[:2]
-    places = (foot[:, None] + offsets[None, :, None] * outwards - 0.5).astype(np.float32)
+    places = (foot[:, None] - OFFSETS[None, :, None] * line[:2] - 0.5).astype(np.float32)
     colors = cv2.remap(light, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     height, width = light.shape[:2]
     inside = (places > 0).all(-1) & (places[..., 0] < width - 1) & (places[..., 1] < height - 1)  # [S, U]
@@ -268,7 +171,7 @@ def _edge(
     cut = blocks * EDGE.block_px
     whole = whole[:cut].reshape(blocks, EDGE.block_px).all(1)
     profiles = (
-        np.median(colors[:cut].reshape(blocks, EDGE.block_px, len(offsets), 3), axis=1)[whole] * used[:, None]
+        np.median(colors[:cut].reshape(blocks, EDGE.block_px, len(OFFSETS), 3), axis=1)[whole] * used[:, None]
     )  # [B, U, 3]
     missed = (profiles**2).sum((1, 2))[:, None]
     missed = missed - (np.einsum("euk,buc->bekc", bases, profiles, optimize=True) ** 2).sum((2, 3))  # [B, E]
@@ -278,23 +181,13 @@ def _edge(
     best = np.clip(best, 1, missed.shape[1] - 2)
     low, least, high = missed[row, best - 1], missed[row, best], missed[row, best + 1]
     curvature = np.maximum(low - 2 * least + high, 1e-9)
-    shift = _candidates()[best] + EDGE.step_px * 0.5 * (low - high) / curvature
+    shift = CANDIDATES[best] + EDGE.step_px * 0.5 * (low - high) / curvature
     noise = np.maximum(least, EDGE.min_misfit) / (3 * used.sum())
     independent = EDGE.sample_px  # neighbouring samples are of one pixel
     sds = np.sqrt(2 * noise / independent * EDGE.step_px**2 / curvature)
     centers = foot[:cut].reshape(blocks, EDGE.block_px, 2).mean(1)[whole]
     edge_places = centers - shift[:, None] * line[:2]
     return edge_places[inner], sds[inner], noise[inner]
-
-
-def _offsets() -> np.ndarray:
-    """Return offsets [U] px across an edge, outwards, at which images are sampled."""
-    return np.arange(-EDGE.inside_px, EDGE.outside_px + EDGE.sample_px / 2, EDGE.sample_px)
-
-
-def _candidates() -> np.ndarray:
-    """Return candidate offsets [E] px of an edge."""
-    return np.arange(-EDGE.reach_px, EDGE.reach_px + EDGE.step_px / 2, EDGE.step_px)
 
 
 @lru_cache(maxsize=256)
@@ -304,19 +197,18 @@ def _profile_bases(radius_px: float, blur: float) -> tuple[np.ndarray, np.ndarra
     They span four, blurred: tissue, tissue that changes linearly towards the edge (a shadow), the shaft, and the shaft
     lit by a lamp at the lens, sqrt(1 - t^2) of the share t of its radius.
     """
-    offsets = _offsets()
-    used = (offsets >= -max(EDGE.max_radius_share * radius_px, 2.0)).astype(float)
+    used = (-max(EDGE.max_radius_share * radius_px, 2.0) <= OFFSETS).astype(float)
     fine = np.arange(-EDGE.inside_px - 5, EDGE.outside_px + 5, EDGE.fine_px)
     reach = np.arange(-4 * blur, 4 * blur + EDGE.fine_px / 2, EDGE.fine_px)
     kernel = np.exp(-0.5 * (reach / blur) ** 2)
     kernel /= kernel.sum()
     bases = []
-    for edge in _candidates():
+    for edge in CANDIDATES:
         beyond = fine - edge
         shaft = (beyond < 0).astype(float)
         lit = np.sqrt(np.clip(1 - (1 + beyond / max(radius_px, 3.0)) ** 2, 0, None)) * shaft
         parts = (1 - shaft, (1 - shaft) * beyond, shaft, lit)
-        columns = [np.interp(offsets, fine, np.convolve(part, kernel, "same")) * used for part in parts]
+        columns = [np.interp(OFFSETS, fine, np.convolve(part, kernel, "same")) * used for part in parts]
         bases.append(np.linalg.qr(np.stack(columns, 1))[0])
     return np.stack(bases), used
 
@@ -331,18 +223,13 @@ def axis_coordinates(axes: ShaftAxes, frame: int, pixels: np.ndarray, intrinsics
 def tips_along(masks: np.ndarray, axes: ShaftAxes, intrinsics: Intrinsics) -> np.ndarray:
     """Coordinates [F] mm along each axis, from its point, of the tip of its mask [F, h, w]; NaN where that is not in
     the image."""
-    count, height, width = masks.shape
-    tips = np.full(count, np.nan)
+    tips = np.full(len(masks), np.nan)
     for frame, mask in enumerate(masks):
-        pieces, labels, facts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-        if pieces < 2:
-            continue
-        v, u = np.nonzero(labels == 1 + int(facts[1:, cv2.CC_STAT_AREA].argmax()))
-        hull = cv2.convexHull(np.stack([u, v], 1).astype(np.float32))[:, 0] + 0.5
-        along = axis_coordinates(axes, frame, hull, intrinsics)
-        tip = hull[along.argmax()]
-        if (tip > EDGE.border_px).all() and tip[0] < width - EDGE.border_px and tip[1] < height - EDGE.border_px:
-            tips[frame] = along.max()
+        if len(places := largest_piece(mask)):
+            hull = cv2.convexHull(places.astype(np.float32))[:, 0]
+            along = axis_coordinates(axes, frame, hull, intrinsics)
+            margin = np.minimum(hull, np.array(mask.shape[::-1]) - hull)[along.argmax()].min()
+            tips[frame] = along.max() if margin > EDGE.border_px else np.nan
     return tips
 
 
@@ -371,7 +258,7 @@ def shaft_ends(images: np.ndarray, masks: np.ndarray, points: np.ndarray, direct
     for _ in range(EDGE.n_rounds):
         colors = np.concatenate([*shaft, *head])
         is_shaft = np.arange(len(colors)) < sum(map(len, shaft))
-        odds = np.clip(color_odds(colors, is_shaft, ~is_shaft).of_color, -EDGE.max_odds, EDGE.max_odds)
+        odds = np.clip(color_odds(colors, is_shaft, ~is_shaft), -EDGE.max_odds, EDGE.max_odds)
         shaft, head = [], []
         for frame in frames:
             tints, along, first, last = seen[frame]

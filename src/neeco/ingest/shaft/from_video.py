@@ -10,11 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.capture.model import UNKNOWN_DEG, FromVideo, Instrument, Uncertainty, evenly_spaced
+from neeco.capture.model import UNKNOWN_DEG, Uncertainty, evenly_spaced
 from neeco.geometry.lines import distances_to_lines, unit
+from neeco.geometry.rotations import rigid
 from neeco.ingest.foreground.silhouettes import shaft_lines
 from neeco.ingest.frames.images import SfmResult, Views, reduced
-from neeco.ingest.recording.model import InstrumentLogs, Recording
+from neeco.ingest.recording.model import InstrumentLogs
 from neeco.ingest.shaft.axis import ShaftAxes, ShaftEdges, ShaftVideo, across_axes, edge_distances, solve_axes
 from neeco.ingest.shaft.edges import (
     EDGE,
@@ -23,7 +24,6 @@ from neeco.ingest.shaft.edges import (
     shaded_edges,
     shaft_ends,
     tips_along,
-    with_shafts,
 )
 from neeco.ingest.timing.episodes import Episodes
 
@@ -83,26 +83,17 @@ class FoundShaft:
     """An instrument's poses, found in F frames.
 
     poses: world_from_instrument [F, 4, 4] mm, z along the shaft towards the tip, the origin where the shaft ends; known
-    [F]: those with small standard deviations; uncertainties of all; axes: the same in the cameras' frames; diameters
-    [F] of shaft that the frames show; masks bool [F, h, w], which end at the shaft's contours where those were
-    detected; working_length mm from the origin to the tip; by_color: the shaft's end was detected by its colour; notes:
-    one sentence each.
+    [F]: those with small standard deviations; uncertainties of all; axes: the same in the cameras' frames; share of the
+    frames that show two diameters of shaft; working_length mm from the origin to the tip; notes: one sentence each.
     """
 
     poses: np.ndarray
     known: np.ndarray
     uncertainties: tuple[Uncertainty, ...]
     axes: ShaftAxes
-    diameters: np.ndarray
-    masks: np.ndarray
+    share: float
     working_length: float
-    by_color: bool
     notes: tuple[str, ...] = ()
-
-    @property
-    def share(self) -> float:
-        """Share of the frames that show two diameters of shaft."""
-        return float((self.diameters >= SHAFT.min_diameters).mean())
 
 
 def find_shaft(
@@ -120,11 +111,12 @@ def find_shaft(
     what to film, when the shaft is not visible.
     """
     _require_one(masks)
-    notes = []
-    known_scale = video.scaled
+    notes, known_scale = [], video.scaled
+    head = working_length or SHAFT.default_head_diameters * 2 * video.radius  # mm, where it cannot be measured
     video = replace(video, trocar=trocar is not False, scaled=video.scaled or trocar is False)
-    axes, edges, ends = _first_axes(images, masks, video, working_length)
-    if trocar is None and not _passes_one_point(video, axes):
+    axes, edges, ends = _first_axes(images, masks, video, head)
+    missed = 0.0 if axes.trocar is None else distances_to_lines(axes.trocar, *video.world_lines(axes))
+    if trocar is None and float(np.sqrt(np.mean(np.square(missed)))) >= SHAFT.trocar_rms_mm:
         notes.append("the shaft does not keep passing one point: no fixed trocar helps to find its direction")
         video = replace(video, trocar=False, scaled=True)  # smooth motion tells no scale: it would shrink all motion
         axes = replace(axes, trocar=None)
@@ -146,7 +138,7 @@ def find_shaft(
             notes.append(UNKNOWN_SCALE)
         narrower = _narrower_part(video, axes, edges) if turn > 0 else 0.0
         offset += narrower
-        axes, ends, heads = _at_end(axes, images, masks, video, working_length, offset)
+        axes, ends, heads = _at_end(axes, images, masks, video, head, offset)
         if turn >= SHAFT.min_rounds - 1 and not narrower:
             break
     axes = solve_axes(video, axes, edges, covariance=True)
@@ -156,10 +148,11 @@ def find_shaft(
         axes = replace(axes, covariance=SHAFT.short_factor**2 * axes.covariance)
         notes.append("its standard deviations are doubled, as little of the shaft is visible; hold the scope back")
     by_color = bool(ends.any()) and heads is not None
-    length = working_length or (
-        float(np.nanquantile(heads, SHAFT.closed_quantile)) if heads is not None else _default_head(video)
-    )
-    along_sd = _along_deviation(video, axes, ends, by_color)
+    length = head if working_length or heads is None else float(np.nanquantile(heads, SHAFT.closed_quantile))
+    slant = np.abs((unit(axes.points) * axes.directions).sum(1))
+    seen = SHAFT.end_px * axes.points[:, 2] / video.intrinsics[0] / np.sqrt(np.maximum(1 - slant**2, 1e-3))
+    nearest = np.abs(video.times[:, None] - video.times[ends]).min(1, initial=np.inf)
+    along_sd = np.hypot(seen if by_color else SHAFT.tip_mm, SHAFT.sliding_mm_s * nearest)
     uncertainties, tilt, across = _uncertainties(axes, poses := _poses(video, axes), along_sd, video)
     certain = (tilt < SHAFT.max_sd[0]) & (across < SHAFT.max_sd[1]) & (along_sd < SHAFT.max_sd[2])
     if certain.sum() < SHAFT.min_frames:
@@ -172,22 +165,15 @@ def find_shaft(
             "shaft and head have the same colour: the place along the shaft is that of the tip, which opening jaws "
             "move; a ring of tape on the shaft's end would mend it"
         )
-    sharp = with_shafts(masks, axes, video.radius, video.intrinsics, certain & ends) if by_color else masks
     return FoundShaft(
         poses=poses,
         known=certain,
         uncertainties=uncertainties,
         axes=axes,
-        diameters=diameters,
-        masks=sharp,
+        share=share,
         working_length=length,
-        by_color=by_color,
         notes=tuple(notes),
     )
-
-
-def _default_head(video: ShaftVideo) -> float:
-    return SHAFT.default_head_diameters * 2 * video.radius
 
 
 def _plausible(axes: ShaftAxes, tissue: float) -> ShaftAxes:
@@ -217,14 +203,14 @@ def _require_one(masks: np.ndarray) -> None:
 
 
 def _first_axes(
-    images: np.ndarray, masks: np.ndarray, video: ShaftVideo, working_length: float | None
+    images: np.ndarray, masks: np.ndarray, video: ShaftVideo, head: float
 ) -> tuple[ShaftAxes, ShaftEdges, np.ndarray]:
-    """Return the axes of all frames from the masks' outlines, their edges, and which frames show the shaft's end."""
+    """Return the axes of all frames from the masks' outlines, their edges, and which frames show the shaft's end.
+    head: mm from the shaft's end to the tip, if its colour does not show it."""
     lines = shaft_lines(masks)
     along = shaft_ends(images, masks, lines.points, lines.directions)
-    if not np.isfinite(along).any():  # by the head's length against the mask's width, at a usual slant
-        radii = (working_length or _default_head(video)) / video.radius
-        along = _behind_tips(masks, lines.points, lines.directions, radii)
+    if not np.isfinite(along).any():
+        along = np.zeros(len(masks))  # the middle of the mask: behind most heads
     ends = lines.points + along[:, None] * lines.directions
     axes, edges, valid = outline_edges(masks, ends, lines.directions, video.radius, video.intrinsics)
     if valid.sum() < max(SHAFT.min_frames, SHAFT.min_frames_share * len(masks)):
@@ -232,45 +218,15 @@ def _first_axes(
             f"a shaft is visible in {int(valid.sum())} of {len(masks)} frames; hold the scope back, so that more than "
             "the instrument's end shows"
         )
-    axes, edges = _bridged(video, axes, edges, valid)
-    axes = solve_axes(video, axes, edges)
-    axes, at_end, _ = _at_end(axes, images, masks, video, working_length)
-    return axes, edges, at_end
-
-
-def _behind_tips(masks: np.ndarray, points: np.ndarray, directions: np.ndarray, radii: float) -> np.ndarray:
-    """Places [F] px along lines at which heads of so many radii begin in masks [F, h, w], at a typical slant."""
-    slant = 0.75
-    ends = np.full(len(masks), np.nan)
-    for frame in np.flatnonzero(np.isfinite(points[:, 0])):
-        v, u = np.nonzero(masks[frame])
-        offsets = np.stack([u, v], 1) + 0.5 - points[frame]
-        along = offsets @ directions[frame]
-        behind = along < np.quantile(along, 0.25)
-        width = 4 * float(np.std(offsets[behind] @ np.array([-directions[frame, 1], directions[frame, 0]]))) * 0.87
-        ends[frame] = along.max() - slant * radii * width / 2
-    return ends
-
-
-def _passes_one_point(video: ShaftVideo, axes: ShaftAxes) -> bool:
-    """Whether axes solved with a trocar pass it."""
-    assert axes.trocar is not None
-    missed = distances_to_lines(axes.trocar, *video.world_lines(axes))
-    return float(np.sqrt(np.mean(missed**2))) < SHAFT.trocar_rms_mm
-
-
-def _bridged(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges, valid: np.ndarray) -> tuple[ShaftAxes, ShaftEdges]:
-    """Interpolate the axes of outlier frames from the others, which alone keep their edges."""
     depth = axes.points[:, 2]
     usual = float(np.median(depth[valid]))
     good = valid & (depth > SHAFT.depth_range[0] * usual) & (depth < SHAFT.depth_range[1] * usual)
     points, directions = video.world_lines(axes)
-    for _ in range(2):
-        for frame in np.flatnonzero(good):
-            near = np.clip(frame + np.arange(-SHAFT.window_frames, SHAFT.window_frames + 1), 0, len(good) - 1)
-            near = near[good[near] & (video.episodes[near] == video.episodes[frame])]
-            if np.linalg.norm(directions[frame] - np.median(directions[near], axis=0)) > SHAFT.max_jump:
-                good[frame] = False
+    for frame in np.flatnonzero(good):
+        near = good & (video.episodes == video.episodes[frame])
+        near[: max(frame - SHAFT.window_frames, 0)] = near[frame + SHAFT.window_frames + 1 :] = False
+        good[frame] = np.linalg.norm(directions[frame] - np.median(directions[near], axis=0)) <= SHAFT.max_jump
+    # outliers lie between the others, which alone keep their edges
     values = np.concatenate([points, directions], 1)
     values = np.stack([np.interp(video.times, video.times[good], column[good]) for column in values.T], 1)
     rotations, centers = video.world_from_camera[:, :3, :3], axes.scale * video.world_from_camera[:, :3, 3]
@@ -279,7 +235,10 @@ def _bridged(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges, valid: np.nd
         points=np.einsum("fji,fj->fi", rotations, values[:, :3] - centers),
         directions=np.einsum("fji,fj->fi", rotations, unit(values[:, 3:])),
     )
-    return bridged, ShaftEdges(edges.pixels, np.where(good[:, None, None], edges.deviations, np.inf))
+    edges = ShaftEdges(edges.pixels, np.where(good[:, None, None], edges.deviations, np.inf))
+    axes = solve_axes(video, bridged, edges)
+    axes, at_end, _ = _at_end(axes, images, masks, video, head, 0.0)
+    return axes, edges, at_end
 
 
 def _at_end(
@@ -287,13 +246,13 @@ def _at_end(
     images: np.ndarray,
     masks: np.ndarray,
     video: ShaftVideo,
-    working_length: float | None,
-    offset: float = 0.0,
+    head: float,
+    offset: float,
 ) -> tuple[ShaftAxes, np.ndarray, np.ndarray | None]:
     """Return the axes with their points where the shaft ends, which frames show that [F], and the heads' lengths [F].
 
-    These are NaN where not visible, and None where the colour does not show the end, which then lies behind the tip.
-    offset: mm by which the shaft ends before its colour does.
+    These are NaN where not visible, and None where the colour does not show the end, which then lies `head` mm behind
+    the tip. offset: mm by which the shaft ends before its colour does.
     """
     fx, fy, cx, cy = video.intrinsics
     near, ahead = axes.points, axes.points + video.radius * axes.directions
@@ -308,7 +267,7 @@ def _at_end(
         usual = np.nanmedian(heads) if np.isfinite(heads).any() else np.nan
         shift[(heads < SHAFT.head_range[0] * usual) | (heads > SHAFT.head_range[1] * usual)] = np.nan
     else:
-        shift = tips - (working_length or _default_head(video))
+        shift = tips - head
     shift = shift - offset
     valid = np.isfinite(shift)
     if valid.any():
@@ -336,30 +295,18 @@ def _narrower_part(video: ShaftVideo, axes: ShaftAxes, edges: ShaftEdges) -> flo
     return float(numbers[step + 1] * SHAFT.bin_radii * video.radius)
 
 
-def _along_deviation(video: ShaftVideo, axes: ShaftAxes, ends: np.ndarray, by_color: bool) -> np.ndarray:
-    """Standard deviations [F] mm of the places along the axes."""
-    if not ends.any():
-        return np.full(len(ends), np.inf)
-    slant = np.abs((unit(axes.points) * axes.directions).sum(1))
-    seen = SHAFT.end_px * axes.points[:, 2] / video.intrinsics[0] / np.sqrt(np.maximum(1 - slant**2, 1e-3))
-    nearest = np.abs(video.times[:, None] - video.times[ends]).min(1)
-    return np.asarray(np.hypot(seen if by_color else SHAFT.tip_mm, SHAFT.sliding_mm_s * nearest))
-
-
 def _poses(video: ShaftVideo, axes: ShaftAxes) -> np.ndarray:
     """world_from_instrument [F, 4, 4] mm. Without a roll, x turns from that at the mean direction as little as can
     be."""
     points, directions = video.world_lines(axes)
     mean = unit(directions.mean(0))
     start = unit(np.cross(mean, np.eye(3)[np.abs(mean).argmin()]))
-    poses = np.tile(np.eye(4), (len(points), 1, 1))
-    for frame, (point, direction) in enumerate(zip(points, directions, strict=True)):
-        turn = np.cross(mean, direction)
-        angle = np.arctan2(np.linalg.norm(turn), mean @ direction)
-        x = Rotation.from_rotvec(turn * angle / max(float(np.linalg.norm(turn)), 1e-12)).apply(start)
-        x = unit(x - (x @ direction) * direction)
-        poses[frame, :3] = np.stack([x, np.cross(direction, x), direction, point], 1)
-    return poses
+    turns = np.cross(mean, directions)
+    lengths = np.linalg.norm(turns, axis=1)
+    angles = np.arctan2(lengths, directions @ mean)
+    x = Rotation.from_rotvec(turns * (angles / np.maximum(lengths, 1e-12))[:, None]).apply(start)
+    x = unit(x - (x * directions).sum(1, keepdims=True) * directions)
+    return rigid(np.stack([x, np.cross(directions, x), directions], -1), points)
 
 
 def _uncertainties(
@@ -411,7 +358,20 @@ def find_in_video(
         shaft = find_shaft(images, masks, shared, asked.working_length_mm, asked.fixed_trocar, tissue or np.inf)
     except NeecoError as error:
         raise NeecoError(f"{data.recording.path}: instrument {item.name!r}, from video: {error}") from error
-    data.notes.add(_in_words(item.name, shaft))
+    turns, shifts = (
+        np.array([getattr(item, name) for item in shaft.uncertainties])[shaft.known]
+        for name in ("rotation_deg", "translation_mm")
+    )
+    scale, scale_sd = "", shaft.axes.scale_sd
+    if scale_sd is not None:
+        scale = f"; the cameras' scale is known to {scale_sd:.0%}, from the trocar"
+    data.notes.add(
+        f"instrument {item.name!r} was found in the video: {shaft.share:.0%} of the frames show two diameters of its "
+        f"shaft (usual: {SHAFT.usual_share:.0%} or more); {(~shaft.known).sum()} of {len(shaft.known)} show too little "
+        f"of it and are left out; its direction has a standard deviation of {np.median(turns[:, :2].max(1)):.1f} "
+        f"degrees, its place of {np.median(shifts[:, :2]):.1f} mm across the view and {np.median(shifts[:, 2]):.1f} mm "
+        f"in depth; from the end of the shaft to the tip it is {shaft.working_length:.0f} mm{scale}"
+    )
     for note in shaft.notes:
         data.notes.add(f"instrument {item.name!r}, from video: {note}")
     if item.roll is None:
@@ -420,24 +380,12 @@ def find_in_video(
             "pose frames by hand (`neeco view CAPTURE --annotate`)"
         )
     poses = views.times[shaft.known], shaft.poses[shaft.known]
-    return replace(data, video_poses={**data.video_poses, item.name: poses}), shaft
-
-
-def _in_words(name: str, shaft: FoundShaft) -> str:
-    shifts = np.array([item.translation_mm for item in shaft.uncertainties])[shaft.known]
-    turns = np.array([item.rotation_deg[:2] for item in shaft.uncertainties])[shaft.known].max(1)
-    left_out = int((~shaft.known).sum())
-    scale = ""
-    if shaft.axes.scale_sd is not None:
-        scale = f"; the cameras' scale is known to {shaft.axes.scale_sd:.0%}, from the trocar"
-    return (
-        f"instrument {name!r} was found in the video: {shaft.share:.0%} of the frames show two diameters of its shaft "
-        f"(usual: {SHAFT.usual_share:.0%} or more); {left_out} of {len(shaft.known)} show too little of it and are "
-        "left out; "
-        f"its direction has a standard deviation of {np.median(turns):.1f} degrees, its place of "
-        f"{np.median(shifts[:, :2]):.1f} mm across the view and {np.median(shifts[:, 2]):.1f} mm in depth; from the "
-        f"end of the shaft to the tip it is {shaft.working_length:.0f} mm{scale}"
-    )
+    roll, joints = UNKNOWN_DEG if item.roll is None else SHAFT.roll_deg, dict.fromkeys(item.joints, SHAFT.reading_deg)
+    with_logs = [
+        replace(one, rotation_deg=(*one.rotation_deg[:2], roll), joints_deg=joints) for one in shaft.uncertainties
+    ]
+    data = replace(data, video_poses={**data.video_poses, item.name: poses})
+    return data, replace(shaft, uncertainties=tuple(with_logs))
 
 
 def on_masks(masks: np.ndarray, sfm: SfmResult, size: tuple[int, int]) -> np.ndarray:
@@ -450,26 +398,3 @@ def on_masks(masks: np.ndarray, sfm: SfmResult, size: tuple[int, int]) -> np.nda
     row, x, y = (sfm.observations[:, column] for column in (0, 2, 3))
     column = np.clip(x * width / size[0], 0, width - 1).astype(int)
     return np.asarray(around[row.astype(int), np.clip(y * height / size[1], 0, height - 1).astype(int), column] > 0)
-
-
-def uncertainties(item: InstrumentLogs, shaft: FoundShaft) -> tuple[Uncertainty, ...]:
-    """Return the uncertainty of every state, with that of logged rolls and joints."""
-    assert item.from_video is not None
-    values = shaft.uncertainties
-    if item.roll is not None:
-        values = tuple(replace(one, rotation_deg=(*one.rotation_deg[:2], SHAFT.roll_deg)) for one in values)
-    joints = dict.fromkeys(item.joints, SHAFT.reading_deg)
-    return tuple(replace(one, joints_deg=joints) for one in values)
-
-
-def instruments_of(recording: Recording, shaft: FoundShaft | None) -> tuple[Instrument, ...]:
-    """Return the instruments of a recording for its capture. found: the one that was found in the video."""
-    stated = []
-    for item in recording.instruments:
-        if item.placed:
-            limits = {name: source.limits for name, source in item.joints.items()}
-            in_video = None
-            if shaft is not None and item.from_video is not None:
-                in_video = FromVideo(item.from_video.shaft_diameter_mm, shaft.working_length)
-            stated.append(Instrument(item.name, limits, item.kinematics, from_video=in_video))
-    return tuple(stated)
