@@ -12,8 +12,8 @@ from pluswriter import frame_fields, write_sequence
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import Kind, format_of
-from neeco.ingest.readers.columns import PoseColumns
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.readers.sections import PoseColumns
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 

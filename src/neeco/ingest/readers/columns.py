@@ -1,17 +1,15 @@
-"""The meaning and unit of a log's columns: as a recording states them, or as common loggers name them."""
+"""The meaning and unit of a log's columns, as common loggers name them."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated
 
 from neeco.base.errors import NeecoError
-from neeco.capture.documents import Node, printable
 
 TRACKER_CLOCK = "em"  # default name of a tracker's clock
 VIDEO_CLOCK = "video"  # clock of the images, and of logs in the same file
@@ -33,71 +31,6 @@ _ALIASES = {
     "usec": "us", "microseconds": "us", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanoseconds": "ns",
 }  # fmt: skip
 _UNIT_SUFFIX = re.compile(r"^(?P<base>.*?)(?:[\s_\-/]+|[\s_]*[\[(]\s*)(?P<unit>[a-zµ°]+)\s*[\])]?$")
-
-
-def _unit(kind: str) -> Callable[[Node], str]:
-    """Return the parser of a unit."""
-
-    def parse(node: Node) -> str:
-        unit = canonical_unit(str(node.value))
-        if unit not in UNITS[kind]:
-            node.fail(f"{printable(node.value)} is not a unit of {kind}", f"use one of: {', '.join(UNITS[kind])}")
-        return unit
-
-    return parse
-
-
-@dataclass(frozen=True)
-class Units:
-    """Units stated in a recording; None: the column names state the unit."""
-
-    time: Annotated[str, _unit("time")] | None = None
-    length: Annotated[str, _unit("length")] | None = None
-    angle: Annotated[str, _unit("angle")] | None = None
-
-
-@dataclass(frozen=True)
-class PoseColumns:
-    """Columns of a pose log (tracker_from_sensor). Fields that are None are recognised from the header.
-
-    time: one column, or two (whole seconds, nanoseconds); position: x, y, z (not with a 4x4 matrix); rotation: as
-    many columns as `form` takes; euler_convention: as scipy names it, "XYZ" intrinsic, "xyz" extrinsic; state: a
-    column whose values `good` mark measured rows; rate_hz: frame rate if `time` counts frames; stream: name, if the
-    file has several; frame: frame of the poses, one of `frame_names.FRAMES` (CAMERA, BASE: a robot's base or a
-    tracker's frame); None: as stated by the file, else BASE.
-    """
-
-    path: Path
-    clock: str = TRACKER_CLOCK
-    _: KW_ONLY
-    time: tuple[str, ...] | None = None
-    position: tuple[str, ...] | None = None
-    rotation: tuple[str, ...] | None = None
-    form: str | None = None
-    euler_convention: str | None = None
-    state: str | None = None
-    good: tuple[str, ...] = ("OK",)
-    units: Units = field(default_factory=Units)
-    rate_hz: float | None = None
-    stream: str | None = None
-    frame: str | None = None
-
-
-@dataclass(frozen=True)
-class JointColumns:
-    """Columns of one joint sensor's log. calibration: table from counts to angles (None: the column holds angles);
-    limits: joint limits for the capture, rad; stream: name, if the file has several."""
-
-    path: Path
-    clock: str
-    _: KW_ONLY
-    time: tuple[str, ...] | None = None
-    value: str | None = None
-    units: Units = field(default_factory=Units)
-    rate_hz: float | None = None
-    calibration: Path | None = None
-    limits: tuple[float, float] | None = None
-    stream: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,9 +20,10 @@ from neeco.geometry.conventions import OPENCV
 from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Table, column_index, numbers, read_table, to_numbers
 from neeco.ingest.readers import columns as named
-from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
+from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, RecognisedColumns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_in, meaning_of, of_dvrk
 from neeco.ingest.readers.rows import Rows, drop_stuck, find_gaps, in_order, keep_measured, read_cells, read_times
+from neeco.ingest.readers.sections import JointColumns, PoseColumns
 
 _FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
 _FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?id)?")
@@ -78,10 +79,11 @@ class ReadingLog(SampleLog):
 
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
-    table = read_table(source.path, source.stream)
-    stated = _stated_columns(table, time=source.time, position=source.position, rotation=source.rotation)
+    table = read_table(source.file, source.stream)
+    names, (rotation, _) = source.columns, source.columns.rotation
+    stated = _stated_columns(table, time=names.time, position=names.position, rotation=rotation)
     recognised = named.recognise_pose(table.header, stated)
-    table = with_named_frame(table, (*(source.position or recognised.position or ()), *(source.rotation or ())))
+    table = with_named_frame(table, (*(names.position or recognised.position or ()), *(rotation or ())))
     frame = _frame_of(table, source)
     rows = Rows(table)
     keep_measured(rows, source, recognised.state)
@@ -169,12 +171,12 @@ def _frame_of(table: Table, source: PoseColumns) -> str:
 def read_reading_log(source: JointColumns) -> ReadingLog:
     """Read a joint sensor's log, through its calibration table when there is one. Raises NeecoError naming file,
     row or column, and remedy."""
-    table = read_table(source.path, source.stream)
-    stated = _stated_columns(table, time=source.time, value=None if source.value is None else (source.value,))
+    table = read_table(source.file, source.stream)
+    stated = _stated_columns(table, time=source.columns.time, value=source.columns.value)
     recognised, when = named.recognise_value(table.header, stated)
-    value = source.value or recognised
+    (value,) = source.columns.value or (recognised,)
     if value is None:
-        raise NeecoError(f"{source.path}: header: the joint's column is ambiguous; name it as columns.value")
+        raise NeecoError(f"{source.file}: header: the joint's column is ambiguous; name it as columns.value")
     rows = Rows(table)
     times = read_times(rows, source, when)
     values = read_cells(rows, (value,))[:, 0]
@@ -209,10 +211,12 @@ def _stated_columns(table: Table, **columns: tuple[str, ...] | None) -> dict[str
 def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
     """Return positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
     table = rows.table
-    rotation, form = (source.rotation, source.form) if source.rotation else (recognised.rotation, recognised.form)
+    rotation, form = source.columns.rotation
+    if rotation is None:
+        rotation, form = recognised.rotation, recognised.form
     if rotation is None or form is None:
         raise _unclear(table, recognised, "rotation", "qw, qx, qy, qz columns")
-    position = source.position or recognised.position
+    position = source.columns.position or recognised.position
     if form == MATRIX:
         position, read = tuple(rotation[i] for i in (3, 7, 11)), rotation
     elif position is None:
@@ -229,7 +233,7 @@ def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tu
     positions = positions * scale
     if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
         rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
-    quats, good = to_quaternions(form, turns, source.euler_convention, angle)
+    quats, good = to_quaternions(form, turns, source.columns.euler_convention, angle)
     expected = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
     rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {expected}; name the right columns")
     distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
