@@ -186,9 +186,7 @@ def test_truncated_images_are_refused(world, transforms):
 def test_of_compressed_sequences_the_poses_are_read(world, transforms, name):
     path = sequence(world.folder / name, frame_fields(TIMES, transforms), film(), compressed=True)
     np.testing.assert_allclose(read_pose_log(PoseColumns(path)).times, TIMES - START, atol=1e-7)
-    with pytest.raises(
-        NeecoError, match=r"images are compressed, .*; save the sequence without compression"
-    ):
+    with pytest.raises(NeecoError, match=r"images are compressed, .*; save the sequence without compression"):
         format_of(path).open_images(path)
     with pytest.raises(NeecoError, match=r"holds no images that can be read: images: its images are compressed"):
         write_template(path)
