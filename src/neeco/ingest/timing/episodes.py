@@ -261,25 +261,22 @@ class Episodes:
     def instrument_poses(self, name: str, times: np.ndarray, lag: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Return poses [N, 4, 4] of an instrument, logged `lag` s later, and whether they are known.
 
-        In the world's frame if its base is known, else in the tracker's.
+        In the world's frame if its base is known, else in the tracker's; of one found in the video, with its roll where
+        that is logged.
         """
         if name in self.video_poses:
-            return self._found_poses(name, times)
+            video_times, poses = self.video_poses[name]
+            if not len(video_times):
+                return np.full((len(times), 4, 4), np.nan), np.zeros(len(times), dtype=bool)
+            row = np.abs(times[:, None] - video_times).argmin(1)
+            valid = np.abs(times - video_times[row]) < EPISODES.same_instant
+            resampled = np.where(valid[:, None, None], poses[row], np.nan)
+            if name in self.parts[0].rolls:
+                roll, logged = self._gathered(times, lambda part, t: part.logged_readings(part.rolls[name], t), ())
+                resampled, valid = with_roll(resampled, np.nan_to_num(roll)), valid & logged
+            return resampled, valid
         poses, valid = self._gathered(times, lambda part, t: part.logged_poses(part.poses[name], t + lag), (4, 4))
         return (self.world_from_base[name] @ poses if name in self.world_from_base else poses), valid
-
-    def _found_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`instrument_poses` of one found in the video, with its roll where that is logged."""
-        video_times, poses = self.video_poses[name]
-        if not len(video_times):
-            return np.full((len(times), 4, 4), np.nan), np.zeros(len(times), dtype=bool)
-        row = np.abs(times[:, None] - video_times).argmin(1)
-        valid = np.abs(times - video_times[row]) < EPISODES.same_instant
-        resampled = np.where(valid[:, None, None], poses[row], np.nan)
-        if name in self.parts[0].rolls:
-            roll, logged = self._gathered(times, lambda part, t: part.logged_readings(part.rolls[name], t), ())
-            resampled, valid = with_roll(resampled, np.nan_to_num(roll)), valid & logged
-        return resampled, valid
 
     def states_at(self, times: np.ndarray) -> tuple[States, np.ndarray]:
         """Return every instrument's states, and whether all of them are known. All clocks must be known.
