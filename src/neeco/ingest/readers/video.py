@@ -186,6 +186,9 @@ class _Video(VideoSource):
     buffered: tuple[Any, ...] = ()  # all frames, decoded; empty where they are too large
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        from av.video.reformatter import Interpolation as Way
+
+        exact = Way.BICUBIC | Way.ACCURATE_RND | Way.FULL_CHR_H_INT | Way.BITEXACT
         remaining = {self.stamps[int(index)]: int(index) for index in indices}
         frames = self.buffered or _Scan(self.path, threads=self.threads, part=self.part).decoded()
         for number, frame in enumerate(frames):
@@ -193,7 +196,8 @@ class _Video(VideoSource):
                 return
             index = remaining.pop(number if self.numbered else frame.pts, None)
             if index is not None:
-                yield index, _rgb(frame)
+                # the converter's fast default is more than one level too dark, hence exact rounding
+                yield index, frame.to_ndarray(format="rgb24", interpolation=exact)
         if remaining:
             problem = f"frame {min(remaining.values())} can no longer be read; do not modify the file during a run"
             raise NeecoError(f"{self.path}: {problem}")
@@ -352,14 +356,6 @@ class _Scan:
         if self.turned:
             notes.append(f"states a rotation by {self.turned} degrees; its frames are used as stored")
         return notes
-
-
-def _rgb(frame: Any) -> np.ndarray:
-    """Return uint8 [H, W, 3]. The converter's fast default is more than one level too dark, hence exact rounding."""
-    from av.video.reformatter import Interpolation
-
-    exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.BITEXACT
-    return frame.to_ndarray(format="rgb24", interpolation=exact)
 
 
 def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[str]) -> tuple[list[Path], np.ndarray]:
