@@ -84,7 +84,16 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     stated = _stated_columns(table, time=names.time, position=names.position, rotation=rotation)
     recognised = named.recognise_pose(table.header, stated)
     table = with_named_frame(table, (*(names.position or recognised.position or ()), *(rotation or ())))
-    frame = _frame_of(table, source)
+    frame = source.frame or table.frame or named.BASE
+    if source.frame is None and table.meaning is not None and table.frame is None:
+        raise NeecoError(f"{table.where}: frame: {table.meaning.question}")
+    axes = CAMERA_FRAMES.get(table.frame or "")
+    if source.frame == named.CAMERA and axes is not None and axes.words != OPENCV.words:
+        raise NeecoError(
+            f"{table.where}: frame: {named.CAMERA} means OpenCV's axes ({OPENCV.words}), but the file's frame is "
+            f"{table.stated_in or axes.name} with axes {axes.words}; remove `frame` (or set frame: "
+            f"{axes.name}), or set frame: {OPENCV.name} if the poses are already converted"
+        )
     rows = Rows(table)
     keep_measured(rows, source, recognised.state)
     times = read_times(rows, source, recognised)
@@ -99,7 +108,11 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     gaps = find_gaps(rows, times)
     if frame != named.BASE and source.frame is None and table.meaning is not None:
         rows.repairs.append(f"poses are expressed in {table.meaning.why}")
-    positions, quats = in_opencv(frame, positions[order], quats)
+    positions = positions[order]
+    turn = CAMERA_FRAMES[frame].opencv_from_own[:3, :3] if frame != named.BASE else np.eye(3)
+    if not np.array_equal(turn, np.eye(3)):  # from the camera's own axes to OpenCV's
+        turned = Rotation.from_matrix(turn) * Rotation.from_quat(quats, scalar_first=True)
+        positions, quats = positions @ turn.T, continuous(turned.as_quat(scalar_first=True))[0]
     return PoseLog(
         table.path,
         source.clock,
@@ -114,16 +127,6 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     )
 
 
-def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert positions [T, 3] and quaternions [T, 4] wxyz from a camera's frame (`frame_names.CAMERA_FRAMES`) to
-    OpenCV's axes; poses in a base are unchanged."""
-    turn = CAMERA_FRAMES[frame].opencv_from_own[:3, :3] if frame != named.BASE else np.eye(3)
-    if np.array_equal(turn, np.eye(3)):
-        return positions, quats
-    turned = Rotation.from_matrix(turn) * Rotation.from_quat(quats, scalar_first=True)
-    return positions @ turn.T, continuous(turned.as_quat(scalar_first=True))[0]
-
-
 def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
     """Return the table with the meaning of its poses' frame: by the column names, else by the file, else by a column of
     frame names, else by the file's name. Raises NeecoError if that column holds several."""
@@ -131,41 +134,16 @@ def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
     meaning = meaning_in(columns, dvrk=dvrk)
     if meaning is None and (table.meaning is not None or table.stream is not None):
         return table
-    names = [] if meaning is not None else _frame_names(table)
-    if names:
-        return replace(table, stated_in=names[0], meaning=meaning_of(names[0], dvrk=dvrk))
-    return replace(table, meaning=meaning or meaning_in([table.path.stem], dvrk=dvrk))
-
-
-def _frame_names(table: Table) -> list[str]:
-    """Return the name in a column such as `header.frame_id`; [] if there is none, or it numbers or names images."""
-    for index, name in enumerate(table.header):
-        if table.rows.dtype != object or not _FRAME_COLUMN.fullmatch(name.strip().lower()):
+    for index, name in enumerate(table.header if meaning is None and table.rows.dtype == object else ()):
+        if not _FRAME_COLUMN.fullmatch(name.strip().lower()):
             continue
         names = sorted({cell.strip("/\"' ") for cell in table.rows[:, index]} - {""})
         if len(names) > 1 and any(meaning_of(cell).frame != named.BASE for cell in names):
             listed = ", ".join(names[:4])
             raise NeecoError(f"{table.where}: {name}: poses are in several frames ({listed}); export one only")
-        if len(names) == 1 and np.isnan(to_numbers(np.array(names, object))[0]):
-            return names
-    return []
-
-
-def _frame_of(table: Table, source: PoseColumns) -> str:
-    """Return the frame of poses stated by the recording, else by the file. Raises NeecoError if neither states one, or
-    they contradict each other."""
-    if source.frame is None:
-        if table.meaning is not None and table.frame is None:
-            raise NeecoError(f"{table.where}: frame: {table.meaning.question}")
-        return table.frame or named.BASE
-    axes = CAMERA_FRAMES.get(table.frame or "")
-    if source.frame == named.CAMERA and axes is not None and axes.words != OPENCV.words:
-        raise NeecoError(
-            f"{table.where}: frame: {named.CAMERA} means OpenCV's axes ({OPENCV.words}), but the file's frame is "
-            f"{table.stated_in or axes.name} with axes {axes.words}; remove `frame` (or set frame: "
-            f"{axes.name}), or set frame: {OPENCV.name} if the poses are already converted"
-        )
-    return source.frame
+        if len(names) == 1 and np.isnan(to_numbers(np.array(names, object))[0]):  # else it numbers or names images
+            return replace(table, stated_in=names[0], meaning=meaning_of(names[0], dvrk=dvrk))
+    return replace(table, meaning=meaning or meaning_in([table.path.stem], dvrk=dvrk))
 
 
 def read_reading_log(source: JointColumns) -> ReadingLog:
@@ -229,8 +207,14 @@ def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tu
     angle = 1.0
     if form in (EULER, ROTATION_VECTOR):
         angle = named.scale_of(table.where, rotation, "angle", source.units.angle, None, "")
-    positions, turns = _parts(table, form, read_cells(rows, read))
-    positions = positions * scale
+    cells = read_cells(rows, read)
+    positions, turns = cells[:, :3] * scale, cells[:, 3:]
+    if form == MATRIX:
+        top = cells[:, :12].reshape(-1, 3, 4)
+        positions, turns = top[:, :, 3] * scale, top[:, :, :3].reshape(-1, 9)
+        last, column = cells[:, 12:], cells[:, 3::4][:, :3]
+        if cells.shape[1] == 16 and np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
+            raise NeecoError(f"{table.where}: matrix: is in column-major order; list its columns row by row")
     if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
         rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
     quats, good = to_quaternions(form, turns, source.columns.euler_convention, angle)
@@ -281,18 +265,6 @@ def _unclear(table: Table, recognised: RecognisedColumns, what: str, expected: s
     listed = repr(", ".join(table.header[:12])[:120])
     problem = f"no {expected} found among {listed}; name them in the recording under columns: {names}"
     return NeecoError(f"{table.where}: header: {f'{what}: {reason}' if reason else problem}")
-
-
-def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions [R, 3] in the file's unit and rotation cells [R, C]."""
-    if form != MATRIX:
-        return cells[:, :3], cells[:, 3:]
-    rows = cells[:, :12].reshape(-1, 3, 4)
-    if cells.shape[1] == 16:
-        last, column = cells[:, 12:], cells.reshape(-1, 4, 4)[:, :3, 3]
-        if np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
-            raise NeecoError(f"{table.where}: matrix: is in column-major order; list its columns row by row")
-    return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
 
 
 def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndarray, np.ndarray]:
