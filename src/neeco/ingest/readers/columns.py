@@ -139,7 +139,8 @@ def recognise_time(header: Sequence[str]) -> RecognisedColumns:
 def recognise_pose(header: Sequence[str], named: _NamedColumns = _NOTHING) -> RecognisedColumns:
     """Return the columns of time, position and rotation in a pose log, each with one meaning. named: columns that the
     recording names, by meaning, which are not searched."""
-    free = _left(header, named)
+    taken = {name for names in named.values() for name in names}
+    free = [name for name in header if name not in taken]
     when = RecognisedColumns() if "time" in named else recognise_time(free)
     free = [name for name in free if name not in (when.time or ())]
     unclear: dict[str, str] = {}
@@ -196,7 +197,8 @@ def _first_choice(plain: Mapping[str, str], choices: _Choices) -> tuple[list[str
 def recognise_value(header: Sequence[str], named: _NamedColumns = _NOTHING) -> tuple[str | None, RecognisedColumns]:
     """Return the only column, besides time, that can be a joint reading; None if there is none or several. named: as
     for `recognise_pose`."""
-    header = _left(header, named)
+    taken = {name for names in named.values() for name in names}
+    header = [name for name in header if name not in taken]
     when = RecognisedColumns() if "time" in named else recognise_time(header)
     counters = {"frame", "seq", "index", "header_seq", "field_header_seq", "frame_id", "header_frame_id", "state"}
     values = [name for name in header if name and name not in (when.time or ()) and _plain(name) not in counters]
@@ -214,12 +216,6 @@ def joint_columns(header: Sequence[str], bodies: Mapping[str, Sequence[str]]) ->
         moving = [name for name in columns if not _JOINT.search("_".join(_plain(name).split("_")[start:]))]
         posing |= {*(pose.position or ()), *(pose.rotation or ()), *moving}
     return [name for name in header if _JOINT.search(name) and name not in posing]
-
-
-def _left(header: Sequence[str], named: _NamedColumns) -> list[str]:
-    """Return the columns that have no meaning yet."""
-    taken = {name for names in named.values() for name in names}
-    return [name for name in header if name not in taken]
 
 
 def quaternion_form(names: Sequence[str]) -> str | None:
