@@ -57,29 +57,24 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
     require_file(source, "a calibration as YAML, XML or JSON")
     document = read_calibration(source)
     cameras = () if isinstance(document, dict) and "fl_x" in document else cameras_in(source, document)
-    if source.suffix.lower() == ".json" and not cameras:
-        return _nerfstudio(source, document)
-    if not cameras:
+    if cameras:
+        return lens_of(source, cameras[0])
+    if source.suffix.lower() != ".json":
         problem = "camera_matrix: missing" if isinstance(document, dict) else "no keys"
         raise NeecoError(f"{source}: {problem}; expected {EXPECTED}")
-    return lens_of(source, cameras[0])
-
-
-def _nerfstudio(path: Path, document: Any) -> Lens:
     if not isinstance(document, dict):
-        raise NeecoError(f"{path}: expected an object with fl_x, fl_y, cx, cy")
-    size = image_size(path, document.get("w"), document.get("h"))
-    missing = [key for key in ("fl_x", "cx", "cy") if key not in document]
-    if missing:
-        raise NeecoError(f"{path}: {missing[0]}: missing; give fl_x, fl_y, cx, cy (and k1, k2, p1, p2 if distorted)")
+        raise NeecoError(f"{source}: expected an object with fl_x, fl_y, cx, cy")
+    size = image_size(source, document.get("w"), document.get("h"))
+    if missing := [key for key in ("fl_x", "cx", "cy") if key not in document]:
+        raise NeecoError(f"{source}: {missing[0]}: missing; give fl_x, fl_y, cx, cy (and k1, k2, p1, p2 if distorted)")
     values = [document["fl_x"], document.get("fl_y", document["fl_x"]), document["cx"], document["cy"]]
-    with faults_in(path):
-        stated = stated_distortion(Node(document, str(path)).child)
-    lens = checked_lens(path, values, (), size)
+    with faults_in(source):
+        stated = stated_distortion(Node(document, str(source)).child)
+    lens = checked_lens(source, values, (), size)
     try:
         return replace(lens, distortion=opencv_distortion(stated.model, stated.coefficients, lens.intrinsics, size))
     except NeecoError as error:
-        raise NeecoError(f"{path}: distortion: {error}") from None
+        raise NeecoError(f"{source}: distortion: {error}") from None
 
 
 def lens_of(where: Path | str, camera: CameraNumbers) -> Lens:

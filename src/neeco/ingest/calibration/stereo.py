@@ -65,8 +65,11 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     """
     path = Path(path)
     if path.is_dir():
-        left, right = _pair_of_files(path)
-        return from_projections(_one_camera(left), _one_camera(right))
+        files = [file for file in visible_entries(path) if file.suffix.lower() in (".yaml", ".yml")]
+        left, right = ([file for file in files if side in file.stem.lower()] for side in ("left", "right"))
+        if len(left) != 1 or len(right) != 1:
+            raise NeecoError(f"{path}: holds no one left and one right calibration; name the file of one as left.yaml")
+        return from_projections(_one_camera(left[0]), _one_camera(right[0]))
     require_file(path, EXPECTED)
     document = _of_ini(path) if path.suffix.lower() == ".ini" else read_calibration(path)
     if not isinstance(document, dict):
@@ -77,7 +80,10 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     if len(cameras) == 2:
         return _two_cameras(path, document, *cameras)
     if cameras and first_of(cameras[0].keys, _PROJECTION) is not None:
-        return from_projections(RosCamera(path, cameras[0]), _one_camera(_right_beside(path)))
+        for one, other in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
+            if one in path.name and (beside := path.with_name(path.name.replace(one, other))).is_file():
+                return from_projections(RosCamera(path, cameras[0]), _one_camera(beside))
+        raise NeecoError(f"{path}: is one camera's; put the right camera's next to it, as left.yaml and right.yaml")
     raise NeecoError(f"{path}: camera matrices: not there for two cameras; expected {EXPECTED}")
 
 
@@ -201,22 +207,6 @@ def _one_camera(path: Path) -> RosCamera:
     if not cameras:
         raise NeecoError(f"{path}: camera_matrix: missing; expected the camera_info of one camera, as ROS saves it")
     return RosCamera(path, cameras[0])
-
-
-def _pair_of_files(folder: Path) -> tuple[Path, Path]:
-    files = [file for file in visible_entries(folder) if file.suffix.lower() in (".yaml", ".yml")]
-    left, right = ([file for file in files if side in file.stem.lower()] for side in ("left", "right"))
-    if len(left) != 1 or len(right) != 1:
-        raise NeecoError(f"{folder}: holds no one left and one right calibration; name the file of one as left.yaml")
-    return left[0], right[0]
-
-
-def _right_beside(path: Path) -> Path:
-    for left, right in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
-        other = path.with_name(path.name.replace(left, right))
-        if left in path.name and other.is_file():
-            return other
-    raise NeecoError(f"{path}: is one camera's; put the right camera's next to it, as left.yaml and right.yaml")
 
 
 def _numbers(path: Path | str, document: Mapping[str, Any], names: tuple[str, ...], count: int) -> np.ndarray:

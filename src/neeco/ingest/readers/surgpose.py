@@ -48,10 +48,10 @@ class SurgPose(RecordingFormat):
         poses, joints = _read(path)
         count = max(len(frames) for frames, _ in poses.values())
         stream = partial(Stream, rate_hz=FRAMES_PER_SECOND)
-        # the left camera's are the frames; others are listed
-        streams = [
-            stream(name, Kind.IMAGES, "video", count, offered=number == 0) for number, name in enumerate(_videos(path))
-        ]
+        videos = [file.relative_to(path).as_posix() for file in visible_entries(path, "**/*_video.mp4")]
+        videos.sort(key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
+        # the left camera's in visible light are the frames; others are listed
+        streams = [stream(name, Kind.IMAGES, "video", count, offered=number == 0) for number, name in enumerate(videos)]
         for name, (frames, _) in sorted(poses.items()):
             streams.append(stream(name, Kind.POSES, "poses", len(frames), body=name, hints=(DVRK_HINT,)))
         for name, (frames, values) in sorted(joints.items()):
@@ -88,12 +88,6 @@ class SurgPose(RecordingFormat):
             return None  # videos of different light, or two left cameras
         calibrations = visible_entries(path, "*.ini")
         return read_stereo(calibrations[0]) if len(calibrations) == 1 else None
-
-
-def _videos(path: Path) -> list[str]:
-    """Return the videos, the left one in visible light first."""
-    videos = [file.relative_to(path).as_posix() for file in visible_entries(path, "**/*_video.mp4")]
-    return sorted(videos, key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
 
 
 def _read(path: Path) -> tuple[_ByArm, _ByArm]:
