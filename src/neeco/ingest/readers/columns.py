@@ -144,10 +144,25 @@ def recognise_pose(header: Sequence[str], named: _NamedColumns = _NOTHING) -> Re
     when = RecognisedColumns() if "time" in named else recognise_time(free)
     free = [name for name in free if name not in (when.time or ())]
     unclear: dict[str, str] = {}
-    matrix, position, rotation, form = None, None, None, None
-    if "rotation" not in named:
-        matrix = _matrix(free)
-        rotation, form = _rotation(free, matrix, unclear)
+    position, rotation, form = None, None, None
+    matrix = None if "rotation" in named else _matrix(free)
+    if matrix:
+        rotation, form = matrix, ROTATION_MATRIX if len(matrix) == 9 else MATRIX
+    elif "rotation" in named:
+        pass
+    elif rotation := _group(free, _QUATERNIONS, "length", "quaternion", unclear):
+        form = QUATERNION_WXYZ
+    elif rotation := _group(free, _ROTATION_VECTORS, "angle", "rotation", unclear):
+        form = ROTATION_VECTOR
+    else:
+        for angles in _EULER_ANGLES:
+            if _group(free, [(True, angles)], "angle", "rotation", {}):
+                unclear["rotation"] = (
+                    f"{', '.join(angles)} are ambiguous; name them under columns.euler with an euler_convention "
+                    "(or under columns.rotation_vector)"
+                )
+        if {"q0", "q1", "q2", "q3"} <= {_plain(name) for name in free}:
+            unclear["rotation"] = "the order of q0, q1, q2, q3 is ambiguous; use columns.quaternion_wxyz or _xyzw"
     if "position" not in named and not (matrix and len(matrix) > 9):
         position = _group(free, _POSITIONS, "length", "position", unclear)
     if shared := [name for name in position or () if name in (rotation or ())]:
@@ -238,26 +253,6 @@ def _by_plain_name(header: Sequence[str], kind: str) -> dict[str, str]:
     for name in header:
         plain.setdefault(_plain(split_unit(name, kind)[0]), name)
     return plain
-
-
-def _rotation(
-    header: Sequence[str], matrix: tuple[str, ...] | None, unclear: dict[str, str]
-) -> tuple[tuple[str, ...] | None, str | None]:
-    if matrix:
-        return matrix, ROTATION_MATRIX if len(matrix) == 9 else MATRIX
-    if quaternion := _group(header, _QUATERNIONS, "length", "quaternion", unclear):
-        return quaternion, QUATERNION_WXYZ
-    if vector := _group(header, _ROTATION_VECTORS, "angle", "rotation", unclear):
-        return vector, ROTATION_VECTOR
-    for angles in _EULER_ANGLES:
-        if _group(header, [(True, angles)], "angle", "rotation", {}):
-            unclear["rotation"] = (
-                f"{', '.join(angles)} are ambiguous; name them under columns.euler with an euler_convention "
-                "(or under columns.rotation_vector)"
-            )
-    if {"q0", "q1", "q2", "q3"} <= {_plain(name) for name in header}:
-        unclear["rotation"] = "the order of q0, q1, q2, q3 is ambiguous; use columns.quaternion_wxyz or _xyzw"
-    return None, None
 
 
 def _group(

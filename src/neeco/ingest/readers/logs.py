@@ -159,7 +159,19 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     times = read_times(rows, source, when)
     values = read_cells(rows, (value,))[:, 0]
     if source.calibration is not None:
-        values = _calibrated(rows, value, values, source.calibration, source.units.angle)
+        # monotone interpolation of the table (PCHIP, Fritsch & Carlson 1980): readings just outside it become its end
+        counts, angles = read_calibration(source.calibration, source.units.angle)
+        (low, high), title = (counts[0], counts[-1]), source.calibration.name
+        values = np.where(rows.keep, values, low)
+        excess = np.maximum(low - values, values - high)
+        outside = excess > SETTINGS.clamped_share * (high - low)
+        if (clamped := (excess > 0) & ~outside).any():
+            by = f"{low:g} to {high:g}, by at most {excess[clamped].max():g}"
+            words = f"{counted(int(clamped.sum()), 'row')} with {value} just outside the table {title} ({by})"
+            rows.repairs.append(f"{words}: clamped to its end ({table.list_rows(table.lines[clamped])})")
+        values = np.asarray(PchipInterpolator(counts, angles)(np.clip(values, low, high)))
+        reason = f"{value} is far outside the calibration table {title}"
+        rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
     else:
         hint = " (counts need a table as `calibration`)"
         values = values * named.scale_of(table.where, (value,), "angle", source.units.angle, None, hint)
@@ -302,22 +314,3 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     if np.abs(angles).max() > SETTINGS.max_angle:
         raise NeecoError(f"{path}: {angle_name}: exceeds two turns; correct the column's unit")
     return counts, angles
-
-
-def _calibrated(rows: Rows, name: str, readings: np.ndarray, path: Path, angle_unit: str | None) -> np.ndarray:
-    """Return angles [R] rad of a column of counts, by monotone interpolation of the table (PCHIP, Fritsch & Carlson
-    1980). Readings just outside the table are clamped to its end, with a note; rows farther outside are dropped."""
-    counts, angles = read_calibration(path, angle_unit)
-    low, high = counts[0], counts[-1]
-    readings = np.where(rows.keep, readings, low)
-    excess = np.maximum(low - readings, readings - high)
-    outside = excess > SETTINGS.clamped_share * (high - low)
-    values = PchipInterpolator(counts, angles)(np.clip(readings, low, high))
-    clamped = (excess > 0) & ~outside
-    if clamped.any():
-        by = f"{low:g} to {high:g}, by at most {excess[clamped].max():g}"
-        clamped_rows = f"{counted(int(clamped.sum()), 'row')} with {name} just outside the table {path.name} ({by})"
-        rows.repairs.append(f"{clamped_rows}: clamped to its end ({rows.table.list_rows(rows.table.lines[clamped])})")
-    reason = f"{name} is far outside the calibration table {path.name}"
-    rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
-    return np.asarray(values)

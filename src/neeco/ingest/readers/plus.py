@@ -129,7 +129,16 @@ def read_sequence(path: Path) -> FrameSequence:
         raise NeecoError(f"{path}: {problem}; give a PLUS sequence, or another log")
     sizes = _integers(path, plain, "sizes" if is_nrrd else "DimSize")
     usual = "" if is_nrrd else " ".join(["domain"] * (len(sizes) - 1) + ["list"])
-    (width, height), count, channels = _dimensions(path, sizes, plain.get("kinds", usual).lower().split())
+    kinds, channels = plain.get("kinds", usual).lower().split(), 1
+    if len(kinds) == len(sizes) and (kinds[0] == "vector" or kinds[0].endswith("color")):
+        channels, sizes, kinds = sizes[0], sizes[1:], kinds[1:]
+    if kinds[-1:] not in (["list"], ["time"]) or kinds[:-1] != ["domain"] * (len(sizes) - 1):
+        raise _fault(path, "kinds: expected domain ... list, with the frames last")
+    if len(sizes) not in (3, 4) or (len(sizes) == 4 and sizes[2] > 1):
+        raise _fault(path, f"{sizes} is not a sequence of images, expected width, height, frames")
+    if max(sizes[:2]) > LIMITS.side_px or sizes[-1] > LIMITS.frames:
+        raise _fault(path, f"{sizes} is too large")
+    width, height, count = sizes[0], sizes[1], sizes[-1]
     if "elementnumberofchannels" in plain:
         channels = _integers(path, plain, "ElementNumberOfChannels")[0]
     packed = plain.get("encoding", "raw").lower() != "raw" or plain.get("compresseddata", "").lower() == "true"
@@ -190,20 +199,6 @@ def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> tuple[dict[str,
     if stream.read(1) or not plain.keys() & {"data file", "datafile"}:
         raise _fault(path, "its header has no end")
     return plain, frames, stream.tell()
-
-
-def _dimensions(path: Path, sizes: list[int], kinds: list[str]) -> tuple[tuple[int, int], int, int]:
-    """Return (width, height), the number of frames, and channels; frames must be the last axis."""
-    channels = 1
-    if len(kinds) == len(sizes) and kinds and (kinds[0] == "vector" or kinds[0].endswith("color")):
-        channels, sizes, kinds = sizes[0], sizes[1:], kinds[1:]
-    if kinds != [*["domain"] * (len(sizes) - 1), kinds[-1] if kinds else ""] or kinds[-1] not in ("list", "time"):
-        raise _fault(path, "kinds: expected domain ... list, with the frames last")
-    if len(sizes) not in (3, 4) or (len(sizes) == 4 and sizes[2] > 1):
-        raise _fault(path, f"{sizes} is not a sequence of images, expected width, height, frames")
-    if max(sizes[:2]) > LIMITS.side_px or sizes[-1] > LIMITS.frames:
-        raise _fault(path, f"{sizes} is too large")
-    return (sizes[0], sizes[1]), sizes[-1], channels
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -293,9 +293,22 @@ class Episodes:
             for joint in self.parts[0].joints[name]:
 
                 def of(part: Episode, local: np.ndarray, name: str = name, joint: str = joint) -> Any:
-                    log = part.joints[name][joint]
+                    log, span = part.joints[name][joint], limits[name][joint]
                     values, valid = part.logged_readings(log, local)
-                    return self._within_limits(part, log, limits[name][joint], values), valid
+                    if span is None:
+                        return values, valid
+                    clipped = np.clip(values, *span)
+                    excess = float(np.nanmax(np.abs(values - clipped), initial=0.0))
+                    beyond = f"{np.degrees(excess):.1f} deg beyond the"
+                    if excess > EPISODES.limit_slack:
+                        raise NeecoError(
+                            f"{log.path}: readings go {beyond} joint's limits {span[0]:g} .. {span[1]:g} rad; correct "
+                            "`limits` in the recording, or the calibration"
+                        )
+                    if excess > 0:
+                        note = f"{log.path.name}: readings up to {beyond} limits are held at them"
+                        self.notes.add(note, self.parts.index(part))
+                    return clipped, valid
 
                 readings[joint], valid = self._gathered(times, of, ())
                 usable &= valid
@@ -334,27 +347,6 @@ class Episodes:
         for part, rows, local in self._each(times):
             values[rows], valid[rows] = of(part, local)
         return values, valid
-
-    def _within_limits(
-        self, part: Episode, log: ReadingLog, limits: tuple[float, float] | None, values: np.ndarray
-    ) -> np.ndarray:
-        """Return readings [N] rad clipped to the joint's stated limits. Raises NeecoError if they exceed these by more
-        than noise."""
-        if limits is None:
-            return values
-        clipped = np.clip(values, *limits)
-        excess = float(np.nanmax(np.abs(values - clipped), initial=0.0))
-        if excess > EPISODES.limit_slack:
-            raise NeecoError(
-                f"{log.path}: readings go {np.degrees(excess):.1f} deg beyond the joint's limits {limits[0]:g} .. "
-                f"{limits[1]:g} rad; correct `limits` in the recording, or the calibration"
-            )
-        if excess > 0:
-            self.notes.add(
-                f"{log.path.name}: readings up to {np.degrees(excess):.1f} deg beyond the limits are held at them",
-                self.parts.index(part),
-            )
-        return clipped
 
 
 def with_roll(poses: np.ndarray, roll: np.ndarray) -> np.ndarray:
