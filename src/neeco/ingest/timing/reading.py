@@ -10,7 +10,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_lengths, format_of
+from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_counts, format_of
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording.base import STATED
@@ -118,8 +118,12 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
         notes.contradict("calibration", _check_partner(recording), severe=False, episode=episode)
     for log in (log for log in logs if log.clock == VIDEO_CLOCK):
         if log.image_hz is not None:  # its rows belong to images one by one
-            rows = round(float(log.times[-1]) * log.image_hz) + 1
-            for note in compare_lengths(video.path, video, rows, log.image_hz):
+            rows, images = (round(float(seconds) * log.image_hz) + 1 for seconds in (log.times[-1], length))
+            remedy = "give the video of this log"
+            if images != rows and abs(len(video.times) - rows) <= 1:
+                remedy = f"its {len(video.times)} images match the states: set `fps: {log.image_hz:g}`"
+            noun = f"states at {log.image_hz:g} Hz"
+            for note in compare_counts(video.path, images, rows, noun, MAX_UNLIKE, remedy):
                 notes.add(note, episode)
         elif log.path != recording.file:
             beyond = max(0.0, log.times[-1] - video.times[-1]) + max(0.0, video.times[0] - log.times[0])
