@@ -161,57 +161,52 @@ def _described(path: Path, state: tuple[object, ...]) -> DataSet:
         fps = info.child("fps").number(above=0, below=1e5)
         data_path = info.child("data_path").text("correct it")
         chunks_size = info.child("chunks_size").integer(1) if info.has("chunks_size") else 1000
-    films = [key for key, feature in feature_of.items() if feature.dtype == "video"]
-    records = _records_3(path, films) if match[2] is not None else _records_2(path)
-    if not records:
-        raise NeecoError(f"{path}: has no episodes; download the data set again, with all of meta")
+    number, films = 2 if match[2] is None else 3, [key for key, one in feature_of.items() if one.dtype == "video"]
     return DataSet(
         path=path,
-        version=2 if match[2] is None else 3,
+        version=number,
         fps=fps,
         features=feature_of,
         data_path=data_path,
         video_path=str(info.child("video_path").value or ""),
         chunks_size=chunks_size,
-        records=records,
+        records=_records_of(path, number, films),
     )
 
 
-def _records_2(path: Path) -> dict[int, Record]:
-    """Return the length of each episode, by its number."""
-    file, records = path / EPISODES_2, dict[int, Record]()
-    if file.exists():
-        require_inside(file, _boundary(path))
-    for line, text in enumerate(read_text(file, "episodes, one a line").splitlines(), 1):
-        if text.strip():
-            record, where = None, f"{file}: line {line}"
+def _records_of(path: Path, version: int, films: Sequence[str]) -> dict[int, Record]:
+    """Return the length of each episode, of version 3 with the files of its rows and images, by its number. Raises
+    NeecoError."""
+    stated: list[tuple[str, dict[str, Any]]] = []  # with their places
+    if version == 2:
+        file = path / EPISODES_2
+        if file.exists():
+            require_inside(file, _boundary(path))
+        for line, text in enumerate(read_text(file, "episodes, one a line").splitlines(), 1):
+            record = None
             with suppress(ValueError, RecursionError):
                 record = json.loads(text)
-            number, length = (record.get(name) if isinstance(record, dict) else None for name in LENGTHS)
-            records[_count(where, number)] = {"length": _count(where, length)}
-    return records
-
-
-def _records_3(path: Path, films: Sequence[str]) -> dict[int, Record]:
-    """Return the length of each episode and the files of its rows and images, by its number."""
-    columns = [*LENGTHS, "data/chunk_index", "data/file_index"]
-    of_films = [f"videos/{key}/{name}" for key in films for name in FILM_COLUMNS]
+            record = record if isinstance(record, dict) else {}
+            if text.strip():
+                stated.append((f"{file}: line {line}", {name: record.get(name) for name in LENGTHS}))
+    else:
+        for file in visible_entries(path / EPISODES_3, "chunk-*/*.parquet"):
+            stored = parquet_names(require_inside(file, _boundary(path)))
+            of_films = [f"videos/{key}/{name}" for key in films for name in FILM_COLUMNS]
+            names = [*LENGTHS, "data/chunk_index", "data/file_index", *(name for name in of_films if name in stored)]
+            table = read_columns(file, dict.fromkeys(names, 1))
+            for row, values in enumerate(np.concatenate([table[name] for name in names], 1).tolist()):
+                stated.append((f"{file}: row {row}", dict(zip(names, values, strict=True))))
     records: dict[int, Record] = {}
-    for file in visible_entries(path / EPISODES_3, "chunk-*/*.parquet"):
-        stored = parquet_names(require_inside(file, _boundary(path)))
-        names = [*columns, *(name for name in of_films if name in stored)]
-        table = read_columns(file, dict.fromkeys(names, 1))
-        for row, values in enumerate(np.concatenate([table[name] for name in names], 1).tolist()):
-            record = dict(zip(names, values, strict=True))
-            counts = {name: _count(f"{file}: row {row}", value) for name, value in record.items() if "time" not in name}
-            records[counts["episode_index"]] = {**record, **counts}
+    for where, record in stated:
+        counts = {name: value for name, value in record.items() if "time" not in name}
+        for value in counts.values():
+            if type(value) not in (int, float) or not 0 <= value < 1e9 or value != int(value):  # NaN compares false
+                raise NeecoError(f"{where}: expected an episode with episode_index and length; download it again")
+        records[int(counts["episode_index"])] = record | {name: int(value) for name, value in counts.items()}
+    if not records:
+        raise NeecoError(f"{path}: has no episodes; download the data set again, with all of meta")
     return records
-
-
-def _count(where: str, value: Any) -> int:
-    if type(value) not in (int, float) or not 0 <= value < 1e9 or value != int(value):  # NaN compares false
-        raise NeecoError(f"{where}: expected an episode with episode_index and length; download it again")
-    return int(value)
 
 
 def parquet_names(path: Path) -> list[str]:
