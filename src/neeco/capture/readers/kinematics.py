@@ -261,8 +261,13 @@ def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body:
         raise NeecoError(f"{path}: joint {joint.name!r}: its axis is not a direction; give three numbers, not all 0")
     axis = origin[:3, :3] @ (axis / length)
     unit = MM if kind == PRISMATIC else 1.0
-    limit = joint.limit
-    limits = None if limit is None or joint.type == "continuous" else _limits(limit, unit, joint.name, path)
+    limits = None
+    if joint.limit is not None and joint.type != "continuous":
+        low, high = unit * float(joint.limit.lower or 0.0), unit * float(joint.limit.upper or 0.0)
+        if not (low == high == 0.0 or (math.isfinite(low) and math.isfinite(high) and low < high)):
+            problem = f"its limits {low:g} to {high:g} are not a range; correct them"
+            raise NeecoError(f"{path}: joint {joint.name!r}: {problem}")
+        limits = None if low == high == 0.0 else (low, high)  # zeros are URDF's default: no limits
     driver, gain, offset = joint.name, 1.0, 0.0
     if joint.mimic is not None:
         driver = joint.mimic.joint
@@ -275,12 +280,3 @@ def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body:
         offset = unit * float(joint.mimic.offset or 0.0)
     value = {names.get(driver, driver): gain}
     return Link(joint.child, joint.parent, kind, origin, axis, value, offset=offset, limits=limits, body=body)
-
-
-def _limits(limit: Any, unit: float, name: str, path: Path) -> tuple[float, float] | None:
-    low, high = unit * float(limit.lower or 0.0), unit * float(limit.upper or 0.0)
-    if low == high == 0.0:  # URDF's default: no limits
-        return None
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise NeecoError(f"{path}: joint {name!r}: its limits {low:g} to {high:g} are not a range; correct them")
-    return low, high

@@ -126,7 +126,14 @@ def read_cells(path: Path) -> Cells:
     comment = np.array([_COMMENT.match(text) is not None for _, text in texts], dtype=bool)
     if comment.all():
         raise NeecoError(f"{path}: holds only comments; expected {EXPECTED}")
-    sign = _delimiter([text for (_, text), is_comment in zip(texts, comment, strict=True) if not is_comment])
+    # the delimiter of the rows, by the second half of the file
+    plain = [text for (_, text), is_comment in zip(texts, comment, strict=True) if not is_comment]
+    sample = plain[len(plain) // 2 :][: LIMITS.sample_lines]
+    sign = max(",;\t", key=lambda sign: sum(row.count(sign) for row in sample))
+    sign = sign if any(sign in row for row in sample) else " "
+    for delimiter in ";\t":  # before commas, which may be those of decimals then
+        count, n_similar = Counter(row.count(delimiter) for row in sample).most_common(1)[0]
+        sign = delimiter if count and n_similar > 0.9 * len(sample) else sign
     lines = [_COMMENT.sub("", text) for _, text in texts]
     try:  # line by line: a quote left open must not swallow the rest of the file
         rows = [line.split() if sign == " " else next(csv.reader([line], delimiter=sign)) for line in lines]
@@ -185,17 +192,6 @@ def _header(path: Path, text: Cells) -> tuple[list[str], int]:
     first_cells, where = printable(",".join(text.names(plain[0]))[:40]), f"{path}: line {text.lines[plain[0]]}"
     rows = f", and the rows of numbers begin at line {text.lines[starts[0]]}" if len(above) else ""
     raise NeecoError(f"{where} is not a header line (found {first_cells}){rows}; add a line with the column names")
-
-
-def _delimiter(lines: Sequence[str]) -> str:
-    """Return the delimiter of the rows, by the second half of the file."""
-    rows = lines[len(lines) // 2 :][: LIMITS.sample_lines]
-    for delimiter in "\t;":  # before commas, which may be those of decimals then
-        count, n_similar = Counter(row.count(delimiter) for row in rows).most_common(1)[0]
-        if count and n_similar > 0.9 * len(rows):
-            return delimiter
-    delimiter = max(",;\t", key=lambda sign: sum(row.count(sign) for row in rows))
-    return delimiter if any(delimiter in row for row in rows) else " "
 
 
 @dataclass(frozen=True)

@@ -115,7 +115,17 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
         width, height = video.size
         raise NeecoError(f"{video.path}: its frames are {width}x{height} pixels; give {least} or more each way")
     if recording.stereo is not None:  # before anything that takes long
-        notes.contradict("calibration", _check_partner(recording), severe=False, episode=episode)
+        left, right, _, calibration = recording.read_stereo()
+        right.check_size(recording.stereo.source.open().size, calibration)
+        reader, stated, sentence = None if recording.file is None else format_of(recording.file), None, ""
+        with suppress(NeecoError):  # the calibration of the images' file is not used
+            stated = None if reader is None or recording.file is None else reader.lens(recording.file, recording.stream)
+        if stated is not None and abs(left.fl_x / stated.fl_x - 1) >= READING.same_focal:
+            sentence = (
+                f"stereo.calibration: {calibration.name} states a focal length of {left.fl_x:.0f} px, the images' own "
+                f"file one of {stated.fl_x:.0f} px: check that it is of this scope and zoom"
+            )
+        notes.contradict("calibration", sentence, severe=False, episode=episode)
     for log in (log for log in logs if log.clock == VIDEO_CLOCK):
         if log.image_hz is not None:  # its rows belong to images one by one
             rows, images = (round(float(seconds) * log.image_hz) + 1 for seconds in (log.times[-1], length))
@@ -149,24 +159,6 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
             )
     return Episode(
         name=name, recording=recording, video=video, poses=poses, joints=joints, rolls=rolls, scope=scope, clocks=clocks
-    )
-
-
-def _check_partner(recording: Recording) -> str:
-    """Return a sentence on a stereo calibration that differs from the lens that the images' file states; "" without.
-    Raises NeecoError for one of images of another size, and for a right camera without images."""
-    assert recording.stereo is not None
-    left, right, _, calibration = recording.read_stereo()
-    right.check_size(recording.stereo.source.open().size, calibration)
-    reader = None if recording.file is None else format_of(recording.file)
-    stated = None
-    with suppress(NeecoError):  # the file's calibration is not used
-        stated = None if reader is None or recording.file is None else reader.lens(recording.file, recording.stream)
-    if stated is None or abs(left.fl_x / stated.fl_x - 1) < READING.same_focal:
-        return ""
-    return (
-        f"stereo.calibration: {calibration.name} states a focal length of {left.fl_x:.0f} px, the images' own file "
-        f"one of {stated.fl_x:.0f} px: check that it is of this scope and zoom"
     )
 
 
