@@ -125,8 +125,9 @@ def word(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
-def matrix_numbers(where: Path | str, value: Any, field: str) -> list[float]:
-    """The numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested) lists."""
+def matrix_numbers(where: Path | str, value: Any, field: str, count: int | None = None) -> list[float]:
+    """The `count` numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested)
+    lists."""
     if isinstance(value, dict):
         value = value.get("data")
     if value is None:
@@ -141,6 +142,8 @@ def matrix_numbers(where: Path | str, value: Any, field: str) -> list[float]:
                 problem = f"{printable(entry)} is not a usable number; write it as OpenCV does"
                 raise NeecoError(f"{where}: {field}: {problem}")
             flat.append(number)
+    if count not in (None, len(flat)):
+        raise NeecoError(f"{where}: {field}: needs {count} numbers, has {len(flat)}; write it as OpenCV does")
     return flat
 
 
@@ -213,9 +216,7 @@ def _camera(where: Path | str, keys: Mapping[str, Any], pair_of: bool = False) -
         raise _unread_model(where, min(unread))
     matrix, listed = first_of(keys, _MATRIX), first_of(keys, _INTRINSICS)
     if isinstance(matrix, dict | list):
-        values = matrix_numbers(where, matrix, "camera_matrix")
-        if len(values) != 9:
-            raise NeecoError(f"{where}: camera_matrix: needs 9 numbers, has {len(values)}; write it as OpenCV does")
+        values = matrix_numbers(where, matrix, "camera_matrix", 9)
         if values[2] == values[5] == 0 and all(values[6:8]):
             raise NeecoError(f"{where}: camera_matrix: stands column by column; write it row by row, as OpenCV does")
         four = [values[0], values[4], values[2], values[5]]

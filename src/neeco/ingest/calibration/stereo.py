@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import configparser
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
@@ -106,7 +106,8 @@ class RosCamera:
 
     def rectification(self) -> np.ndarray:
         """Return rectified_from_camera [3, 3]. Raises NeecoError."""
-        turn = _numbers(self.where, self.camera.keys, _RECTIFICATION, 9).reshape(3, 3)
+        value = first_of(self.camera.keys, _RECTIFICATION)
+        turn = np.reshape(matrix_numbers(self.where, value, _RECTIFICATION[0], 9), (3, 3))
         if rotation_error(turn) > STEREO.rotation_tolerance:
             problem = "is no rotation; calibrate the two cameras as one stereo rig"
             raise NeecoError(f"{self.where}: rectification_matrix: {problem}")
@@ -114,7 +115,8 @@ class RosCamera:
 
     def projection(self) -> np.ndarray:
         """Return the projection matrix [3, 4]. Raises NeecoError."""
-        return _numbers(self.where, self.camera.keys, _PROJECTION, 12).reshape(3, 4)
+        value = first_of(self.camera.keys, _PROJECTION)
+        return np.reshape(matrix_numbers(self.where, value, _PROJECTION[0], 12), (3, 4))
 
 
 def from_projections(left: RosCamera, right: RosCamera) -> tuple[Lens, Lens, np.ndarray]:
@@ -148,8 +150,8 @@ def _two_cameras(
     keys = {word(str(name)): value for name, value in document.items()}
     of_pair = {**right.keys, **keys}
     for names, turned_back in ((_RIGHT_FROM_LEFT, False), (_LEFT_FROM_RIGHT, True)):
-        if first_of(of_pair, names) is not None:
-            matrix = _numbers(path, of_pair, names, 16).reshape(4, 4)
+        if (stated := first_of(of_pair, names)) is not None:
+            matrix = np.reshape(matrix_numbers(path, stated, names[0], 16), (4, 4))
             matrix = np.linalg.inv(matrix) if turned_back and np.linalg.det(matrix) else matrix
             return *lenses, _pose(path, matrix[:3, :3].ravel(), matrix[:3, 3])
     source, turn, shift = path, first_of(keys, _TURNS), first_of(keys, _SHIFTS)
@@ -207,13 +209,6 @@ def _one_camera(path: Path) -> RosCamera:
     if not cameras:
         raise NeecoError(f"{path}: camera_matrix: missing; expected the camera_info of one camera, as ROS saves it")
     return RosCamera(path, cameras[0])
-
-
-def _numbers(path: Path | str, document: Mapping[str, Any], names: tuple[str, ...], count: int) -> np.ndarray:
-    values = matrix_numbers(path, first_of(document, names), names[0])
-    if len(values) != count:
-        raise NeecoError(f"{path}: {names[0]}: needs {count} numbers, has {len(values)}; write it as ROS does")
-    return np.array(values)
 
 
 def _lens(path: Path, camera: CameraNumbers) -> Lens:
