@@ -234,7 +234,7 @@ def _camera(where: Path | str, keys: Mapping[str, Any], pair_of: bool = False) -
     bends, vector, named = list[float](), first_of(keys, _DISTORTION), dict(keys)
     for section in (keys.get("projectionparameters"), keys.get("distortionparameters")):
         named |= _plain(section) if isinstance(section, dict) else {}
-    names = _COEFFICIENTS if not fisheye else _FISHEYE_COEFFICIENTS["mu" in named]
+    names: tuple[str, ...] = _COEFFICIENTS if not fisheye else _FISHEYE_COEFFICIENTS["mu" in named]
     present = [index for index, name in enumerate(names) if named.get(name) is not None]
     if vector is not None:
         bends = matrix_numbers(where, vector, "distortion_coefficients")
