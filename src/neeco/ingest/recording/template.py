@@ -205,10 +205,29 @@ def _find_files(source: Path) -> _FolderFiles:
             files.leave_out(name, problem, images=True)
         elif suffix in VIDEOS:
             files.frames.append(_Frames(f"video: {_scalar(name)}", name, file))
-        elif format_of(file) is not None:
-            if not _add_streams(files, file, name):
-                _classify_table(files, name, file)
-        elif suffix in (".yaml", ".yml", ".xml", ".json"):
+        elif format_of(file) is not None and not _add_streams(files, file, name):
+            try:
+                table = read_table(file)
+                meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
+            except NeecoError as error:
+                files.leave_out(name, error, file)
+                continue
+            log, pose, (value, when) = _Log(name), recognise_pose(table.header), recognise_value(table.header)
+            columns = [column for column in table.header if column]
+            angles = [one for one in columns if split_unit(one, "angle")[1] or one.lower().startswith("angle")]
+            if pose.rotation or "rotation" in pose.unclear:
+                files.poses.append((replace(log, says=meaning or log.says), pose))
+                joints = joint_columns(columns, pose_bodies(columns))
+                files.joints += [(log, when, column, _joint_of(column)) for column in joints]
+            elif value and when.time:
+                files.joints.append((log, when, value, None))
+            elif when.time and len(angles) > 1:
+                files.joints += [(log, when, column, _joint_of(column)) for column in angles]
+            elif len(columns) == 2 and angles and not when.time and len(table.rows) <= LIMITS.calibration_rows:
+                files.calibrations.append((name, table.header))
+            elif not (when.time and len(columns) <= 2):
+                files.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
+        elif format_of(file) is None and suffix in (".yaml", ".yml", ".xml", ".json"):
             with suppress(NeecoError):
                 document = read_json(file) if suffix == ".json" else None
                 offsets = document.get("clocks") if isinstance(document, dict) else None
@@ -262,30 +281,6 @@ def _add_streams(files: _FolderFiles, path: Path, name: str) -> bool:
             if (several := _EPISODES.fullmatch(stream.name)) and reader.of_episode(stream.name, 0) is not None:
                 files.episodes = f"{several[1]}-{several[2]}"
     return bool(streams)
-
-
-def _classify_table(files: _FolderFiles, name: str, file: Path) -> None:
-    try:
-        table = read_table(file)
-        meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
-    except NeecoError as error:
-        files.leave_out(name, error, file)
-        return
-    log, pose, (value, when) = _Log(name), recognise_pose(table.header), recognise_value(table.header)
-    columns = [column for column in table.header if column]
-    angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
-    if pose.rotation or "rotation" in pose.unclear:
-        files.poses.append((replace(log, says=meaning or log.says), pose))
-        joints = joint_columns(columns, pose_bodies(columns))
-        files.joints += [(log, when, column, _joint_of(column)) for column in joints]
-    elif value and when.time:
-        files.joints.append((log, when, value, None))
-    elif when.time and len(angles) > 1:
-        files.joints += [(log, when, column, _joint_of(column)) for column in angles]
-    elif len(columns) == 2 and angles and not when.time and len(table.rows) <= LIMITS.calibration_rows:
-        files.calibrations.append((name, table.header))
-    elif not (when.time and len(columns) <= 2):
-        files.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
 
 
 def _scope_lines(
@@ -381,9 +376,20 @@ def _instrument_lines(files: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
         if all(joint in DVRK_WRIST for *_, joint in logs):
             logs.sort(key=lambda log: DVRK_WRIST.index(str(log[3])))
         yield from ["    joints:"] if logs else []
-        for joint, joint_log in zip(_unique([_joint_name(*log) for log in logs]), logs, strict=True):
-            yield f"      {_scalar(joint)}:"
-            yield from (f"        {line}" for line in _joint_lines(files, *joint_log))
+        for joint, (log, when, value, named) in zip(_unique([_joint_name(*log) for log in logs]), logs, strict=True):
+            lines, stem = log.lines(), log.stem.lower()
+            if log.stream is None and named:  # a table of several joints is a robot's, as its poses are
+                lines.append("clock: em   # that of the poses: correct it where another computer logged it")
+            elif log.stream is None and not files.syncs:
+                lines.append("# clock: em   # left out, it is its own, whose offset nothing states")
+            tables = [name for name, header in files.calibrations if value in header]
+            tables += [name for name, _ in files.calibrations if Path(name).stem.lower().startswith(stem)]
+            lines += [
+                f"columns: {{value: {_scalar(value)}}}",
+                *(f"calibration: {_scalar(name)}" for name in tables[:1]),
+            ]
+            lines += _unit_lines(when, {} if tables else {"angle": (value,)})
+            yield from [f"      {_scalar(joint)}:", *(f"        {line}" for line in lines)]
 
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
@@ -395,18 +401,6 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
         lines += ["columns:", *(f"  {key}: [{', '.join(map(_scalar, names))}]" for key, names in stated if names)]
     lines += [f"# columns: {meaning} is not clear: {why}" for meaning, why in columns.unclear.items()]
     return lines + _unit_lines(columns, {"length": of_length})
-
-
-def _joint_lines(files: _FolderFiles, log: _Log, when: RecognisedColumns, value: str, named: str | None) -> list[str]:
-    lines, stem = log.lines(), log.stem.lower()
-    if log.stream is None and named:  # a table of several joints is a robot's, as its poses are
-        lines.append("clock: em   # that of the poses: correct it where another computer logged it")
-    elif log.stream is None and not files.syncs:
-        lines.append("# clock: em   # left out, it is its own, whose offset nothing states")
-    tables = [name for name, header in files.calibrations if value in header]
-    tables += [name for name, _ in files.calibrations if Path(name).stem.lower().startswith(stem)]
-    lines += [f"columns: {{value: {_scalar(value)}}}", *(f"calibration: {_scalar(name)}" for name in tables[:1])]
-    return lines + _unit_lines(when, {} if tables else {"angle": (value,)})
 
 
 def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | None]) -> list[str]:
