@@ -12,8 +12,9 @@ from damaged_files import refusals
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import format_of
-from neeco.ingest.readers.columns import BASE, CAMERA, JointColumns, PoseColumns
+from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.readers.sections import JointColumns, NamedJointColumns, PoseColumns
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 
@@ -60,7 +61,9 @@ def test_topics_count_from_the_first_image(world, session):
     np.testing.assert_allclose(log.positions, world.positions(TICKS), atol=1e-9)
     assert np.abs((log.quats * world.quats(TICKS)).sum(axis=1)).min() > 1 - 1e-12
     assert log.frame == BASE
-    joints = JointColumns(session, "video", value="outer_wrist_pitch_rad", stream="/PSM1/measured_js")
+    joints = JointColumns(
+        session, "video", columns=NamedJointColumns(value=("outer_wrist_pitch_rad",)), stream="/PSM1/measured_js"
+    )
     np.testing.assert_allclose(read_reading_log(joints).values, world.jaw(TICKS), atol=1e-12)
 
 

@@ -8,9 +8,9 @@ from damaged_files import refusals
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.calibration.lens import read_lens
-from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.readers.sections import JointColumns, PoseColumns
 from neeco.ingest.readers.video import open_video
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template

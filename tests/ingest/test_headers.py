@@ -7,8 +7,8 @@ import pytest
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import read_table
-from neeco.ingest.readers.columns import JointColumns, PoseColumns, Units
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.readers.sections import JointColumns, NamedJointColumns, NamedPoseColumns, PoseColumns, Units
 from neeco.ingest.recording.template import write_template
 
 MM = Units(length="mm")
@@ -79,26 +79,26 @@ def twice_xyz(world):
 
 
 def test_a_column_named_for_one_meaning_is_not_recognised_for_another(world, twice_xyz):
-    quaternion = {"rotation": ("X", "Y", "Z", "W"), "form": "quaternion_xyzw", "units": MM}
-    place = ("X#2", "Y#2", "Z#2")
-    for source in (quaternion, quaternion | {"position": place}, {"position": place, "units": MM}):
-        log = read_pose_log(PoseColumns(twice_xyz, **source))
+    quaternion, place = {"quaternion_xyzw": ("X", "Y", "Z", "W")}, {"position": ("X#2", "Y#2", "Z#2")}
+    for stated in (quaternion, quaternion | place, place):
+        log = read_pose_log(PoseColumns(twice_xyz, columns=NamedPoseColumns(**stated), units=MM))
         np.testing.assert_allclose(log.positions, world.positions(world.times), atol=1e-6)
         assert np.abs((log.quats * world.quats(world.times)).sum(1)).min() > 1 - 1e-9
     with pytest.raises(NeecoError, match=r"X, Y, Z may belong to the position or the quaternion; name both"):
         read_pose_log(PoseColumns(twice_xyz, units=MM))
+    twice = NamedPoseColumns(**quaternion, position=("X", "Y#2", "Z#2"))
     with pytest.raises(NeecoError, match=r"log\.csv: columns: X is named for two quantities"):
-        read_pose_log(PoseColumns(twice_xyz, **quaternion, position=("X", "Y#2", "Z#2")))
+        read_pose_log(PoseColumns(twice_xyz, columns=twice))
 
 
 def test_a_joints_reading_is_not_its_time(world):
     path = world.write("stamp,time_s", np.column_stack([world.jaw(world.times), world.times]))
-    source = JointColumns(path, "jaw", value="stamp", units=Units(angle="rad"))
+    source = JointColumns(path, "jaw", columns=NamedJointColumns(value=("stamp",)), units=Units(angle="rad"))
     np.testing.assert_allclose(read_reading_log(source).times, world.times, atol=1e-8)
-    source = JointColumns(path, "jaw", time=("time_s",), units=Units(angle="rad"))
+    source = JointColumns(path, "jaw", columns=NamedJointColumns(time=("time_s",)), units=Units(angle="rad"))
     np.testing.assert_allclose(read_reading_log(source).values, world.jaw(world.times), atol=1e-8)
     with pytest.raises(NeecoError, match="stamp is named for two quantities"):
-        read_reading_log(JointColumns(path, "jaw", time=("stamp",), value="stamp"))
+        read_reading_log(JointColumns(path, "jaw", columns=NamedJointColumns(time=("stamp",), value=("stamp",))))
 
 
 def test_rows_without_times_come_at_the_stated_rate(world):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers.columns import JointColumns, Units
 from neeco.ingest.readers.logs import read_reading_log
+from neeco.ingest.readers.sections import JointColumns, NamedJointColumns, Units
 
 TABLE = [[600.0, 0.0], [1200.0, 0.35], [1900.0, 0.8], [2900.0, 1.5]]
 
@@ -94,4 +94,6 @@ def test_several_columns_need_a_name(world):
     path = world.write("t_s,a_rad,b_rad", [[i / 50, 0.1, 0.2] for i in range(9)])
     with pytest.raises(NeecoError, match=r"the joint's column is ambiguous"):
         read_reading_log(JointColumns(path, "jaw"))
-    np.testing.assert_allclose(read_reading_log(JointColumns(path, "jaw", value="b_rad")).values, 0.2)
+    np.testing.assert_allclose(
+        read_reading_log(JointColumns(path, "jaw", columns=NamedJointColumns(value=("b_rad",)))).values, 0.2
+    )

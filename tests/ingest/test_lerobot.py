@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import format_of, lerobot_files, read_table
 from neeco.ingest.readers.columns import CAMERA as CAMERA_FRAME
-from neeco.ingest.readers.columns import PoseColumns, Units
 from neeco.ingest.readers.lerobot_files import LeRobotLimits
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.readers.sections import NamedPoseColumns, PoseColumns, Units
 from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
@@ -29,6 +29,7 @@ from lerobot_world import BODY, CAMERA, DVRK, FPS, left_edge, write_data_set  # 
 
 LENGTHS = (20, 30, 25)
 STATE = "observation.state"
+POSITION = tuple(f"{STATE}[{k}]" for k in range(3))
 WXYZ = tuple(f"{STATE}[{k}]" for k in range(3, 7))
 
 
@@ -137,9 +138,7 @@ def test_matrices_are_columns_row_by_row(tmp_path):
 def pose_columns(path: Path, **given: Any) -> PoseColumns:
     options: dict[str, Any] = {
         "stream": f"episode 0/{STATE}",
-        "position": tuple(f"{STATE}[{k}]" for k in range(3)),
-        "rotation": WXYZ,
-        "form": "quaternion_xyzw",
+        "columns": NamedPoseColumns(position=POSITION, quaternion_xyzw=WXYZ),
         "units": Units(length="m"),
         "frame": "camera",
     }
@@ -167,7 +166,7 @@ def test_poses_are_what_the_recording_says_they_are(nameless):
     ("changes", "message"),
     [
         (
-            {"rotation": None, "form": None},
+            {"columns": NamedPoseColumns(position=POSITION)},
             r"set: episode 0/observation\.state: header: .*quaternion_wxyz, quaternion_xyz",
         ),
         (
@@ -206,9 +205,9 @@ def test_a_template_names_every_arm_with_its_jaw(plain):
     first, second = (item.poses for item in recording.instruments)
     assert first is not None
     assert second is not None
-    assert first.rotation == tuple(f"psm1_pose.orientation.{axis}" for axis in "wxyz")
-    assert first.form == "quaternion_wxyz"
-    assert [dict(item.joints)["jaw"].value for item in recording.instruments] == ["psm1_jaw", "psm2_jaw"]
+    assert first.columns.quaternion_wxyz == tuple(f"psm1_pose.orientation.{axis}" for axis in "wxyz")
+    jaws = [dict(item.joints)["jaw"].columns.value for item in recording.instruments]
+    assert jaws == [("psm1_jaw",), ("psm2_jaw",)]
     assert {log.clock for log in (first, second)} == {"video"}
     place.write_text(text.replace('# episodes: ["0-', 'episodes: ["0-'))
     assert [item.episode for item in separate([read_recording(place)])] == [f"episode_{n}" for n in range(3)]

@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers.columns import PoseColumns
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.readers.motive import MotiveExport
+from neeco.ingest.readers.sections import PoseColumns
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 

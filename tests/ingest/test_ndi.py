@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers.columns import PoseColumns, Units
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.readers.sections import NamedPoseColumns, PoseColumns, Units
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 
@@ -58,7 +58,7 @@ def test_a_tool_that_drops_out_takes_no_other_with_it(world, polaris):
         ({}, r"has 3 streams of poses; set `stream` in the recording to one of: 8700340, needle driver, endoscope"),
         ({"stream": "0x07"}, r"stream: '0x07' does not exist; choose one of: 8700340, needle driver, endoscope"),
         # the second Tx is the first tool's first marker
-        ({"position": ("Tx#2", "Ty#2", "Tz#2")}, "has 3 streams of poses; set `stream`"),
+        ({"columns": NamedPoseColumns(position=("Tx#2", "Ty#2", "Tz#2"))}, "has 3 streams of poses; set `stream`"),
     ],
 )
 def test_of_several_tools_one_is_named(polaris, source, message):
@@ -68,10 +68,10 @@ def test_of_several_tools_one_is_named(polaris, source, message):
 
 
 def test_columns_of_a_tool_may_be_named(world, polaris):
-    source = PoseColumns(
-        polaris, stream="0x02", time=("Time [sec]",), position=("Tx", "Ty", "Tz"), rotation=("Q0", "Qx", "Qy", "Qz"),
-        form="quaternion_wxyz", state="State", units=Units(length="mm"),
-    )  # fmt: skip
+    names = NamedPoseColumns(
+        time=("Time [sec]",), position=("Tx", "Ty", "Tz"), quaternion_wxyz=("Q0", "Qx", "Qy", "Qz"), state="State"
+    )
+    source = PoseColumns(polaris, stream="0x02", columns=names, units=Units(length="mm"))
     assert len(read_pose_log(source).times) == len(world.times) - 4
 
 

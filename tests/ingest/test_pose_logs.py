@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers.columns import PoseColumns, Units
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.readers.sections import NamedPoseColumns, PoseColumns, Units
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
@@ -66,7 +66,7 @@ def test_euler_angles_of_a_named_convention(world, convention, unit):
     angles = world.rotations(world.times).as_euler(convention, degrees=unit == "deg")
     path = world.write("t_s,x_mm,y_mm,z_mm,a,b,c", np.column_stack([world.rows()[:, :4], angles]))
     source = PoseColumns(
-        path, rotation=("a", "b", "c"), form="euler", euler_convention=convention, units=Units(angle=unit)
+        path, columns=NamedPoseColumns(euler=("a", "b", "c"), euler_convention=convention), units=Units(angle=unit)
     )
     assert_same(read_pose_log(source), world)
 
@@ -196,7 +196,7 @@ def test_one_of_several_bodies_is_named(world):
     with pytest.raises(NeecoError, match=r"several bodies \(tool, scope\)"):
         read_pose_log(PoseColumns(path))
     source = PoseColumns(
-        path, position=tuple(names[:3]), rotation=tuple(names[3:7]), form="quaternion_wxyz", clock="other"
+        path, "other", columns=NamedPoseColumns(position=tuple(names[:3]), quaternion_wxyz=tuple(names[3:7]))
     )
     log = read_pose_log(source)
     assert_same(log, world)

@@ -11,8 +11,8 @@ from ingest.conftest import POSE_HEADER
 from PIL import Image
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers.columns import Units
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.readers.sections import Units
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.model import IngestSettings, Splits
 from neeco.ingest.recording.template import open_questions, write_template
@@ -79,7 +79,7 @@ def test_init_offers_the_jaw_that_stands_in_a_table_of_poses(world, body, jaw):
     )
     [instrument] = read_recording(world.folder / "recording.yaml").instruments
     [joint] = instrument.joints.values()
-    assert (joint.value, joint.clock) == (body + jaw, instrument.poses.clock)
+    assert (joint.columns.value, joint.clock) == ((body + jaw,), instrument.poses.clock)
     assert len(read_reading_log(joint).values) == 40
 
 
@@ -95,7 +95,7 @@ def test_init_writes_what_the_flags_say(folder):
             np.testing.assert_array_equal(
                 read_reading_log(mine.joints[joint]).values, read_reading_log(theirs.joints[joint]).values
             )
-    assert recording.laparoscope.path.name == "camera.csv"
+    assert recording.laparoscope.file.name == "camera.csv"
 
 
 def test_init_asks_for_the_lens_and_the_clock_that_no_file_states(folder):
@@ -198,7 +198,7 @@ def test_everything_at_once(world, folder):
     recording = read_recording(world.text(FULL, "recording.yaml"))
     assert recording.source.fps == 50
     [instrument] = recording.instruments
-    assert instrument.poses.form == "quaternion_wxyz"
+    assert instrument.poses.columns.rotation[1] == "quaternion_wxyz"
     assert instrument.poses.units == Units(length="mm")
     assert instrument.joints["jaw"].limits == (0.0, 1.5)
     assert instrument.joints["wrist"].clock == "em"  # in the file of the poses

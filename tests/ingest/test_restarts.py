@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers.columns import JointColumns, PoseColumns, Units
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.readers.sections import JointColumns, PoseColumns, Units
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 
@@ -85,7 +85,7 @@ def test_a_repeated_header_is_named_whether_or_not_rows_have_times(world):
         source = JointColumns(world.write(header, np.column_stack(columns)), "jaw", rate_hz=None)
         source = source if "t_s" in header else replace(source, rate_hz=50.0)
         assert len(read_reading_log(source).times) == 100
-        source.path.write_text(source.path.read_text() * 2)
+        source.file.write_text(source.file.read_text() * 2)
         with pytest.raises(NeecoError, match=message):
             read_reading_log(source)
 

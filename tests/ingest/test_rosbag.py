@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import Kind, VideoSource, _bagfile, read_table
-from neeco.ingest.readers.columns import BASE, CAMERA, JointColumns, PoseColumns
+from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog, read_pose_log, read_reading_log
+from neeco.ingest.readers.sections import JointColumns, NamedJointColumns, PoseColumns
 
 ARM, JAW, LEFT = "/PSM1/measured_cp", "/PSM1/jaw/measured_js", "/stereo/left/image_raw"
 STEP = 0.025  # s
@@ -95,7 +96,9 @@ def test_a_bag_gives_back_what_was_recorded(tmp_path: Path, kind: str, packed: s
         assert log.frame == BASE
         jaw = read_reading_log(JointColumns(path, "video", stream=JAW))
         np.testing.assert_allclose(jaw.values, 0.5 * TICKS, atol=1e-15)
-        wrist = JointColumns(path, "video", value="outer_wrist_yaw_rad", stream="/PSM1/measured_js")
+        wrist = JointColumns(
+            path, "video", columns=NamedJointColumns(value=("outer_wrist_yaw_rad",)), stream="/PSM1/measured_js"
+        )
         np.testing.assert_allclose(read_reading_log(wrist).values, -TICKS, atol=1e-15)
         film = images(path)
         assert film.size == SIZE
@@ -218,7 +221,9 @@ def test_joints_go_by_their_names(tmp_path: Path) -> None:
             bag.joints("/joint_states", time + 0.001, insertion=0.2)
     table = read_table(bag.path, "/joint_states")
     assert set(table.header) == {"t_s", "a_rad", "b_rad", "insertion_m"}
-    log = read_reading_log(JointColumns(bag.path, "video", value="a_rad", stream="/joint_states"))
+    log = read_reading_log(
+        JointColumns(bag.path, "video", columns=NamedJointColumns(value=("a_rad",)), stream="/joint_states")
+    )
     np.testing.assert_allclose(log.values, log.times, atol=2 * NS)
     assert len(log.times) == 40
     column = table.header.index("insertion_m")

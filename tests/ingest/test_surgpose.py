@@ -9,8 +9,8 @@ from damaged_files import refusals
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import format_of
-from neeco.ingest.readers.columns import JointColumns, PoseColumns
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.readers.sections import JointColumns, NamedJointColumns, PoseColumns
 from neeco.ingest.recording.file import read_recording
 from neeco.ingest.recording.template import write_template
 from neeco.ingest.timing.reading import read_episodes
@@ -53,7 +53,9 @@ def test_poses_and_joints_come_back(world, trajectory):
     assert np.abs((log.quats * world.quats(TIMES)).sum(axis=1)).min() > 1 - 1e-12
     other = read_pose_log(PoseColumns(trajectory, stream="PSM3"))
     np.testing.assert_allclose(other.positions, world.positions(TIMES) / 2, atol=1e-9)
-    joints = JointColumns(trajectory, "video", value="wrist_pitch_rad", stream="PSM1_joints")
+    joints = JointColumns(
+        trajectory, "video", columns=NamedJointColumns(value=("wrist_pitch_rad",)), stream="PSM1_joints"
+    )
     np.testing.assert_allclose(read_reading_log(joints).values, world.jaw(TIMES), atol=1e-12)
 
 

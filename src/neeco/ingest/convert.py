@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import torch
 from neeco.base.errors import NeecoError
 from neeco.capture.documents import ProblemReport, condensed
 from neeco.capture.images import masks_fault, measure_hidden, read_mask, write_image, write_labels
-from neeco.capture.model import Capture, Frame, evenly_spaced
+from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.points import measured_sample
 from neeco.capture.readers import capture_of, parse_capture
 from neeco.capture.readers.endonerf import MASKS, folder_images
@@ -46,50 +46,38 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
             report.error(f"{MASKS}/", "", message, "each image needs one, in the order of the sorted names")
         report.raise_first(folder)
         capture, notes = capture_of(parsed), list[str]()
-        if count := len(parsed.absent):
-            total, first = count + len(parsed.frames), parsed.absent[0]
-            lacking = f"{count} of {total} frames, which have no image ({first.field}: {first.message})"
-            notes.append(f"Left out: {lacking}.")
         frames = list(capture.frames)
+        if count := len(parsed.absent):
+            total, first = count + len(frames), parsed.absent[0]
+            notes.append(f"Left out: {count} of {total} frames, which have no image ({first.field}: {first.message}).")
         if tool_masks:
             frames, mask_notes = _with_tool_masks(frames, tool_masks, work / "tool")
             notes += mask_notes
-        border = None if any(frame.mask_path for frame in frames) else _shared_border(frames)
+        border, sizes = None, {(frame.camera.width, frame.camera.height) for frame in frames}
+        if len(sizes) == 1 and not any(frame.mask_path for frame in frames):
+            chosen = evenly_spaced(len(frames), BORDERS.max_frames, floor=True)
+            border = find_border(frames[index].load_image_bytes().numpy() for index in chosen)
         if border is not None:
             visible = visible_mask(border, (frames[0].camera.width, frames[0].camera.height))
             write_labels(work / "border.png", torch.from_numpy(visible.astype(np.uint8) * 255))
             frames = [replace(frame, mask_path=work / "border.png") for frame in frames]
             notes.append(f"The endoscope's dark border ({1 - visible.mean():.0%} of the image) is masked.")
-        undistorted = undistort_frames(frames, work / "undistorted", border)
-        notes += undistorted.notes
-        capture = replace(capture, frames=undistorted.frames, lens=undistorted.lens or capture.lens)
-        notes += _inverted_masks(capture)
+        frames, lens, more = _undistorted(frames, work / "undistorted", border)
+        notes += more
+        capture = replace(capture, frames=tuple(frames), lens=lens or capture.lens)
+        masked = [frame for frame in capture.frames if frame.mask_path is not None]
+        points, hidden = measured_sample(capture.points), []
+        for index in evenly_spaced(len(masked), BORDERS.max_frames, floor=True):
+            mask = masked[index].load_mask()
+            assert mask is not None
+            hidden.append(measure_hidden(masked[index].load_pixels(), mask.numpy(), masked[index].camera, points))
+        if (fault := masks_fault(hidden)) is not None:  # they may be inverted
+            notes.append(f"Warning: {fault[0]} {fault[1]}.")
         write_capture(capture, work / "capture")
     settled = ("instruments", "units")  # warnings that `_lacking` repeats; converting settles those of masks
     warnings = [problem for problem in report.problems if problem.severity == "warning" and problem.file != f"{MASKS}/"]
     warning_texts = [str(problem) for problem in condensed(warnings) if problem.field not in settled]
     return (*_lacking(parsed, masked=bool(tool_masks)), *warning_texts, *notes)
-
-
-def _inverted_masks(capture: Capture) -> list[str]:
-    """Return notes on loss masks that may be inverted."""
-    masked = [frame for frame in capture.frames if frame.mask_path is not None]
-    points, hidden = measured_sample(capture.points), []
-    for index in evenly_spaced(len(masked), BORDERS.max_frames, floor=True):
-        frame, mask = masked[index], masked[index].load_mask()
-        assert mask is not None
-        hidden.append(measure_hidden(frame.load_pixels(), mask.numpy(), frame.camera, points))
-    fault = masks_fault(hidden)
-    return [] if fault is None else [f"Warning: {fault[0]} {fault[1]}."]
-
-
-def _shared_border(frames: Sequence[Frame]) -> Border | None:
-    """Return the dark border common to all frames; None without one, or for frames of different sizes. Raises
-    NeecoError."""
-    if len({(frame.camera.width, frame.camera.height) for frame in frames}) != 1:
-        return None
-    chosen = evenly_spaced(len(frames), BORDERS.max_frames, floor=True)
-    return find_border(frames[index].load_image_bytes().numpy() for index in chosen)
 
 
 def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path) -> tuple[list[Frame], list[str]]:
@@ -147,47 +135,39 @@ def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
     return sentences
 
 
-@dataclass(frozen=True)
-class Undistorted:
-    """Frames with pinhole cameras."""
-
-    frames: tuple[Frame, ...]
-    lens: Lens | None  # the recording's lens; None: no distortion, or several lenses
-    notes: list[str]
-
-
-def undistort_frames(frames: Sequence[Frame], folder: Path, border: Border | None) -> Undistorted:
-    """Undistort the frames whose cameras are distorted into `folder`, as PNG; return all.
+def _undistorted(
+    frames: list[Frame], folder: Path, border: Border | None
+) -> tuple[list[Frame], Lens | None, list[str]]:
+    """Undistort the frames whose cameras are distorted into `folder`, as PNG; return all, their lens (None: no
+    distortion, or several lenses), and notes.
 
     border: of the round field of view in the images as recorded. Raises NeecoError for an image that cannot be read and
     a distortion that folds the image over, naming the image.
     """
     count = sum(bool(frame.camera.distortion) for frame in frames)
     if not count:
-        return Undistorted(tuple(frames), None, [])
+        return frames, None, []
     first, *other_lenses = {Lens.of(frame.camera): None for frame in frames}
     lens = None if other_lenses else replace(first, border=border)
     note = f"of their {1 + len(other_lenses)} lenses none is kept" if lens is None else "their lens is kept"
-    straight = [_undistort(frame, folder / str(order)) for order, frame in enumerate(frames)]
-    return Undistorted(tuple(straight), lens, [f"{count} of {len(frames)} images are undistorted; {note}."])
-
-
-def _undistort(frame: Frame, folder: Path) -> Frame:
-    if not frame.camera.distortion:
-        return frame
-    lens = Lens.of(frame.camera)
-    assert lens.size is not None
-    try:
-        pinhole = lens.pinhole(lens.size)
-    except NeecoError as error:
-        raise NeecoError(f"{frame.image_path}: {error}") from None
-    # the parent's name stays: where two images share a stem it tells them apart
-    image = folder / frame.image_path.parent.name / f"{frame.name}.png"
-    pixels = lens.undistort(frame.load_image_bytes().numpy())
-    write_image(image, torch.from_numpy(pixels.astype(np.float32) / 255))
-    mask, mask_path = frame.load_mask(), None
-    if mask is not None:
-        mask_path = folder / "mask.png"
-        write_labels(mask_path, torch.from_numpy(lens.undistort_mask(mask.numpy()).astype(np.uint8) * 255))
-    camera = pinhole.camera(frame.camera.world_from_camera.numpy())
-    return replace(frame, image_path=image, camera=camera, mask_path=mask_path)
+    straight = list(frames)
+    for order, frame in enumerate(frames):
+        if not frame.camera.distortion:
+            continue
+        own = Lens.of(frame.camera)
+        assert own.size is not None
+        try:
+            pinhole = own.pinhole(own.size)
+        except NeecoError as error:
+            raise NeecoError(f"{frame.image_path}: {error}") from None
+        # the parent's name stays: where two images share a stem it tells them apart
+        image = folder / str(order) / frame.image_path.parent.name / f"{frame.name}.png"
+        pixels = own.undistort(frame.load_image_bytes().numpy())
+        write_image(image, torch.from_numpy(pixels.astype(np.float32) / 255))
+        mask, mask_path = frame.load_mask(), None
+        if mask is not None:
+            mask_path = folder / str(order) / "mask.png"
+            write_labels(mask_path, torch.from_numpy(own.undistort_mask(mask.numpy()).astype(np.uint8) * 255))
+        camera = pinhole.camera(frame.camera.world_from_camera.numpy())
+        straight[order] = replace(frame, image_path=image, camera=camera, mask_path=mask_path)
+    return straight, lens, [f"{count} of {len(frames)} images are undistorted; {note}."]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import write_text
@@ -54,7 +54,20 @@ def sources_of(request: IngestRequest, output: Path | None) -> tuple[Path | None
     """Return the folder in another format that a request names, to be converted; else the recordings that it states: by
     files, or by its other options, whose columns are recognised from the headers. Raises NeecoError naming the file or
     the option, and where there is no output."""
-    folder = _folder_to_convert(request.source)
+    folder = None  # the one that holds cameras in another format
+    for source in request.source:
+        if source.suffix.lower() in VIDEOS:
+            raise NeecoError(f"{source}: is a video; give it as --video {shlex.quote(str(source))}")
+        if (kind := format_of(source)) is not None and source.exists():
+            raise NeecoError(
+                f"{source}: is in a recording's format ({kind.format}) but does not state the meaning of its streams; "
+                f"write that down first: neeco ingest --init {source}"
+            )
+        if source.is_dir() and (source / RECORDING).is_file():
+            raise NeecoError(f"{source}: holds a recording; give the file: {source / RECORDING}")
+        if source.is_dir() and len(request.source) > 1:
+            raise NeecoError(f"{source}: is a folder; of several recordings give each recording.yaml")
+        folder = source if source.is_dir() else None
     if not request.source and request.video is None:
         raise NeecoError("--video: give the video (or a folder of images), or a recording.yaml")
     if output is None:
@@ -70,26 +83,6 @@ def sources_of(request: IngestRequest, output: Path | None) -> tuple[Path | None
         return None, [_recording_of_options(request, request.video)]
     recordings = [read_recording(source) for source in request.source]
     return None, [item if request.frames is None else replace(item, frames=request.frames) for item in recordings]
-
-
-def _folder_to_convert(sources: Sequence[Path]) -> Path | None:
-    """Return the folder that holds cameras in another format; None where the sources are files of recordings. Raises
-    NeecoError for what is neither."""
-    for source in sources:
-        if source.suffix.lower() in VIDEOS:
-            raise NeecoError(f"{source}: is a video; give it as --video {shlex.quote(str(source))}")
-        if (kind := format_of(source)) is not None and source.exists():
-            raise NeecoError(
-                f"{source}: is in a recording's format ({kind.format}) but does not state the meaning of its streams; "
-                f"write that down first: neeco ingest --init {source}"
-            )
-        if source.is_dir():
-            if (source / RECORDING).is_file():
-                raise NeecoError(f"{source}: holds a recording; give the file: {source / RECORDING}")
-            if len(sources) > 1:
-                raise NeecoError(f"{source}: is a folder; of several recordings give each recording.yaml")
-            return source
-    return None
 
 
 def _recording_of_options(request: IngestRequest, video: Path) -> Recording:
@@ -108,28 +101,21 @@ def _recording_of_options(request: IngestRequest, video: Path) -> Recording:
     is_folder = video.is_dir() and format_of(video) is None
     tool = {
         "name": "instrument",
-        "poses": _plain(request.instrument),
-        "joints": {joint: {"file": _plain(log), "calibration": _plain(table)} for joint, log, table in joints},
+        "poses": request.instrument,
+        "joints": {joint: {"file": log, "calibration": table} for joint, log, table in joints},
         "from_video": None if shaft is None else {"shaft_diameter_mm": shaft},
     }
-    images = {"folder" if is_folder else "file": str(video), "fps": request.fps}
     document = {
-        "images" if is_folder else "video": images,
-        "intrinsics": _plain(request.calibration or request.intrinsics),
+        "images" if is_folder else "video": {"folder" if is_folder else "file": video, "fps": request.fps},
+        "intrinsics": request.calibration or request.intrinsics,
         "instruments": [tool] if tracked else [],
-        "laparoscope": _plain(request.laparoscope),
-        "sync": _plain(request.sync),
-        "frames": request.frames,
+        **{name: getattr(request, name) for name in ("laparoscope", "sync", "frames")},
     }
     try:
-        return replace(recording_of(document, Path("this folder")), path=video)
+        plain = json.loads(json.dumps(document, default=str))  # as recording.yaml has it
+        return replace(recording_of(plain, Path("this folder")), path=video)
     except Fault as fault:
         options = (option for field, option in _OPTIONS.items() if fault.field.startswith(field))
         option = "--calibration" if request.calibration and fault.field == "intrinsics" else next(options, fault.field)
         joint = fault.field.split(".")[2] if option == "--joint" else ""
         raise NeecoError(f"{option} {joint}".rstrip() + f": {fault}") from None
-
-
-def _plain(value: Path | Sequence[float] | None) -> Any:
-    """Return an option as recording.yaml has it."""
-    return value if value is None else str(value) if isinstance(value, Path) else [*value]

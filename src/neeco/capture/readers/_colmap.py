@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -73,9 +73,8 @@ def _suffix(model: Path) -> str:
 
 def _image_count(model: Path) -> int:
     """Return the number of images of a model, 0 if it is damaged."""
-    suffix = _suffix(model)
     try:
-        return len(_parse(model / f"images{suffix}", _PARSERS[suffix][1]))
+        return len(_parse(model / f"images{_suffix(model)}"))
     except NeecoError:
         return 0
 
@@ -89,17 +88,15 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
     model, *unused_models = models
     parsed = Parsed(root, timed=False, as_source=as_source)
     suffix = _suffix(model)
-    parse_cameras, parse_images, parse_points = _PARSERS[suffix]
     try:
-        cameras = _parse(model / f"cameras{suffix}", parse_cameras)
-        images = _parse(model / f"images{suffix}", parse_images)
+        cameras, images = (_parse(model / f"{kind}{suffix}") for kind in ("cameras", "images"))
     except NeecoError as error:
         report.error(relative_name(model, root), "", str(error).removeprefix(f"{model}/"))
         return parsed
     points_file = model / f"points3D{suffix}"
     parsed.points_place = Node(None, relative_name(points_file, root), "", report)
     try:
-        rows = np.array(_parse(points_file, parse_points), dtype=np.float64).reshape(-1, 6)
+        rows = np.array(_parse(points_file), dtype=np.float64).reshape(-1, 6)
         positions = rows[:, :3].astype(np.float32)
         if not np.isfinite(positions).all():
             raise NeecoError("contains points that are NaN or infinite; remove them")
@@ -109,7 +106,18 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "contains no images", "reconstruct again: no image was registered")
-    _note_left_out(model, unused_models, images, root, Node(None, file, "", report))
+    whole = Node(None, file, "", report)
+    if unused_models:
+        counts = ", ".join(f"{relative_name(other, root)} with {_image_count(other)}" for other in unused_models)
+        message = f"{relative_name(model, root)} with {len(images)} images is read; left out: {counts}"
+        whole.warning(message, "to read another, copy it and images/ into a separate folder")
+    files = [file for file in (root / "images").rglob("*") if file.suffix.lower() in EXTENSIONS and file.is_file()]
+    registered = {os.path.normpath(image.name) for image in images}
+    unregistered = sorted(str(file.relative_to(root / "images")) for file in files)
+    unregistered = [name for name in unregistered if os.path.normpath(name) not in registered]
+    if unregistered:
+        message = f"{len(unregistered)} of {len(files)} images in images/ have no camera ({printable(unregistered[0])})"
+        whole.warning(message, "they are left out")
     images.sort(key=lambda item: natural_order(item.name))
     orders = instants([image.name for image in images], [image.camera_id for image in images])
     orders = orders or list(range(len(images)))
@@ -122,21 +130,6 @@ def parse_colmap(models: Sequence[Path], root: Path, report: ProblemReport, *, a
         parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
         parsed.places.append(place)
     return parsed
-
-
-def _note_left_out(model: Path, others: Sequence[Path], images: Sequence[_Image], root: Path, place: Node) -> None:
-    """Warn of other models, and of images in images/ without a camera."""
-    if others:
-        counts = ", ".join(f"{relative_name(other, root)} with {_image_count(other)}" for other in others)
-        message = f"{relative_name(model, root)} with {len(images)} images is read; left out: {counts}"
-        place.warning(message, "to read another, copy it and images/ into a separate folder")
-    files = [file for file in (root / "images").rglob("*") if file.suffix.lower() in EXTENSIONS and file.is_file()]
-    registered = {os.path.normpath(image.name) for image in images}
-    unregistered = sorted(str(file.relative_to(root / "images")) for file in files)
-    unregistered = [name for name in unregistered if os.path.normpath(name) not in registered]
-    if unregistered:
-        message = f"{len(unregistered)} of {len(files)} images in images/ have no camera ({printable(unregistered[0])})"
-        place.warning(message, "they are left out")
 
 
 def _camera(place: Node, image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> Camera:
@@ -172,107 +165,68 @@ def _camera(place: Node, image: _Image, cameras: dict[int, _Intrinsics], parsed:
     return Camera(pose, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion)
 
 
-def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:
-    """Return `parse` of a file's content. Raises NeecoError for damage."""
+def _parse(path: Path) -> Any:
+    """Return the cameras by id, the images, or the points [x, y, z, red, green, blue] of a file of a model, by its
+    name. Raises NeecoError for damage."""
     content = read_bytes(path, "a file of a COLMAP model", "no such file; export the whole COLMAP model")
     try:
-        return parse(content)
+        return (_parse_binary if path.suffix == ".bin" else _parse_text)(path.stem, content)
     except NeecoError as error:  # which names no file
         raise NeecoError(f"{path}: {error}") from None
     except (struct.error, ValueError, IndexError, KeyError, OverflowError):
         raise NeecoError(f"{path}: is damaged or not a COLMAP model file; export it again") from None
 
 
-class _Stream:
-    """Sequential little-endian values of a binary file."""
+def _parse_binary(kind: str, content: bytes) -> Any:
+    cameras, images, points, offset = dict[int, _Intrinsics](), list[_Image](), list[tuple[float, ...]](), 0
 
-    def __init__(self, content: bytes) -> None:
-        self.content, self.offset = content, 0
-
-    def take(self, layout: str) -> tuple:
-        values = struct.unpack_from("<" + layout, self.content, self.offset)
-        self.offset += struct.calcsize("<" + layout)
+    def take(layout: str) -> tuple:
+        nonlocal offset
+        values = struct.unpack_from("<" + layout, content, offset)
+        offset += struct.calcsize("<" + layout)
         return values
 
-    def skip(self, count: int) -> None:
-        self.offset += count
-        if self.offset > len(self.content):
+    for _ in range(take("Q")[0]):
+        skipped = 0  # bytes
+        if kind == "cameras":
+            camera_id, model_id, width, height = take("iiQQ")
+            if model_id not in _MODELS and 0 <= model_id < MAX_MODEL_ID:
+                raise NeecoError(f"its camera model {model_id} is unknown; run `colmap image_undistorter` first")
+            model, count = _MODELS[model_id]
+            cameras[camera_id] = _Intrinsics(model, width, height, take(f"{count}d"))
+        elif kind == "images":
+            _, *pose, camera_id = take("i7di")
+            end = content.index(b"\0", offset)
+            images.append(_Image(content[offset:end].decode("utf-8"), camera_id, tuple(pose[:4]), tuple(pose[4:])))
+            offset = end + 1
+            skipped = 24 * take("Q")[0]  # x, y, point id of each observation
+        else:
+            _, *point, _error, track = take("Q3d3BdQ")
+            points.append(tuple(point))
+            skipped = 8 * track
+        offset += skipped
+        if offset > len(content):
             raise ValueError("truncated")
-
-    def name(self) -> str:
-        end = self.content.index(b"\0", self.offset)
-        text = self.content[self.offset : end].decode("utf-8")
-        self.offset = end + 1
-        return text
+    return {"cameras": cameras, "images": images}.get(kind, points)
 
 
-def _cameras_binary(content: bytes) -> dict[int, _Intrinsics]:
-    stream = _Stream(content)
-    cameras: dict[int, _Intrinsics] = {}
-    for _ in range(stream.take("Q")[0]):
-        camera_id, model_id, width, height = stream.take("iiQQ")
-        if model_id not in _MODELS and 0 <= model_id < MAX_MODEL_ID:
-            raise NeecoError(f"its camera model {model_id} is unknown; run `colmap image_undistorter` first")
-        model, count = _MODELS[model_id]
-        cameras[camera_id] = _Intrinsics(model, width, height, stream.take(f"{count}d"))
-    return cameras
-
-
-def _images_binary(content: bytes) -> list[_Image]:
-    stream = _Stream(content)
-    images = []
-    for _ in range(stream.take("Q")[0]):
-        _, *pose, camera_id = stream.take("i7di")
-        images.append(_Image(stream.name(), camera_id, tuple(pose[:4]), tuple(pose[4:])))
-        stream.skip(24 * stream.take("Q")[0])  # x, y, point id of each observation
-    return images
-
-
-def _points_binary(content: bytes) -> list[tuple[float, ...]]:
-    stream = _Stream(content)
-    rows: list[tuple[float, ...]] = []
-    for _ in range(stream.take("Q")[0]):
-        _, x, y, z, red, green, blue, _error, track = stream.take("Q3d3BdQ")
-        rows.append((x, y, z, red, green, blue))
-        stream.skip(8 * track)
-    return rows
-
-
-def _lines(content: bytes) -> list[str]:
-    return [line for line in content.decode("utf-8").splitlines() if not line.startswith("#")]
-
-
-def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
-    cameras = {}
-    for line in _lines(content):
-        if line.strip():
-            camera_id, model, width, height, *params = line.split()
-            expected = dict(_MODELS.values()).get(model, len(params))
-            if len(params) != expected:
-                raise ValueError("parameters missing")
-            cameras[int(camera_id)] = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
-    return cameras
-
-
-def _images_text(content: bytes) -> list[_Image]:
-    images = []
-    # two lines per image; the second (observations) may be empty, so only every other line is read
-    for line in list(dropwhile(lambda line: not line.strip(), _lines(content)))[::2]:
-        if line.strip():
+def _parse_text(kind: str, content: bytes) -> Any:
+    lines = [line for line in content.decode("utf-8").splitlines() if not line.startswith("#")]
+    cameras, images = dict[int, _Intrinsics](), list[_Image]()
+    if kind == "images":  # two lines each; the second (observations) may be empty, so only every other line is read
+        for line in (line for line in list(dropwhile(lambda line: not line.strip(), lines))[::2] if line.strip()):
             _, *pose, camera_id, name = line.split(maxsplit=9)
             values = tuple(map(float, pose))
             images.append(_Image(name.strip(), int(camera_id), values[:4], values[4:]))
-    return images
-
-
-def _points_text(content: bytes) -> list[tuple[float, ...]]:
-    rows = [tuple(map(float, line.split()[1:7])) for line in _lines(content) if line.strip()]
-    if any(len(row) != 6 for row in rows):
+        return images
+    rows = [line.split() for line in lines if line.strip()]
+    if kind == "cameras":
+        for camera_id, model, width, height, *params in rows:
+            if len(params) != dict(_MODELS.values()).get(model, len(params)):
+                raise ValueError("parameters missing")
+            cameras[int(camera_id)] = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
+        return cameras
+    points = [tuple(map(float, row[1:7])) for row in rows]
+    if any(len(point) != 6 for point in points):
         raise ValueError("columns missing")
-    return rows
-
-
-_PARSERS = {
-    ".bin": (_cameras_binary, _images_binary, _points_binary),
-    ".txt": (_cameras_text, _images_text, _points_text),
-}
+    return points

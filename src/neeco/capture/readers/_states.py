@@ -40,10 +40,20 @@ def read_states(path: Path, instruments: Sequence[Instrument]) -> list[StateLine
     pose that is not rigid, a joint outside its limits.
     """
     missing = "no such file; give a file of states"
-    lines = read_text(Path(path), "one JSON object per line", missing).split("\n")
-    states = [
-        _parse_line(line, f"{path}: line {number}", instruments) for number, line in enumerate(lines, 1) if line.strip()
-    ]
+    states = []
+    for number, line in enumerate(read_text(Path(path), "one JSON object per line", missing).split("\n"), 1):
+        where = f"{path}: line {number}"
+        if not line.strip():
+            continue
+        try:
+            value = json.loads(line, object_pairs_hook=distinct_keys)
+        except RepeatedKeyError as error:
+            raise NeecoError(f"{where}: {error}") from None
+        except (ValueError, RecursionError) as error:  # RecursionError, ValueError: endless nesting and numbers
+            reason = error.msg if isinstance(error, json.JSONDecodeError) else "a number or the nesting is too large"
+            raise NeecoError(f"{where}: not valid JSON: {reason}; give one JSON object per line") from None
+        with faults_in(where):
+            states.append(_parse_state_line(Node(value, where), instruments))
     if not states:
         raise NeecoError(f"{path}: contains no states; write one JSON object per line")
     return states
@@ -153,18 +163,6 @@ def _parse_uncertainty(node: Node, joints: Iterable[str]) -> Uncertainty:
     return Uncertainty((across, down, depth), (tilt, turn, roll), named)
 
 
-def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> StateLine:
-    try:
-        value = json.loads(text, object_pairs_hook=distinct_keys)
-    except RepeatedKeyError as error:
-        raise NeecoError(f"{where}: {error}") from None
-    except (ValueError, RecursionError) as error:  # RecursionError, ValueError: endless nesting and numbers
-        reason = error.msg if isinstance(error, json.JSONDecodeError) else "a number or the nesting is too large"
-        raise NeecoError(f"{where}: not valid JSON: {reason}; give one JSON object per line") from None
-    with faults_in(where):
-        return _parse_state_line(Node(value, where), instruments)
-
-
 def _parse_state_line(node: Node, instruments: Sequence[Instrument]) -> StateLine:
     listed = node.child("instruments")
     if not isinstance(listed.value, list):
@@ -178,7 +176,12 @@ def _parse_state_line(node: Node, instruments: Sequence[Instrument]) -> StateLin
         if name.value in parsed:
             name.fail(f"{printable(name.value)} is listed twice", "keep one state per instrument")
         parsed[name.value] = _parse_state(item)[1]
-        _check_joints(item, by_name[name.value])
+        joints, instrument = item.child("joints"), by_name[name.value]
+        if not all(joints.has(joint) for joint in instrument.joints if joint not in instrument.unrecorded):
+            joints.fail(f"expected these joints, in rad: {', '.join(instrument.joints)}")
+        for joint, angle in (joints.value or {}).items():
+            if (fault := instrument.joint_fault(joint, angle)) is not None:
+                joints.child(joint).fail(*fault)
     if missing := [name for name in by_name if name not in parsed]:
         listed.fail(f"{', '.join(missing)} missing", "give every instrument of the scene")
     camera = node.child("camera")
@@ -194,13 +197,3 @@ def _parse_state_line(node: Node, instruments: Sequence[Instrument]) -> StateLin
         for name, item in by_name.items()
     }
     return StateLine(State(states, node.given("time", Node.number, 0.0)), pose)
-
-
-def _check_joints(item: Node, instrument: Instrument) -> None:
-    """Raise Fault for a missing or unknown joint, or an impossible joint value."""
-    joints = item.child("joints")
-    if not all(joints.has(joint) for joint in instrument.joints if joint not in instrument.unrecorded):
-        joints.fail(f"expected these joints, in rad: {', '.join(instrument.joints)}")
-    for joint, value in (joints.value or {}).items():
-        if (fault := instrument.joint_fault(joint, value)) is not None:
-            joints.child(joint).fail(*fault)

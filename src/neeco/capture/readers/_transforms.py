@@ -68,8 +68,13 @@ def parse_transforms(
             _parse_points(document, file.parent, parsed)
         declared = {item.name: item for item in declared_instruments(document)} | declared
     parsed.instruments = all_instruments(parsed.frames, tuple(declared.values()))
-    for document in documents:
-        _warn_of_unread_states(document, parsed)
+    for document in documents if not parsed.instruments else ():
+        for index, frame in enumerate(_frame_objects(document)):  # states under other keys than `instruments`
+            if keys := [key for key in STATE_LIKE if frame.get(key) is not None]:
+                message = "is ignored: instrument states must be in `instruments`"
+                remedy = 'write [{"name", "pose": 4x4 mm, "joints": {name: rad}}] there'
+                document.child("frames").item(index).child(keys[0]).warning(message, remedy)
+                break
     if not blender:
         return _by_name(parsed)
     if not parsed.instruments and not any("time" in frame for one in documents for frame in _frame_objects(one)):
@@ -98,17 +103,6 @@ def _by_name(parsed: Parsed) -> Parsed:
 def _frame_objects(document: Node) -> list[dict[str, Any]]:
     frames = document.value.get("frames")
     return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
-
-
-def _warn_of_unread_states(document: Node, parsed: Parsed) -> None:
-    """Warn of states under other keys than `instruments`, if no frame has that key."""
-    for index, frame in enumerate(_frame_objects(document)):
-        keys = [key for key in STATE_LIKE if frame.get(key) is not None]
-        if keys and not parsed.instruments:
-            message = "is ignored: instrument states must be in `instruments`"
-            remedy = 'write [{"name", "pose": 4x4 mm, "joints": {name: rad}}] there'
-            document.child("frames").item(index).child(keys[0]).warning(message, remedy)
-            return
 
 
 def _parse_header(document: Node, parsed: Parsed) -> None:
@@ -167,23 +161,18 @@ def _parse_frames(
             camera = replace(camera, world_from_camera=opencv)
         parsed.frames.append(Frame(image_path, camera, State(instruments, time), name, mask_path, background))
         parsed.places.append(node)
-    _count_shared(document.report, first, len(nodes))
+    # equal problems of the top-level camera become one, with the number of frames concerned, before those of frames
+    new_problems = document.report.problems[first:]
+    shared = Counter(problem for problem in new_problems if not problem.field.startswith("frames["))
+    merged = []
+    for problem, count in shared.items():
+        concerned = "" if len(nodes) == 1 else f", for {count} of {len(nodes)} frames"
+        merged.append(replace(problem, message=problem.message + concerned))
+    document.report.problems[first:] = [*merged, *(problem for problem in new_problems if problem not in shared)]
     if timed < len(nodes):  # unless every frame has a time, all get their index, so that units are not mixed
         parsed.timed = False
         for order, frame in enumerate(parsed.frames):
             parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
-
-
-def _count_shared(report: ProblemReport, first: int, frames: int) -> None:
-    """Merge equal problems, from index `first`, of the top-level camera, with the number of frames concerned; they
-    precede the problems of frames."""
-    new_problems = report.problems[first:]
-    shared = Counter(problem for problem in new_problems if not problem.field.startswith("frames["))
-    merged = []
-    for problem, count in shared.items():
-        concerned = "" if frames == 1 else f", for {count} of {frames} frames"
-        merged.append(replace(problem, message=problem.message + concerned))
-    report.problems[first:] = [*merged, *(problem for problem in new_problems if problem not in shared)]
 
 
 def _time(node: Node) -> float:

@@ -66,7 +66,23 @@ def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
     poses = LLFF.camera_to_opencv(rows[:, :15].reshape(-1, 3, 5)[..., :4])
     if len(rows) == len(table):
         parsed.points = _points([frame.camera for frame in parsed.frames], poses, *table[:, 15:].T)
-    _warn_of_limits(root, poses, file)
+    remedy = "only methods without instrument states can be trained, such as 3dgs"
+    file.child("instruments").warning("no instrument states", remedy)
+    file.child("units").warning("has no unit of length", "mm is assumed: distances may be wrong")
+    if len(poses) > 1 and np.ptp(poses, axis=0).max() < MAX_STILL_CHANGE:
+        message = "the camera never moves, so the images do not determine depth"
+        file.child("poses").warning(message, "views other than the recorded one will be wrong")
+    elif len(poses) > 1:
+        remedy = "folders prepared for some EndoNeRF successors have right, down, forwards: reorder those"
+        file.child("poses").warning("LLFF's camera axes are assumed: down, right, backwards", remedy)
+    if (root / MASKS).is_dir():
+        message = "tool masks (white = tool) are not loss masks (black = ignored) and are left out"
+        remedy = (
+            f"`neeco ingest {printable(root.name)} --output CAPTURE` converts them to loss masks that ignore the tool"
+        )
+        report.warning(f"{MASKS}/", "", message, remedy)
+    if (root / "depth").is_dir():
+        report.warning("depth/", "", "depth maps are not read", "training starts from random points")
     return parsed
 
 
@@ -128,24 +144,3 @@ def _points(cameras: Sequence[Camera], poses: np.ndarray, near: np.ndarray, far:
     centers = poses[:, :3, 3] + middles[:, None] * poses[:, :3, 2]
     slopes = np.array([0.5 * camera.width / camera.fx for camera in cameras])
     return random_points(centers.mean(axis=0), max((slopes * middles).max(), (0.5 * (far - near)).max()))
-
-
-def _warn_of_limits(root: Path, poses: np.ndarray, file: Node) -> None:
-    """Warn of missing data, and of files that are not read."""
-    remedy = "only methods without instrument states can be trained, such as 3dgs"
-    file.child("instruments").warning("no instrument states", remedy)
-    file.child("units").warning("has no unit of length", "mm is assumed: distances may be wrong")
-    if len(poses) > 1 and np.ptp(poses, axis=0).max() < MAX_STILL_CHANGE:
-        message = "the camera never moves, so the images do not determine depth"
-        file.child("poses").warning(message, "views other than the recorded one will be wrong")
-    elif len(poses) > 1:
-        remedy = "folders prepared for some EndoNeRF successors have right, down, forwards: reorder those"
-        file.child("poses").warning("LLFF's camera axes are assumed: down, right, backwards", remedy)
-    if (root / MASKS).is_dir():
-        message = "tool masks (white = tool) are not loss masks (black = ignored) and are left out"
-        remedy = (
-            f"`neeco ingest {printable(root.name)} --output CAPTURE` converts them to loss masks that ignore the tool"
-        )
-        file.report.warning(f"{MASKS}/", "", message, remedy)
-    if (root / "depth").is_dir():
-        file.report.warning("depth/", "", "depth maps are not read", "training starts from random points")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -196,7 +196,12 @@ def read_urdf(
         raise NeecoError(f"{path}: expected one root link, found {', '.join(tops) or 'none'}; set `root`")
     first = tops[0] if root is None else root
     assert first is not None
-    reached = [(first, None), *((joint.child, joint) for joint in _below(first, children, path))]
+    reached: list[tuple[str, Any]] = [(first, None)]  # links and the joints that carry them, parents first
+    for name, _ in reached:  # which grows
+        for joint in children.get(name, []):
+            if any(joint.child == other for other, _ in reached):
+                raise NeecoError(f"{path}: {joint.child!r} has several paths to the root; give every link one parent")
+            reached.append((joint.child, joint))
     for key, defined in (("link", [link.name for link in robot.links]), ("joint", [j.name for j in robot.joints])):
         if twice := next((name for name in defined if defined.count(name) > 1), None):
             raise NeecoError(f"{path}: {key} {twice!r} is defined twice; rename one of them")
@@ -225,7 +230,13 @@ def _parse(path: Path) -> Any:
     except ImportError:
         raise NeecoError(f"{path}: needs urdfdom-py to be read; {install_hint('urdf')}") from None
     text = read_text(path, URDF)
-    _refuse_xacro(path, text)
+    # unprocessed xacro, of which a URDF parser would ignore the macros
+    plain = _COMMENT.sub("", text)
+    prefixes = "|".join(map(re.escape, {"xacro", *_XACRO_PREFIX.findall(plain)}))
+    if _SUBSTITUTION.search(plain) or re.search(rf"[<\s/](?:{prefixes}):[\w.-]+[\s=/>]", plain):
+        stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
+        target = f"{stem}.urdf" if path.suffix == ".xacro" else f"{stem}_processed.urdf"
+        raise NeecoError(f"{path}: is xacro; run `xacro {path.name} > {target}` and give the result")
     core.on_error = lambda message: None  # it would print unknown tags
     try:
         return urdf.URDF.from_xml_string(text.encode())
@@ -233,28 +244,6 @@ def _parse(path: Path) -> Any:
     except Exception as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise NeecoError(f"{path}: cannot be read as {URDF} ({reason}); correct it") from None
-
-
-def _refuse_xacro(path: Path, text: str) -> None:
-    """Raise NeecoError for unprocessed xacro, of which a URDF parser would ignore the macros."""
-    text = _COMMENT.sub("", text)
-    prefixes = "|".join(map(re.escape, {"xacro", *_XACRO_PREFIX.findall(text)}))
-    if _SUBSTITUTION.search(text) or re.search(rf"[<\s/](?:{prefixes}):[\w.-]+[\s=/>]", text):
-        stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
-        target = f"{stem}.urdf" if path.suffix == ".xacro" else f"{stem}_processed.urdf"
-        raise NeecoError(f"{path}: is xacro; run `xacro {path.name} > {target}` and give the result")
-
-
-def _below(first: str, children: Mapping[str, list[Any]], path: Path) -> Iterator[Any]:
-    """Yield the joints distal to a link, parents first. Raises NeecoError for a cycle."""
-    queue, visited = [first], {first}
-    while queue:
-        for joint in children.get(queue.pop(0), []):
-            if joint.child in visited:
-                raise NeecoError(f"{path}: {joint.child!r} has several paths to the root; give every link one parent")
-            visited.add(joint.child)
-            queue.append(joint.child)
-            yield joint
 
 
 def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body: bool, path: Path) -> Link:
@@ -272,8 +261,13 @@ def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body:
         raise NeecoError(f"{path}: joint {joint.name!r}: its axis is not a direction; give three numbers, not all 0")
     axis = origin[:3, :3] @ (axis / length)
     unit = MM if kind == PRISMATIC else 1.0
-    limit = joint.limit
-    limits = None if limit is None or joint.type == "continuous" else _limits(limit, unit, joint.name, path)
+    limits = None
+    if joint.limit is not None and joint.type != "continuous":
+        low, high = unit * float(joint.limit.lower or 0.0), unit * float(joint.limit.upper or 0.0)
+        if not (low == high == 0.0 or (math.isfinite(low) and math.isfinite(high) and low < high)):
+            problem = f"its limits {low:g} to {high:g} are not a range; correct them"
+            raise NeecoError(f"{path}: joint {joint.name!r}: {problem}")
+        limits = None if low == high == 0.0 else (low, high)  # zeros are URDF's default: no limits
     driver, gain, offset = joint.name, 1.0, 0.0
     if joint.mimic is not None:
         driver = joint.mimic.joint
@@ -286,12 +280,3 @@ def _link(joint: Any, joints: Mapping[str, Any], names: Mapping[str, str], body:
         offset = unit * float(joint.mimic.offset or 0.0)
     value = {names.get(driver, driver): gain}
     return Link(joint.child, joint.parent, kind, origin, axis, value, offset=offset, limits=limits, body=body)
-
-
-def _limits(limit: Any, unit: float, name: str, path: Path) -> tuple[float, float] | None:
-    low, high = unit * float(limit.lower or 0.0), unit * float(limit.upper or 0.0)
-    if low == high == 0.0:  # URDF's default: no limits
-        return None
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise NeecoError(f"{path}: joint {name!r}: its limits {low:g} to {high:g} are not a range; correct them")
-    return low, high

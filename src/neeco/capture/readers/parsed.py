@@ -12,7 +12,6 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import follows_links
-from neeco.base.plausible import Fault
 from neeco.capture.documents import Node, Problem, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, Instrument, InstrumentState
@@ -101,7 +100,11 @@ def named_file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...]
     text = node.text()
     candidates = [inside(root, folder, text + extension) for extension in ("", *extensions)]
     if not (existing := [candidate for candidate in candidates if candidate.is_file()]):
-        node.fail(*missing_file(folder, text))
+        message, similar = f"no such file: {printable(text)}", similar_file(folder, text)
+        if similar is None:
+            node.fail(message, NOWHERE)
+        form = ", in another Unicode form or case" if _normal(similar) == _normal(text) else ""
+        node.fail(message, f"{printable(similar)} exists{form}: correct the path")
     return existing[0]
 
 
@@ -145,15 +148,6 @@ def instants(names: Sequence[str], lenses: Sequence[Hashable]) -> list[int] | No
 def relative_name(file: Path, root: Path) -> str:
     """Return the name of a file of the capture for messages."""
     return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name
-
-
-def missing_file(folder: Path, text: str) -> Fault:
-    """Return the fault and remedy for a path, relative to `folder`, without a file."""
-    message, similar = f"no such file: {printable(text)}", similar_file(folder, text)
-    if similar is None:
-        return message, NOWHERE
-    form = ", in another Unicode form or case" if _normal(similar) == _normal(text) else ""
-    return message, f"{printable(similar)} exists{form}: correct the path"
 
 
 def similar_file(folder: Path, text: str) -> str | None:

@@ -125,8 +125,9 @@ def word(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
-def matrix_numbers(where: Path | str, value: Any, field: str) -> list[float]:
-    """The numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested) lists."""
+def matrix_numbers(where: Path | str, value: Any, field: str, count: int | None = None) -> list[float]:
+    """The `count` numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested)
+    lists."""
     if isinstance(value, dict):
         value = value.get("data")
     if value is None:
@@ -141,6 +142,8 @@ def matrix_numbers(where: Path | str, value: Any, field: str) -> list[float]:
                 problem = f"{printable(entry)} is not a usable number; write it as OpenCV does"
                 raise NeecoError(f"{where}: {field}: {problem}")
             flat.append(number)
+    if count not in (None, len(flat)):
+        raise NeecoError(f"{where}: {field}: needs {count} numbers, has {len(flat)}; write it as OpenCV does")
     return flat
 
 
@@ -213,41 +216,31 @@ def _camera(where: Path | str, keys: Mapping[str, Any], pair_of: bool = False) -
         raise _unread_model(where, min(unread))
     matrix, listed = first_of(keys, _MATRIX), first_of(keys, _INTRINSICS)
     if isinstance(matrix, dict | list):
-        values = matrix_numbers(where, matrix, "camera_matrix")
-        if len(values) != 9:
-            raise NeecoError(f"{where}: camera_matrix: needs 9 numbers, has {len(values)}; write it as OpenCV does")
+        values = matrix_numbers(where, matrix, "camera_matrix", 9)
         if values[2] == values[5] == 0 and all(values[6:8]):
             raise NeecoError(f"{where}: camera_matrix: stands column by column; write it row by row, as OpenCV does")
         four = [values[0], values[4], values[2], values[5]]
     elif isinstance(listed, list):
         four = matrix_numbers(where, listed, "intrinsics")
     else:
-        named = _plain(listed) if isinstance(listed, dict) else keys
-        names = next(names for names in _FOCAL if set(names) <= set(named))
-        four = matrix_numbers(where, [named[name] for name in names], ", ".join(names))
+        intrinsics = _plain(listed) if isinstance(listed, dict) else keys
+        focal = next(names for names in _FOCAL if set(names) <= set(intrinsics))
+        four = matrix_numbers(where, [intrinsics[name] for name in focal], ", ".join(focal))
     size = next(((keys[w], keys[h]) for w, h in _SIZES if w in keys and h in keys), (None, None))
     both = first_of(keys, _SIZE_LISTS)
     if isinstance(both, list) and len(both) == 2:
         size = (both[0], both[1])
     fisheye = bool(models & FISHEYE)
-    bends = _distortion(where, keys, fisheye)
-    if pair_of and matrix is not None and not bends and first_of(keys, _DISTORTION) is None:
-        raise NeecoError(f"{where}: distortion: not there for two cameras; give D1 and D2, zeros where there is none")
-    return CameraNumbers((four[0], four[1], four[2], four[3]), tuple(bends), size, fisheye, keys)
-
-
-def _distortion(where: Path | str, keys: Mapping[str, Any], fisheye: bool) -> list[float]:
-    """Return the coefficients of a vector, or by name, among all keys or in a section of their own."""
-    vector = first_of(keys, _DISTORTION)
-    if vector is not None:
-        return matrix_numbers(where, vector, "distortion_coefficients")
-    named = dict(keys)
+    bends, vector, named = list[float](), first_of(keys, _DISTORTION), dict(keys)
     for section in (keys.get("projectionparameters"), keys.get("distortionparameters")):
         named |= _plain(section) if isinstance(section, dict) else {}
-    names = _COEFFICIENTS if not fisheye else _FISHEYE_COEFFICIENTS["mu" in named]
+    names: tuple[str, ...] = _COEFFICIENTS if not fisheye else _FISHEYE_COEFFICIENTS["mu" in named]
     present = [index for index, name in enumerate(names) if named.get(name) is not None]
-    if not present:
-        return []
-    count = next(length for length in (4, 5, 8) if length > present[-1])
-    values = [named.get(name) or 0.0 for name in names[:count]]
-    return matrix_numbers(where, values, ", ".join(names[:count]))
+    if vector is not None:
+        bends = matrix_numbers(where, vector, "distortion_coefficients")
+    elif present:  # by name, among all keys or in a section of their own
+        names = names[: next(length for length in (4, 5, 8) if length > present[-1])]
+        bends = matrix_numbers(where, [named.get(name) or 0.0 for name in names], ", ".join(names))
+    if pair_of and matrix is not None and not bends and vector is None:
+        raise NeecoError(f"{where}: distortion: not there for two cameras; give D1 and D2, zeros where there is none")
+    return CameraNumbers((four[0], four[1], four[2], four[3]), tuple(bends), size, fisheye, keys)

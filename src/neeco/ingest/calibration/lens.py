@@ -57,29 +57,24 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
     require_file(source, "a calibration as YAML, XML or JSON")
     document = read_calibration(source)
     cameras = () if isinstance(document, dict) and "fl_x" in document else cameras_in(source, document)
-    if source.suffix.lower() == ".json" and not cameras:
-        return _nerfstudio(source, document)
-    if not cameras:
+    if cameras:
+        return lens_of(source, cameras[0])
+    if source.suffix.lower() != ".json":
         problem = "camera_matrix: missing" if isinstance(document, dict) else "no keys"
         raise NeecoError(f"{source}: {problem}; expected {EXPECTED}")
-    return lens_of(source, cameras[0])
-
-
-def _nerfstudio(path: Path, document: Any) -> Lens:
     if not isinstance(document, dict):
-        raise NeecoError(f"{path}: expected an object with fl_x, fl_y, cx, cy")
-    size = image_size(path, document.get("w"), document.get("h"))
-    missing = [key for key in ("fl_x", "cx", "cy") if key not in document]
-    if missing:
-        raise NeecoError(f"{path}: {missing[0]}: missing; give fl_x, fl_y, cx, cy (and k1, k2, p1, p2 if distorted)")
+        raise NeecoError(f"{source}: expected an object with fl_x, fl_y, cx, cy")
+    size = image_size(source, document.get("w"), document.get("h"))
+    if missing := [key for key in ("fl_x", "cx", "cy") if key not in document]:
+        raise NeecoError(f"{source}: {missing[0]}: missing; give fl_x, fl_y, cx, cy (and k1, k2, p1, p2 if distorted)")
     values = [document["fl_x"], document.get("fl_y", document["fl_x"]), document["cx"], document["cy"]]
-    with faults_in(path):
-        stated = stated_distortion(Node(document, str(path)).child)
-    lens = checked_lens(path, values, (), size)
+    with faults_in(source):
+        stated = stated_distortion(Node(document, str(source)).child)
+    lens = checked_lens(source, values, (), size)
     try:
         return replace(lens, distortion=opencv_distortion(stated.model, stated.coefficients, lens.intrinsics, size))
     except NeecoError as error:
-        raise NeecoError(f"{path}: distortion: {error}") from None
+        raise NeecoError(f"{source}: distortion: {error}") from None
 
 
 def lens_of(where: Path | str, camera: CameraNumbers) -> Lens:
@@ -106,13 +101,20 @@ def checked_lens(
     if len(values) != 4 or min(values[:2]) <= 0:
         raise NeecoError(f"{source}: fl_x, fl_y: must be two positive focal lengths in pixels; correct them")
     coefficients = tuple(float(value) for value in distortion)
-    if fisheye:
-        coefficients = _rational(source, [float(value) for value in values], coefficients, size)
+    fl_x, fl_y, cx, cy = (float(value) for value in values)
+    if fisheye and len(coefficients) != 4:
+        problem = f"a fisheye lens has 4 coefficients, not {len(coefficients)}; calibrate again"
+        raise NeecoError(f"{source}: distortion: {problem}")
+    if fisheye:  # Kannala & Brandt 2006
+        named = dict(zip(FISHEYE_DISTORTION, coefficients, strict=True))
+        try:
+            coefficients = opencv_distortion(FISHEYE_MODEL, named, (fl_x, fl_y, cx, cy), size)
+        except NeecoError as error:
+            raise NeecoError(f"{source}: distortion: {error}") from None
     if len(coefficients) not in COEFFICIENT_COUNTS:
         raise NeecoError(f"{source}: distortion: has {len(coefficients)} coefficients; OpenCV has 4, 5, 8, 12 or 14")
     if not any(coefficients):
         coefficients = ()
-    fl_x, fl_y, cx, cy = (float(value) for value in values)
     return Lens(fl_x, fl_y, cx, cy, coefficients, size)
 
 
@@ -126,38 +128,39 @@ def image_size(path: Path | str, width: Any, height: Any) -> tuple[int, int] | N
     return int(width), int(height)
 
 
-def _rational(
-    source: object, values: Sequence[float], fisheye: Sequence[float], size: tuple[int, int] | None
-) -> tuple[float, ...]:
-    """OpenCV's coefficients of a lens with four of a fisheye (Kannala & Brandt 2006). Raises NeecoError."""
-    if len(fisheye) != 4:
-        problem = f"a fisheye lens has 4 coefficients, not {len(fisheye)}; calibrate again"
-        raise NeecoError(f"{source}: distortion: {problem}")
-    fl_x, fl_y, cx, cy = values
-    coefficients = dict(zip(FISHEYE_DISTORTION, fisheye, strict=True))
-    try:
-        return opencv_distortion(FISHEYE_MODEL, coefficients, (fl_x, fl_y, cx, cy), size)
-    except NeecoError as error:
-        raise NeecoError(f"{source}: distortion: {error}") from None
-
-
 def find_border(images: Iterable[np.ndarray]) -> Border | None:
     """The dark border around a round field of view; None when the images have no such border.
 
     images: uint8 [H, W, 3], frames spread over the recording (10 or more; at most BORDERS.max_frames are used). The
     border stays at the black level although the scene lights up pixels next to it. Only one with a circular edge, sharp
     all along, counts: dark corners of a dim scene are none."""
-    brightness = _brightest(images)
-    if brightness is None or min(brightness.shape) < 32:
+    stack = [image.max(axis=2).astype(np.float32) for image in islice(images, BORDERS.max_frames)]
+    if not stack or min(stack[0].shape) < 32:
         return None
-    threshold = _dark_threshold(brightness)
-    if threshold is None:
+    # the second brightest of ten, so that one flash or one damaged frame does not light up the border
+    brightness = ndimage.gaussian_filter(np.percentile(np.stack(stack), 90, axis=0), 1.0)
+    # the brightness between border and scene, from the corners' black level up
+    height, width = brightness.shape
+    size = max(min(height, width) // 40, 2)
+    ends = (slice(size), slice(-size, None))
+    corners = [brightness[rows, columns] for rows in ends for columns in ends]
+    black = sorted(float(np.median(corner)) for corner in corners)[1]
+    spread = max(float(np.median([np.std(corner) for corner in corners])), 0.5)
+    scene = float(np.percentile(brightness[height // 4 : -height // 4, width // 4 : -width // 4], 25))
+    if black > BORDERS.max_black or scene < black + 6 * spread + 4:
         return None
-    dark = ndimage.binary_opening(brightness < threshold, iterations=1)
-    outside = _touching_corners(dark)
+    threshold = black + max(0.15 * (scene - black), 4 * spread)
+    # the dark regions that hold a corner of the image
+    labels, _ = ndimage.label(ndimage.binary_opening(brightness < threshold, iterations=1))
+    outside = np.isin(labels, list({int(labels[row, column]) for row in (1, -2) for column in (1, -2)} - {0}))
     if outside.sum() < 0.01 * outside.size:
         return None
-    circle = _fit_circle(_border_edge(outside))
+    # the pixels of the scene next to them, without those at the image's edge
+    edge = ndimage.binary_dilation(outside) & ~outside
+    edge[:2] = edge[-2:] = False
+    edge[:, :2] = edge[:, -2:] = False
+    rows, columns = np.nonzero(edge)
+    circle = _fit_circle(np.stack([columns, rows], axis=1).astype(np.float64))
     if circle is None or not _divides_dark_from_bright(circle, outside, brightness, threshold):
         return None
     x, y, radius = circle
@@ -169,46 +172,6 @@ def visible_mask(border: Border, size: tuple[int, int]) -> np.ndarray:
     x, y, radius = border
     rows, columns = np.indices(size[::-1])
     return np.hypot(columns + 0.5 - x, rows + 0.5 - y) < radius * (1 - BORDERS.edge_margin) - 0.5
-
-
-def _brightest(images: Iterable[np.ndarray]) -> np.ndarray | None:
-    """Return float [H, W], the brightness of each pixel in its brightest frames, smoothed."""
-    stack = [image.max(axis=2).astype(np.float32) for image in islice(images, BORDERS.max_frames)]
-    if not stack:
-        return None
-    # the second brightest of ten, so that one flash or one damaged frame does not light up the border
-    return ndimage.gaussian_filter(np.percentile(np.stack(stack), 90, axis=0), 1.0)
-
-
-def _dark_threshold(brightness: np.ndarray) -> float | None:
-    """The brightness between border and scene, from the corners' black level up."""
-    height, width = brightness.shape
-    size = max(min(height, width) // 40, 2)
-    ends = (slice(size), slice(-size, None))
-    corners = [brightness[rows, columns] for rows in ends for columns in ends]
-    levels = sorted(float(np.median(corner)) for corner in corners)
-    black, spread = levels[1], float(np.median([np.std(corner) for corner in corners]))
-    middle = brightness[height // 4 : -height // 4, width // 4 : -width // 4]
-    scene = float(np.percentile(middle, 25))
-    if black > BORDERS.max_black or scene < black + 6 * max(spread, 0.5) + 4:
-        return None
-    return black + max(0.15 * (scene - black), 4 * max(spread, 0.5))
-
-
-def _touching_corners(dark: np.ndarray) -> np.ndarray:
-    """The dark regions that hold a corner of the image."""
-    labels, _ = ndimage.label(dark)
-    touching = {int(labels[row, column]) for row in (1, -2) for column in (1, -2)} - {0}
-    return np.isin(labels, list(touching))
-
-
-def _border_edge(outside: np.ndarray) -> np.ndarray:
-    """Return the pixels [M, 2] (x, y) of the scene next to the dark region, without those at the image's edge."""
-    edge = ndimage.binary_dilation(outside) & ~outside
-    edge[:2] = edge[-2:] = False
-    edge[:, :2] = edge[:, -2:] = False
-    rows, columns = np.nonzero(edge)
-    return np.stack([columns, rows], axis=1).astype(np.float64)
 
 
 def _fit_circle(points: np.ndarray) -> tuple[float, float, float] | None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import configparser
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
@@ -65,8 +65,11 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     """
     path = Path(path)
     if path.is_dir():
-        left, right = _pair_of_files(path)
-        return from_projections(_one_camera(left), _one_camera(right))
+        files = [file for file in visible_entries(path) if file.suffix.lower() in (".yaml", ".yml")]
+        left, right = ([file for file in files if side in file.stem.lower()] for side in ("left", "right"))
+        if len(left) != 1 or len(right) != 1:
+            raise NeecoError(f"{path}: holds no one left and one right calibration; name the file of one as left.yaml")
+        return from_projections(_one_camera(left[0]), _one_camera(right[0]))
     require_file(path, EXPECTED)
     document = _of_ini(path) if path.suffix.lower() == ".ini" else read_calibration(path)
     if not isinstance(document, dict):
@@ -77,7 +80,10 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     if len(cameras) == 2:
         return _two_cameras(path, document, *cameras)
     if cameras and first_of(cameras[0].keys, _PROJECTION) is not None:
-        return from_projections(RosCamera(path, cameras[0]), _one_camera(_right_beside(path)))
+        for one, other in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
+            if one in path.name and (beside := path.with_name(path.name.replace(one, other))).is_file():
+                return from_projections(RosCamera(path, cameras[0]), _one_camera(beside))
+        raise NeecoError(f"{path}: is one camera's; put the right camera's next to it, as left.yaml and right.yaml")
     raise NeecoError(f"{path}: camera matrices: not there for two cameras; expected {EXPECTED}")
 
 
@@ -100,7 +106,8 @@ class RosCamera:
 
     def rectification(self) -> np.ndarray:
         """Return rectified_from_camera [3, 3]. Raises NeecoError."""
-        turn = _numbers(self.where, self.camera.keys, _RECTIFICATION, 9).reshape(3, 3)
+        value = first_of(self.camera.keys, _RECTIFICATION)
+        turn = np.reshape(matrix_numbers(self.where, value, _RECTIFICATION[0], 9), (3, 3))
         if rotation_error(turn) > STEREO.rotation_tolerance:
             problem = "is no rotation; calibrate the two cameras as one stereo rig"
             raise NeecoError(f"{self.where}: rectification_matrix: {problem}")
@@ -108,7 +115,8 @@ class RosCamera:
 
     def projection(self) -> np.ndarray:
         """Return the projection matrix [3, 4]. Raises NeecoError."""
-        return _numbers(self.where, self.camera.keys, _PROJECTION, 12).reshape(3, 4)
+        value = first_of(self.camera.keys, _PROJECTION)
+        return np.reshape(matrix_numbers(self.where, value, _PROJECTION[0], 12), (3, 4))
 
 
 def from_projections(left: RosCamera, right: RosCamera) -> tuple[Lens, Lens, np.ndarray]:
@@ -142,8 +150,8 @@ def _two_cameras(
     keys = {word(str(name)): value for name, value in document.items()}
     of_pair = {**right.keys, **keys}
     for names, turned_back in ((_RIGHT_FROM_LEFT, False), (_LEFT_FROM_RIGHT, True)):
-        if first_of(of_pair, names) is not None:
-            matrix = _numbers(path, of_pair, names, 16).reshape(4, 4)
+        if (stated := first_of(of_pair, names)) is not None:
+            matrix = np.reshape(matrix_numbers(path, stated, names[0], 16), (4, 4))
             matrix = np.linalg.inv(matrix) if turned_back and np.linalg.det(matrix) else matrix
             return *lenses, _pose(path, matrix[:3, :3].ravel(), matrix[:3, 3])
     source, turn, shift = path, first_of(keys, _TURNS), first_of(keys, _SHIFTS)
@@ -201,29 +209,6 @@ def _one_camera(path: Path) -> RosCamera:
     if not cameras:
         raise NeecoError(f"{path}: camera_matrix: missing; expected the camera_info of one camera, as ROS saves it")
     return RosCamera(path, cameras[0])
-
-
-def _pair_of_files(folder: Path) -> tuple[Path, Path]:
-    files = [file for file in visible_entries(folder) if file.suffix.lower() in (".yaml", ".yml")]
-    left, right = ([file for file in files if side in file.stem.lower()] for side in ("left", "right"))
-    if len(left) != 1 or len(right) != 1:
-        raise NeecoError(f"{folder}: holds no one left and one right calibration; name the file of one as left.yaml")
-    return left[0], right[0]
-
-
-def _right_beside(path: Path) -> Path:
-    for left, right in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
-        other = path.with_name(path.name.replace(left, right))
-        if left in path.name and other.is_file():
-            return other
-    raise NeecoError(f"{path}: is one camera's; put the right camera's next to it, as left.yaml and right.yaml")
-
-
-def _numbers(path: Path | str, document: Mapping[str, Any], names: tuple[str, ...], count: int) -> np.ndarray:
-    values = matrix_numbers(path, first_of(document, names), names[0])
-    if len(values) != count:
-        raise NeecoError(f"{path}: {names[0]}: needs {count} numbers, has {len(values)}; write it as ROS does")
-    return np.array(values)
 
 
 def _lens(path: Path, camera: CameraNumbers) -> Lens:

@@ -28,7 +28,7 @@ from neeco.capture.model import UNKNOWN_DEG, Capture, Instrument
 from neeco.capture.readers import read_capture
 from neeco.ingest.posing.along_shaft import Load, Measurements, Shafts, measure, read_measurements, write_measurements
 from neeco.ingest.posing.angles import SETTINGS, AnglePosterior, chain_breaks, solve_joint, solve_rolls
-from neeco.ingest.recording.sections import Name
+from neeco.ingest.readers.sections import Name
 
 FILE = "hand_posed.yaml"
 HEADER = """\

@@ -274,17 +274,6 @@ def compare_counts(
     return () if images == rows else (f"{file.name}: {counts}; both are assumed to start at the same time",)
 
 
-def compare_lengths(file: Path, video: VideoSource, rows: int, image_hz: float) -> tuple[str, ...]:
-    """`compare_counts` for states recorded one per image of a video at `image_hz` images per second, whatever rate the
-    video file states."""
-    images = round(float(video.times[-1] - video.times[0]) * image_hz) + 1
-    is_rate = images != rows and abs(len(video.times) - rows) <= 1
-    fps = f"its {len(video.times)} images match the states: set `fps: {image_hz:g}`"
-    return compare_counts(
-        file, images, rows, f"states at {image_hz:g} Hz", MAX_UNLIKE, fps if is_rate else "give the video of this log"
-    )
-
-
 def numbers(table: Table, columns: Sequence[str]) -> np.ndarray:
     """Return columns as numbers [R, C], NaN for missing or invalid ones. Raises NeecoError if a column does not
     exist."""

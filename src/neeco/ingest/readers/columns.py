@@ -1,17 +1,15 @@
-"""The meaning and unit of a log's columns: as a recording states them, or as common loggers name them."""
+"""The meaning and unit of a log's columns, as common loggers name them."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated
 
 from neeco.base.errors import NeecoError
-from neeco.capture.documents import Node, printable
 
 TRACKER_CLOCK = "em"  # default name of a tracker's clock
 VIDEO_CLOCK = "video"  # clock of the images, and of logs in the same file
@@ -33,71 +31,6 @@ _ALIASES = {
     "usec": "us", "microseconds": "us", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanoseconds": "ns",
 }  # fmt: skip
 _UNIT_SUFFIX = re.compile(r"^(?P<base>.*?)(?:[\s_\-/]+|[\s_]*[\[(]\s*)(?P<unit>[a-zµ°]+)\s*[\])]?$")
-
-
-def _unit(kind: str) -> Callable[[Node], str]:
-    """Return the parser of a unit."""
-
-    def parse(node: Node) -> str:
-        unit = canonical_unit(str(node.value))
-        if unit not in UNITS[kind]:
-            node.fail(f"{printable(node.value)} is not a unit of {kind}", f"use one of: {', '.join(UNITS[kind])}")
-        return unit
-
-    return parse
-
-
-@dataclass(frozen=True)
-class Units:
-    """Units stated in a recording; None: the column names state the unit."""
-
-    time: Annotated[str, _unit("time")] | None = None
-    length: Annotated[str, _unit("length")] | None = None
-    angle: Annotated[str, _unit("angle")] | None = None
-
-
-@dataclass(frozen=True)
-class PoseColumns:
-    """Columns of a pose log (tracker_from_sensor). Fields that are None are recognised from the header.
-
-    time: one column, or two (whole seconds, nanoseconds); position: x, y, z (not with a 4x4 matrix); rotation: as
-    many columns as `form` takes; euler_convention: as scipy names it, "XYZ" intrinsic, "xyz" extrinsic; state: a
-    column whose values `good` mark measured rows; rate_hz: frame rate if `time` counts frames; stream: name, if the
-    file has several; frame: frame of the poses, one of `frame_names.FRAMES` (CAMERA, BASE: a robot's base or a
-    tracker's frame); None: as stated by the file, else BASE.
-    """
-
-    path: Path
-    clock: str = TRACKER_CLOCK
-    _: KW_ONLY
-    time: tuple[str, ...] | None = None
-    position: tuple[str, ...] | None = None
-    rotation: tuple[str, ...] | None = None
-    form: str | None = None
-    euler_convention: str | None = None
-    state: str | None = None
-    good: tuple[str, ...] = ("OK",)
-    units: Units = field(default_factory=Units)
-    rate_hz: float | None = None
-    stream: str | None = None
-    frame: str | None = None
-
-
-@dataclass(frozen=True)
-class JointColumns:
-    """Columns of one joint sensor's log. calibration: table from counts to angles (None: the column holds angles);
-    limits: joint limits for the capture, rad; stream: name, if the file has several."""
-
-    path: Path
-    clock: str
-    _: KW_ONLY
-    time: tuple[str, ...] | None = None
-    value: str | None = None
-    units: Units = field(default_factory=Units)
-    rate_hz: float | None = None
-    calibration: Path | None = None
-    limits: tuple[float, float] | None = None
-    stream: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,14 +139,30 @@ def recognise_time(header: Sequence[str]) -> RecognisedColumns:
 def recognise_pose(header: Sequence[str], named: _NamedColumns = _NOTHING) -> RecognisedColumns:
     """Return the columns of time, position and rotation in a pose log, each with one meaning. named: columns that the
     recording names, by meaning, which are not searched."""
-    free = _left(header, named)
+    taken = {name for names in named.values() for name in names}
+    free = [name for name in header if name not in taken]
     when = RecognisedColumns() if "time" in named else recognise_time(free)
     free = [name for name in free if name not in (when.time or ())]
     unclear: dict[str, str] = {}
-    matrix, position, rotation, form = None, None, None, None
-    if "rotation" not in named:
-        matrix = _matrix(free)
-        rotation, form = _rotation(free, matrix, unclear)
+    position, rotation, form = None, None, None
+    matrix = None if "rotation" in named else _matrix(free)
+    if matrix:
+        rotation, form = matrix, ROTATION_MATRIX if len(matrix) == 9 else MATRIX
+    elif "rotation" in named:
+        pass
+    elif rotation := _group(free, _QUATERNIONS, "length", "quaternion", unclear):
+        form = QUATERNION_WXYZ
+    elif rotation := _group(free, _ROTATION_VECTORS, "angle", "rotation", unclear):
+        form = ROTATION_VECTOR
+    else:
+        for angles in _EULER_ANGLES:
+            if _group(free, [(True, angles)], "angle", "rotation", {}):
+                unclear["rotation"] = (
+                    f"{', '.join(angles)} are ambiguous; name them under columns.euler with an euler_convention "
+                    "(or under columns.rotation_vector)"
+                )
+        if {"q0", "q1", "q2", "q3"} <= {_plain(name) for name in free}:
+            unclear["rotation"] = "the order of q0, q1, q2, q3 is ambiguous; use columns.quaternion_wxyz or _xyzw"
     if "position" not in named and not (matrix and len(matrix) > 9):
         position = _group(free, _POSITIONS, "length", "position", unclear)
     if shared := [name for name in position or () if name in (rotation or ())]:
@@ -263,7 +212,8 @@ def _first_choice(plain: Mapping[str, str], choices: _Choices) -> tuple[list[str
 def recognise_value(header: Sequence[str], named: _NamedColumns = _NOTHING) -> tuple[str | None, RecognisedColumns]:
     """Return the only column, besides time, that can be a joint reading; None if there is none or several. named: as
     for `recognise_pose`."""
-    header = _left(header, named)
+    taken = {name for names in named.values() for name in names}
+    header = [name for name in header if name not in taken]
     when = RecognisedColumns() if "time" in named else recognise_time(header)
     counters = {"frame", "seq", "index", "header_seq", "field_header_seq", "frame_id", "header_frame_id", "state"}
     values = [name for name in header if name and name not in (when.time or ()) and _plain(name) not in counters]
@@ -281,12 +231,6 @@ def joint_columns(header: Sequence[str], bodies: Mapping[str, Sequence[str]]) ->
         moving = [name for name in columns if not _JOINT.search("_".join(_plain(name).split("_")[start:]))]
         posing |= {*(pose.position or ()), *(pose.rotation or ()), *moving}
     return [name for name in header if _JOINT.search(name) and name not in posing]
-
-
-def _left(header: Sequence[str], named: _NamedColumns) -> list[str]:
-    """Return the columns that have no meaning yet."""
-    taken = {name for names in named.values() for name in names}
-    return [name for name in header if name not in taken]
 
 
 def quaternion_form(names: Sequence[str]) -> str | None:
@@ -309,26 +253,6 @@ def _by_plain_name(header: Sequence[str], kind: str) -> dict[str, str]:
     for name in header:
         plain.setdefault(_plain(split_unit(name, kind)[0]), name)
     return plain
-
-
-def _rotation(
-    header: Sequence[str], matrix: tuple[str, ...] | None, unclear: dict[str, str]
-) -> tuple[tuple[str, ...] | None, str | None]:
-    if matrix:
-        return matrix, ROTATION_MATRIX if len(matrix) == 9 else MATRIX
-    if quaternion := _group(header, _QUATERNIONS, "length", "quaternion", unclear):
-        return quaternion, QUATERNION_WXYZ
-    if vector := _group(header, _ROTATION_VECTORS, "angle", "rotation", unclear):
-        return vector, ROTATION_VECTOR
-    for angles in _EULER_ANGLES:
-        if _group(header, [(True, angles)], "angle", "rotation", {}):
-            unclear["rotation"] = (
-                f"{', '.join(angles)} are ambiguous; name them under columns.euler with an euler_convention "
-                "(or under columns.rotation_vector)"
-            )
-    if {"q0", "q1", "q2", "q3"} <= {_plain(name) for name in header}:
-        unclear["rotation"] = "the order of q0, q1, q2, q3 is ambiguous; use columns.quaternion_wxyz or _xyzw"
-    return None, None
 
 
 def _group(

@@ -88,7 +88,9 @@ def _parsed(path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, tuple[
     used = ~text.comment & (np.arange(len(text.lines)) >= start)
     if not used.any():
         raise NeecoError(f"{path}: has a header but no rows; record again or name another file")
-    header, rows = unique_names(names), text.cells[used, : len(names)]
+    repeats = [names[:index].count(name) for index, name in enumerate(names)]
+    unique = (f"{name}#{count + 1}" if name and count else name for name, count in zip(names, repeats, strict=True))
+    header, rows = tuple(unique), text.cells[used, : len(names)]
     return header, rows, text.lines[used], _find_tools(header, rows)
 
 
@@ -110,12 +112,28 @@ class Cells:
 
 
 def read_cells(path: Path) -> Cells:
-    """Return the non-empty lines of a text file. Raises NeecoError if all are comments or the file is unreadable."""
-    texts = [(number, text) for number, text in enumerate(_read_text(path).splitlines(), 1) if text.strip(",;\t ")]
+    """Return the non-empty lines of a text file in UTF-8, UTF-16 with a byte order mark, or Latin-1. Raises NeecoError
+    if all are comments or the file is unreadable."""
+    content = read_bytes(path, EXPECTED)
+    is_utf16 = content[:2] in (b"\xff\xfe", b"\xfe\xff")
+    try:
+        whole = content.decode("utf-16" if is_utf16 else "utf-8-sig")
+    except UnicodeDecodeError:
+        whole = "\0" if is_utf16 else content.decode("latin-1")
+    if not whole.strip() or any(character < " " and character not in "\t\r\n\f\v" for character in whole[:4096]):
+        raise NeecoError(f"{path}: {'not a text file' if whole.strip() else 'the file is empty'}; expected {EXPECTED}")
+    texts = [(number, text) for number, text in enumerate(whole.splitlines(), 1) if text.strip(",;\t ")]
     comment = np.array([_COMMENT.match(text) is not None for _, text in texts], dtype=bool)
     if comment.all():
         raise NeecoError(f"{path}: holds only comments; expected {EXPECTED}")
-    sign = _delimiter([text for (_, text), is_comment in zip(texts, comment, strict=True) if not is_comment])
+    # the delimiter of the rows, by the second half of the file
+    plain = [text for (_, text), is_comment in zip(texts, comment, strict=True) if not is_comment]
+    sample = plain[len(plain) // 2 :][: LIMITS.sample_lines]
+    sign = max(",;\t", key=lambda sign: sum(row.count(sign) for row in sample))
+    sign = sign if any(sign in row for row in sample) else " "
+    for delimiter in ";\t":  # before commas, which may be those of decimals then
+        count, n_similar = Counter(row.count(delimiter) for row in sample).most_common(1)[0]
+        sign = delimiter if count and n_similar > 0.9 * len(sample) else sign
     lines = [_COMMENT.sub("", text) for _, text in texts]
     try:  # line by line: a quote left open must not swallow the rest of the file
         rows = [line.split() if sign == " " else next(csv.reader([line], delimiter=sign)) for line in lines]
@@ -136,16 +154,6 @@ def read_cells(path: Path) -> Cells:
             cell.replace(",", ".") if commas and _DECIMAL_COMMA.fullmatch(cell) else cell for cell in stripped
         ]
     return Cells(cells, np.array([number for number, _ in texts]), counts, comment)
-
-
-def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Return column names, of which the second `NAME` becomes `NAME#2`."""
-    seen: Counter[str] = Counter()
-    unique = []
-    for name in names:
-        seen[name] += 1
-        unique.append(name if seen[name] == 1 or not name else f"{name}#{seen[name]}")
-    return tuple(unique)
 
 
 def _header(path: Path, text: Cells) -> tuple[list[str], int]:
@@ -184,30 +192,6 @@ def _header(path: Path, text: Cells) -> tuple[list[str], int]:
     first_cells, where = printable(",".join(text.names(plain[0]))[:40]), f"{path}: line {text.lines[plain[0]]}"
     rows = f", and the rows of numbers begin at line {text.lines[starts[0]]}" if len(above) else ""
     raise NeecoError(f"{where} is not a header line (found {first_cells}){rows}; add a line with the column names")
-
-
-def _delimiter(lines: Sequence[str]) -> str:
-    """Return the delimiter of the rows, by the second half of the file."""
-    rows = lines[len(lines) // 2 :][: LIMITS.sample_lines]
-    for delimiter in "\t;":  # before commas, which may be those of decimals then
-        count, n_similar = Counter(row.count(delimiter) for row in rows).most_common(1)[0]
-        if count and n_similar > 0.9 * len(rows):
-            return delimiter
-    delimiter = max(",;\t", key=lambda sign: sum(row.count(sign) for row in rows))
-    return delimiter if any(delimiter in row for row in rows) else " "
-
-
-def _read_text(path: Path) -> str:
-    """Return a text file in UTF-8, UTF-16 with a byte order mark, or Latin-1."""
-    content = read_bytes(path, EXPECTED)
-    is_utf16 = content[:2] in (b"\xff\xfe", b"\xfe\xff")
-    try:
-        text = content.decode("utf-16" if is_utf16 else "utf-8-sig")
-    except UnicodeDecodeError:
-        text = "\0" if is_utf16 else content.decode("latin-1")
-    if not text.strip() or any(character < " " and character not in "\t\r\n\f\v" for character in text[:4096]):
-        raise NeecoError(f"{path}: {'not a text file' if text.strip() else 'the file is empty'}; expected {EXPECTED}")
-    return text
 
 
 @dataclass(frozen=True)

@@ -122,10 +122,16 @@ class _Series:
             outer = np.stack([left - 1, left, right, right + 1], axis=-1)  # [N, 4]
             rows = np.flatnonzero((left < right) & (outer[:, 0] >= self.first[left]) & (outer[:, 3] < self.last[left]))
             if len(rows):
-                weights = _lagrange(self.times[outer[rows]], times[rows])[..., None]
+                samples = self.times[outer[rows]]
+                off_diagonal = ~np.eye(4, dtype=bool)
+                steps = np.where(off_diagonal, samples[:, :, None] - samples[:, None], 1)
+                shares = np.where(off_diagonal, (times[rows, None] - samples)[:, None] / steps, 1)
+                weights = np.asarray(shares.prod(axis=-1))[..., None]  # of Lagrange's polynomials
                 result[rows] = start[rows] + ((self.values[outer[rows]] - start[rows, None]) * weights).sum(1)
         else:
-            noise = _noise(self.values)
+            # robust standard deviation of a sample about the line through its neighbours, per axis
+            bend = self.values[1:-1] - (self.values[:-2] + self.values[2:]) / 2
+            noise = max(1.48 * float(np.median(np.abs(bend))) / np.sqrt(1.5), 1e-9)
             for rows, index, used, offsets in self._windows(times, width, leave_out):
                 around = self.values[index] - start[rows, None]
                 result[rows] = start[rows] + _local_polynomial(offsets, used, around, noise)
@@ -178,7 +184,7 @@ class _Series:
 
 def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray, noise: float) -> np.ndarray:
     """Return the value [N, D] at offset 0 of quadratics through values [N, K, D] at offsets [N, K] in [-1, 1]."""
-    near = used * _tricube(offsets)
+    near = used * np.clip(1 - np.abs(offsets) ** 3, 0, None) ** 3  # tricube
     powers = np.stack([np.ones_like(offsets), offsets, offsets**2], axis=-1)  # [N, K, 3]
     # the large ridge fixes the curvature at 0 for few samples; the small ones keep the equations solvable
     ridge = np.zeros((len(offsets), 3))
@@ -207,24 +213,7 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
     return coefficients[:, 0]
 
 
-def _lagrange(samples: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Lagrange weights [N, K] of values at samples [N, K] s, for times [N] s."""
-    off_diagonal = ~np.eye(samples.shape[1], dtype=bool)
-    steps = np.where(off_diagonal, samples[:, :, None] - samples[:, None], 1)
-    return np.asarray(np.where(off_diagonal, (times[:, None] - samples)[:, None] / steps, 1).prod(axis=-1))
-
-
-def _noise(values: np.ndarray) -> float:
-    """Robust standard deviation of a sample [T, D] about the line through its neighbours, per axis."""
-    bend = values[1:-1] - (values[:-2] + values[2:]) / 2
-    return max(1.48 * float(np.median(np.abs(bend))) / np.sqrt(1.5), 1e-9)
-
-
 def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Lower median [..., N] of the used values among [..., N, K]."""
     ordered = np.sort(np.where(used, values, np.inf), axis=-1)
     return np.take_along_axis(ordered, (used.sum(axis=-1, keepdims=True) - 1) // 2, axis=-1)[..., 0]
-
-
-def _tricube(offsets: np.ndarray) -> np.ndarray:
-    return np.clip(1 - np.abs(offsets) ** 3, 0, None) ** 3

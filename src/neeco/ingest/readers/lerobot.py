@@ -16,10 +16,20 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
+from neeco.capture.documents import printable
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts
 from neeco.ingest.readers import columns as named
 from neeco.ingest.readers.frame_names import NamedFrame, camera_order, meaning_in, of_dvrk, unsaid, without_frame
-from neeco.ingest.readers.lerobot_files import FIXED, LIMITS, DataSet, Episode, Feature, read_data_set
+from neeco.ingest.readers.lerobot_files import (
+    FIXED,
+    LIMITS,
+    DataSet,
+    Episode,
+    Feature,
+    parquet_names,
+    read_columns,
+    read_data_set,
+)
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
 TIME = "timestamp_s"
@@ -43,12 +53,15 @@ class LeRobot(RecordingFormat):
         """Return the streams of the first downloaded episode; all episodes have the same."""
         data = self._data_set(path)
         episode, images, tables = data.first_present(), list[Stream](), list[Stream]()
-        absent = data.absent(episode) | {key: STORED for key, each in data.features.items() if each.dtype == "image"}
+        stored = parquet_names(episode.data)
         for key, feature in data.features.items():
             kind, title = _kind(feature), f"{feature.dtype} of {'x'.join(map(str, feature.shape))}"
             stream = Stream(f"episode {episode.number}/{key}", kind, title, episode.length, data.fps)
-            if kind != Kind.OTHER and key in absent:
-                tables.append(replace(stream, problem=absent[key]))
+            problem = STORED if feature.dtype == "image" else episode.absent.get(key)
+            if key not in stored and feature.dtype != "video":
+                problem = f"{episode.data}: has no column {printable(key)}; download the data set again"
+            if kind != Kind.OTHER and problem is not None:
+                tables.append(replace(stream, problem=problem))
             elif kind == Kind.IMAGES:
                 images.append(stream)
             elif kind == Kind.READINGS:
@@ -65,7 +78,7 @@ class LeRobot(RecordingFormat):
         episode, key = self._chosen(data, stream, Kind.POSES, Kind.READINGS)
         names, name = data.features[key].names, f"episode {episode.number}/{key}"
         times, order, _, notes = _times(data, episode)
-        rows = np.column_stack([times, data.columns(episode, {key: len(names)})[key][order]])
+        rows = np.column_stack([times, read_columns(episode.data, {key: len(names)}, episode.number)[key][order]])
         lines, meaning = np.arange(len(rows)), _meaning(key, names)
         return Table(path, (TIME, *names), rows, lines, stream=name, record="frame", notes=notes, meaning=meaning)
 
@@ -150,7 +163,7 @@ def _bodies(feature: Feature, stream: Stream) -> list[Stream]:
 def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return times [R] s of an episode's rows from the first, the order of its file's rows, the image number of each
     row in its film (the image nearest to the timestamp, if these are distinct), and notes."""
-    table = data.columns(episode, {"timestamp": 1, "frame_index": 1})
+    table = read_columns(episode.data, {"timestamp": 1, "frame_index": 1}, episode.number)
     order = np.argsort(table["frame_index"][:, 0], kind="stable")
     frames, stamps = table["frame_index"][order, 0], table["timestamp"][order, 0]
     if len(frames) != episode.length:

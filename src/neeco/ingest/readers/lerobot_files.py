@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -22,6 +23,7 @@ from neeco.ingest.readers import file_state, one_line
 INFO = "meta/info.json"
 EPISODES_2, EPISODES_3 = "meta/episodes.jsonl", "meta/episodes"
 VERSIONS = re.compile(r"v?(2)\.[01]|v?(3)\.0")
+LENGTHS = ("episode_index", "length")  # of each episode
 FILM_COLUMNS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")  # of each camera, version 3
 FIXED = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns that every data set has
 _FIELD = re.compile(r"\{(\w+)(?::(0?\d{1,2}d))?\}")
@@ -83,11 +85,6 @@ class DataSet:
     records: Mapping[int, Record]
 
     @property
-    def films(self) -> tuple[str, ...]:
-        """The features that are videos."""
-        return tuple(key for key, feature in self.features.items() if feature.dtype == "video")
-
-    @property
     def range_words(self) -> str:
         """`episodes 0 to 9`."""
         first, last = min(self.records), max(self.records)
@@ -95,13 +92,10 @@ class DataSet:
 
     def first_present(self) -> Episode:
         """Return the first episode whose states were downloaded. Raises NeecoError."""
-        problems = []
         for number in self.records:
-            try:
+            with suppress(_NotThere):
                 return self.episode(number)
-            except _NotThere as error:
-                problems.append(error)
-        raise problems[0]
+        return self.episode(next(iter(self.records)))
 
     def episode(self, number: int) -> Episode:
         """Return one episode. Raises NeecoError if it does not exist."""
@@ -112,35 +106,22 @@ class DataSet:
         if self.version == 3:
             place = {name: record.get(f"data/{name}") for name in ("chunk_index", "file_index")}
         films, absent = {}, {}
-        for key in self.films:
+        for key in (key for key, feature in self.features.items() if feature.dtype == "video"):
+            of_film, part = place, None
+            if self.version == 3:
+                of_film = {name: record.get(f"videos/{key}/{name}") for name in FILM_COLUMNS}
+                if None in of_film.values():
+                    absent[key] = f"{self.path / EPISODES_3}: has no images of {printable(key)}; download it again"
+                    continue
+                part = start, end = of_film["from_timestamp"], of_film["to_timestamp"]
+                if not 0 <= start < end < 1e9:  # NaN compares false
+                    problem = f"invalid part of a video, {start:g} to {end:g} s; correct meta"
+                    raise NeecoError(f"{self.path}: {key}: {problem}")
             try:
-                films[key] = self._film(key, record, place)
+                films[key] = self._file("video_path", {**of_film, "video_key": key}), part
             except _NotThere as error:
                 absent[key] = str(error)
         return Episode(number, int(record["length"]), self._file("data_path", place), films, absent)
-
-    def _film(self, key: str, record: Record, place: Mapping[str, Any]) -> tuple[Path, tuple[float, float] | None]:
-        """Return the video file and part (s) of one camera's images of an episode. Raises _NotThere, and NeecoError for
-        an invalid part."""
-        if self.version == 2:
-            return self._file("video_path", {**place, "video_key": key}), None
-        of_film = {name: record.get(f"videos/{key}/{name}") for name in FILM_COLUMNS}
-        start, end = of_film["from_timestamp"], of_film["to_timestamp"]
-        if None in of_film.values() or start is None or end is None:
-            raise _NotThere(f"{self.path / EPISODES_3}: has no images of {printable(key)}; download it again")
-        if not 0 <= start < end < 1e9:  # NaN compares false
-            raise NeecoError(f"{self.path}: {key}: invalid part of a video, {start:g} to {end:g} s; correct meta")
-        return self._file("video_path", {**of_film, "video_key": key}), (start, end)
-
-    def absent(self, episode: Episode) -> dict[str, str]:
-        """Return why features of an episode cannot be read, by key: their column or their camera's file is missing."""
-        stored, where = {*self.films, *parquet_names(episode.data)}, f"{episode.data}: has no column"
-        columns = [key for key in self.features if key not in stored]
-        return {key: f"{where} {printable(key)}; download the data set again" for key in columns} | {**episode.absent}
-
-    def columns(self, episode: Episode, widths: Mapping[str, int]) -> dict[str, np.ndarray]:
-        """Return columns of an episode as `read_columns` does."""
-        return read_columns(episode.data, {"episode_index": 1, **widths}, episode.number)
 
     def _file(self, field: str, values: Mapping[str, Any]) -> Path:
         """Return the file of a path template of info.json. Raises NeecoError if it is outside the data set."""
@@ -180,59 +161,52 @@ def _described(path: Path, state: tuple[object, ...]) -> DataSet:
         fps = info.child("fps").number(above=0, below=1e5)
         data_path = info.child("data_path").text("correct it")
         chunks_size = info.child("chunks_size").integer(1) if info.has("chunks_size") else 1000
-    films = [key for key, feature in feature_of.items() if feature.dtype == "video"]
-    records = _records_3(path, films) if match[2] is not None else _records_2(path)
-    if not records:
-        raise NeecoError(f"{path}: has no episodes; download the data set again, with all of meta")
+    number, films = 2 if match[2] is None else 3, [key for key, one in feature_of.items() if one.dtype == "video"]
     return DataSet(
         path=path,
-        version=2 if match[2] is None else 3,
+        version=number,
         fps=fps,
         features=feature_of,
         data_path=data_path,
         video_path=str(info.child("video_path").value or ""),
         chunks_size=chunks_size,
-        records=records,
+        records=_records_of(path, number, films),
     )
 
 
-def _records_2(path: Path) -> dict[int, Record]:
-    """Return the length of each episode, by its number."""
-    file, records = path / EPISODES_2, dict[int, Record]()
-    if file.exists():
-        require_inside(file, _boundary(path))
-    for line, text in enumerate(read_text(file, "episodes, one a line").splitlines(), 1):
-        if text.strip():
-            try:
+def _records_of(path: Path, version: int, films: Sequence[str]) -> dict[int, Record]:
+    """Return the length of each episode, of version 3 with the files of its rows and images, by its number. Raises
+    NeecoError."""
+    stated: list[tuple[str, dict[str, Any]]] = []  # with their places
+    if version == 2:
+        file = path / EPISODES_2
+        if file.exists():
+            require_inside(file, _boundary(path))
+        for line, text in enumerate(read_text(file, "episodes, one a line").splitlines(), 1):
+            record = None
+            with suppress(ValueError, RecursionError):
                 record = json.loads(text)
-                number, length = record["episode_index"], record["length"]
-            except (ValueError, TypeError, KeyError, RecursionError):
-                number, length = None, None
-            where = f"{file}: line {line}"
-            records[_count(where, number)] = {"length": _count(where, length)}
-    return records
-
-
-def _records_3(path: Path, films: Sequence[str]) -> dict[int, Record]:
-    """Return the length of each episode and the files of its rows and images, by its number."""
-    columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
-    of_films = [f"videos/{key}/{name}" for key in films for name in FILM_COLUMNS]
+            record = record if isinstance(record, dict) else {}
+            if text.strip():
+                stated.append((f"{file}: line {line}", {name: record.get(name) for name in LENGTHS}))
+    else:
+        for file in visible_entries(path / EPISODES_3, "chunk-*/*.parquet"):
+            stored = parquet_names(require_inside(file, _boundary(path)))
+            of_films = [f"videos/{key}/{name}" for key in films for name in FILM_COLUMNS]
+            names = [*LENGTHS, "data/chunk_index", "data/file_index", *(name for name in of_films if name in stored)]
+            table = read_columns(file, dict.fromkeys(names, 1))
+            for row, values in enumerate(np.concatenate([table[name] for name in names], 1).tolist()):
+                stated.append((f"{file}: row {row}", dict(zip(names, values, strict=True))))
     records: dict[int, Record] = {}
-    for file in visible_entries(path / EPISODES_3, "chunk-*/*.parquet"):
-        stored = parquet_names(require_inside(file, _boundary(path)))
-        names = [*columns, *(name for name in of_films if name in stored)]
-        table = read_columns(file, dict.fromkeys(names, 1))
-        for row, values in enumerate(np.concatenate([table[name] for name in names], 1).tolist()):
-            record = dict(zip(names, values, strict=True))
-            counts = {name: _count(f"{file}: row {row}", value) for name, value in record.items() if "time" not in name}
-            records[counts["episode_index"]] = {**record, **counts}
+    for where, record in stated:
+        counts = {name: value for name, value in record.items() if "time" not in name}
+        for value in counts.values():
+            if type(value) not in (int, float) or not 0 <= value < 1e9 or value != int(value):  # NaN compares false
+                raise NeecoError(f"{where}: expected an episode with episode_index and length; download it again")
+        records[int(counts["episode_index"])] = record | {name: int(value) for name, value in counts.items()}
+    if not records:
+        raise NeecoError(f"{path}: has no episodes; download the data set again, with all of meta")
     return records
-
-
-def _count(where: str, value: Any) -> int:
-    if type(value) not in (int, float) or not 0 <= value < 1e9 or value != int(value):  # NaN compares false
-        raise NeecoError(f"{where}: expected an episode with episode_index and length; download it again")
-    return int(value)
 
 
 def parquet_names(path: Path) -> list[str]:
@@ -246,7 +220,7 @@ def read_columns(path: Path, widths: Mapping[str, int], episode: int | None = No
     import pyarrow.dataset
 
     file = _fragment(path)
-    if absent := [name for name in widths if name not in file.physical_schema.names]:
+    if absent := [name for name in (LENGTHS[0], *widths) if name not in file.physical_schema.names]:
         listed = printable(", ".join(file.physical_schema.names), 300).strip("'")
         raise NeecoError(f"{path}: has no column {printable(absent[0])}; its columns are {listed}")
     of_episode = None if episode is None else pyarrow.dataset.field("episode_index") == episode
@@ -261,34 +235,19 @@ def read_columns(path: Path, widths: Mapping[str, int], episode: int | None = No
         table = part.to_table(columns=list(widths), filter=of_episode, use_threads=False)
     columns = {}
     for name, width in widths.items():
+        kind = table.column(name).type
         try:
-            numbers = _numbers(table.column(name).combine_chunks()) if len(table) else np.zeros((0, width))
-        except ValueError:
-            kind = table.column(name).type
+            if re.search(r"string|binary|dictionary|decimal", str(kind)):  # which numpy would read, too
+                raise ValueError
+            rows = np.array(table.column(name).to_pylist(), np.float64).reshape(len(table), -1 if len(table) else width)
+        except (ValueError, TypeError):
             problem = f"holds {kind}, expected numbers, as many in each row"
             raise NeecoError(f"{path}: {name}: {problem}; choose another feature") from None
-        if numbers.shape[1] != width:
-            problem = f"has {numbers.shape[1]} numbers per row, expected {width}"
+        if rows.shape[1] != width:
+            problem = f"has {rows.shape[1]} numbers per row, expected {width}"
             raise NeecoError(f"{path}: {name}: {problem}; download the data set again")
-        columns[name] = numbers
+        columns[name] = rows
     return columns
-
-
-def _numbers(column: Any) -> np.ndarray:
-    """Return numbers, or lists of one length, as [R, C]; NaN for null. Raises ValueError."""
-    from pyarrow import ExtensionArray, FixedSizeListArray, LargeListArray, ListArray, compute, types
-
-    count = len(column)
-    while isinstance(column, ExtensionArray | ListArray | LargeListArray | FixedSizeListArray):
-        if isinstance(column, ExtensionArray):
-            column = column.storage
-        elif len(compute.list_value_length(column).unique()) > 1:
-            raise ValueError("lists of several lengths")
-        else:
-            column = column.flatten()
-    if not any(is_kind(column.type) for is_kind in (types.is_floating, types.is_integer, types.is_boolean)):
-        raise ValueError("no numbers")
-    return np.asarray(column.to_numpy(zero_copy_only=False), np.float64).reshape(count, -1)
 
 
 def _fragment(path: Path) -> Any:

@@ -20,9 +20,10 @@ from neeco.geometry.conventions import OPENCV
 from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Table, column_index, numbers, read_table, to_numbers
 from neeco.ingest.readers import columns as named
-from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
+from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, RecognisedColumns
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_in, meaning_of, of_dvrk
 from neeco.ingest.readers.rows import Rows, drop_stuck, find_gaps, in_order, keep_measured, read_cells, read_times
+from neeco.ingest.readers.sections import JointColumns, PoseColumns
 
 _FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
 _FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?id)?")
@@ -78,11 +79,21 @@ class ReadingLog(SampleLog):
 
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
-    table = read_table(source.path, source.stream)
-    stated = _stated_columns(table, time=source.time, position=source.position, rotation=source.rotation)
+    table = read_table(source.file, source.stream)
+    names, (rotation, _) = source.columns, source.columns.rotation
+    stated = _stated_columns(table, time=names.time, position=names.position, rotation=rotation)
     recognised = named.recognise_pose(table.header, stated)
-    table = with_named_frame(table, (*(source.position or recognised.position or ()), *(source.rotation or ())))
-    frame = _frame_of(table, source)
+    table = with_named_frame(table, (*(names.position or recognised.position or ()), *(rotation or ())))
+    frame = source.frame or table.frame or named.BASE
+    if source.frame is None and table.meaning is not None and table.frame is None:
+        raise NeecoError(f"{table.where}: frame: {table.meaning.question}")
+    axes = CAMERA_FRAMES.get(table.frame or "")
+    if source.frame == named.CAMERA and axes is not None and axes.words != OPENCV.words:
+        raise NeecoError(
+            f"{table.where}: frame: {named.CAMERA} means OpenCV's axes ({OPENCV.words}), but the file's frame is "
+            f"{table.stated_in or axes.name} with axes {axes.words}; remove `frame` (or set frame: "
+            f"{axes.name}), or set frame: {OPENCV.name} if the poses are already converted"
+        )
     rows = Rows(table)
     keep_measured(rows, source, recognised.state)
     times = read_times(rows, source, recognised)
@@ -97,7 +108,11 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     gaps = find_gaps(rows, times)
     if frame != named.BASE and source.frame is None and table.meaning is not None:
         rows.repairs.append(f"poses are expressed in {table.meaning.why}")
-    positions, quats = in_opencv(frame, positions[order], quats)
+    positions = positions[order]
+    turn = CAMERA_FRAMES[frame].opencv_from_own[:3, :3] if frame != named.BASE else np.eye(3)
+    if not np.array_equal(turn, np.eye(3)):  # from the camera's own axes to OpenCV's
+        turned = Rotation.from_matrix(turn) * Rotation.from_quat(quats, scalar_first=True)
+        positions, quats = positions @ turn.T, continuous(turned.as_quat(scalar_first=True))[0]
     return PoseLog(
         table.path,
         source.clock,
@@ -112,16 +127,6 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     )
 
 
-def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert positions [T, 3] and quaternions [T, 4] wxyz from a camera's frame (`frame_names.CAMERA_FRAMES`) to
-    OpenCV's axes; poses in a base are unchanged."""
-    turn = CAMERA_FRAMES[frame].opencv_from_own[:3, :3] if frame != named.BASE else np.eye(3)
-    if np.array_equal(turn, np.eye(3)):
-        return positions, quats
-    turned = Rotation.from_matrix(turn) * Rotation.from_quat(quats, scalar_first=True)
-    return positions @ turn.T, continuous(turned.as_quat(scalar_first=True))[0]
-
-
 def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
     """Return the table with the meaning of its poses' frame: by the column names, else by the file, else by a column of
     frame names, else by the file's name. Raises NeecoError if that column holds several."""
@@ -129,57 +134,44 @@ def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
     meaning = meaning_in(columns, dvrk=dvrk)
     if meaning is None and (table.meaning is not None or table.stream is not None):
         return table
-    names = [] if meaning is not None else _frame_names(table)
-    if names:
-        return replace(table, stated_in=names[0], meaning=meaning_of(names[0], dvrk=dvrk))
-    return replace(table, meaning=meaning or meaning_in([table.path.stem], dvrk=dvrk))
-
-
-def _frame_names(table: Table) -> list[str]:
-    """Return the name in a column such as `header.frame_id`; [] if there is none, or it numbers or names images."""
-    for index, name in enumerate(table.header):
-        if table.rows.dtype != object or not _FRAME_COLUMN.fullmatch(name.strip().lower()):
+    for index, name in enumerate(table.header if meaning is None and table.rows.dtype == object else ()):
+        if not _FRAME_COLUMN.fullmatch(name.strip().lower()):
             continue
         names = sorted({cell.strip("/\"' ") for cell in table.rows[:, index]} - {""})
         if len(names) > 1 and any(meaning_of(cell).frame != named.BASE for cell in names):
             listed = ", ".join(names[:4])
             raise NeecoError(f"{table.where}: {name}: poses are in several frames ({listed}); export one only")
-        if len(names) == 1 and np.isnan(to_numbers(np.array(names, object))[0]):
-            return names
-    return []
-
-
-def _frame_of(table: Table, source: PoseColumns) -> str:
-    """Return the frame of poses stated by the recording, else by the file. Raises NeecoError if neither states one, or
-    they contradict each other."""
-    if source.frame is None:
-        if table.meaning is not None and table.frame is None:
-            raise NeecoError(f"{table.where}: frame: {table.meaning.question}")
-        return table.frame or named.BASE
-    axes = CAMERA_FRAMES.get(table.frame or "")
-    if source.frame == named.CAMERA and axes is not None and axes.words != OPENCV.words:
-        raise NeecoError(
-            f"{table.where}: frame: {named.CAMERA} means OpenCV's axes ({OPENCV.words}), but the file's frame is "
-            f"{table.stated_in or axes.name} with axes {axes.words}; remove `frame` (or set frame: "
-            f"{axes.name}), or set frame: {OPENCV.name} if the poses are already converted"
-        )
-    return source.frame
+        if len(names) == 1 and np.isnan(to_numbers(np.array(names, object))[0]):  # else it numbers or names images
+            return replace(table, stated_in=names[0], meaning=meaning_of(names[0], dvrk=dvrk))
+    return replace(table, meaning=meaning or meaning_in([table.path.stem], dvrk=dvrk))
 
 
 def read_reading_log(source: JointColumns) -> ReadingLog:
     """Read a joint sensor's log, through its calibration table when there is one. Raises NeecoError naming file,
     row or column, and remedy."""
-    table = read_table(source.path, source.stream)
-    stated = _stated_columns(table, time=source.time, value=None if source.value is None else (source.value,))
+    table = read_table(source.file, source.stream)
+    stated = _stated_columns(table, time=source.columns.time, value=source.columns.value)
     recognised, when = named.recognise_value(table.header, stated)
-    value = source.value or recognised
+    (value,) = source.columns.value or (recognised,)
     if value is None:
-        raise NeecoError(f"{source.path}: header: the joint's column is ambiguous; name it as columns.value")
+        raise NeecoError(f"{source.file}: header: the joint's column is ambiguous; name it as columns.value")
     rows = Rows(table)
     times = read_times(rows, source, when)
     values = read_cells(rows, (value,))[:, 0]
     if source.calibration is not None:
-        values = _calibrated(rows, value, values, source.calibration, source.units.angle)
+        # monotone interpolation of the table (PCHIP, Fritsch & Carlson 1980): readings just outside it become its end
+        counts, angles = read_calibration(source.calibration, source.units.angle)
+        (low, high), title = (counts[0], counts[-1]), source.calibration.name
+        values = np.where(rows.keep, values, low)
+        excess = np.maximum(low - values, values - high)
+        outside = excess > SETTINGS.clamped_share * (high - low)
+        if (clamped := (excess > 0) & ~outside).any():
+            by = f"{low:g} to {high:g}, by at most {excess[clamped].max():g}"
+            words = f"{counted(int(clamped.sum()), 'row')} with {value} just outside the table {title} ({by})"
+            rows.repairs.append(f"{words}: clamped to its end ({table.list_rows(table.lines[clamped])})")
+        values = np.asarray(PchipInterpolator(counts, angles)(np.clip(values, low, high)))
+        reason = f"{value} is far outside the calibration table {title}"
+        rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
     else:
         hint = " (counts need a table as `calibration`)"
         values = values * named.scale_of(table.where, (value,), "angle", source.units.angle, None, hint)
@@ -209,10 +201,12 @@ def _stated_columns(table: Table, **columns: tuple[str, ...] | None) -> dict[str
 def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
     """Return positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
     table = rows.table
-    rotation, form = (source.rotation, source.form) if source.rotation else (recognised.rotation, recognised.form)
+    rotation, form = source.columns.rotation
+    if rotation is None:
+        rotation, form = recognised.rotation, recognised.form
     if rotation is None or form is None:
         raise _unclear(table, recognised, "rotation", "qw, qx, qy, qz columns")
-    position = source.position or recognised.position
+    position = source.columns.position or recognised.position
     if form == MATRIX:
         position, read = tuple(rotation[i] for i in (3, 7, 11)), rotation
     elif position is None:
@@ -225,11 +219,17 @@ def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tu
     angle = 1.0
     if form in (EULER, ROTATION_VECTOR):
         angle = named.scale_of(table.where, rotation, "angle", source.units.angle, None, "")
-    positions, turns = _parts(table, form, read_cells(rows, read))
-    positions = positions * scale
+    cells = read_cells(rows, read)
+    positions, turns = cells[:, :3] * scale, cells[:, 3:]
+    if form == MATRIX:
+        top = cells[:, :12].reshape(-1, 3, 4)
+        positions, turns = top[:, :, 3] * scale, top[:, :, :3].reshape(-1, 9)
+        last, column = cells[:, 12:], cells[:, 3::4][:, :3]
+        if cells.shape[1] == 16 and np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
+            raise NeecoError(f"{table.where}: matrix: is in column-major order; list its columns row by row")
     if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
         rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
-    quats, good = to_quaternions(form, turns, source.euler_convention, angle)
+    quats, good = to_quaternions(form, turns, source.columns.euler_convention, angle)
     expected = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
     rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {expected}; name the right columns")
     distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
@@ -279,18 +279,6 @@ def _unclear(table: Table, recognised: RecognisedColumns, what: str, expected: s
     return NeecoError(f"{table.where}: header: {f'{what}: {reason}' if reason else problem}")
 
 
-def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions [R, 3] in the file's unit and rotation cells [R, C]."""
-    if form != MATRIX:
-        return cells[:, :3], cells[:, 3:]
-    rows = cells[:, :12].reshape(-1, 3, 4)
-    if cells.shape[1] == 16:
-        last, column = cells[:, 12:], cells.reshape(-1, 4, 4)[:, :3, 3]
-        if np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
-            raise NeecoError(f"{table.where}: matrix: is in column-major order; list its columns row by row")
-    return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
-
-
 def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Read a joint sensor's calibration table: counts [K] increasing, angles [K] rad, increasing or decreasing.
 
@@ -326,22 +314,3 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     if np.abs(angles).max() > SETTINGS.max_angle:
         raise NeecoError(f"{path}: {angle_name}: exceeds two turns; correct the column's unit")
     return counts, angles
-
-
-def _calibrated(rows: Rows, name: str, readings: np.ndarray, path: Path, angle_unit: str | None) -> np.ndarray:
-    """Return angles [R] rad of a column of counts, by monotone interpolation of the table (PCHIP, Fritsch & Carlson
-    1980). Readings just outside the table are clamped to its end, with a note; rows farther outside are dropped."""
-    counts, angles = read_calibration(path, angle_unit)
-    low, high = counts[0], counts[-1]
-    readings = np.where(rows.keep, readings, low)
-    excess = np.maximum(low - readings, readings - high)
-    outside = excess > SETTINGS.clamped_share * (high - low)
-    values = PchipInterpolator(counts, angles)(np.clip(readings, low, high))
-    clamped = (excess > 0) & ~outside
-    if clamped.any():
-        by = f"{low:g} to {high:g}, by at most {excess[clamped].max():g}"
-        clamped_rows = f"{counted(int(clamped.sum()), 'row')} with {name} just outside the table {path.name} ({by})"
-        rows.repairs.append(f"{clamped_rows}: clamped to its end ({rows.table.list_rows(rows.table.lines[clamped])})")
-    reason = f"{name} is far outside the calibration table {path.name}"
-    rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
-    return np.asarray(values)

@@ -15,7 +15,7 @@ from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, to_numbers
 from neeco.ingest.readers.columns import UNITS, canonical_unit
-from neeco.ingest.readers.delimited import Cells, read_cells, tool_stream
+from neeco.ingest.readers.delimited import read_cells, tool_stream
 
 FIRST = b"Format Version"  # words of a file
 BODY_TYPE = "rigid body"
@@ -49,7 +49,14 @@ class MotiveExport(RecordingFormat):
             raise NeecoError(f"{path}: Rotation Type: {printable(kind)} is not supported; export quaternions")
         suffix = f"_{unit}" if unit in UNITS["length"] else ""
         values = to_numbers(text.cells[start:, [places[name][column] for column in required]])
-        rows = np.column_stack([_times(path, text, start, preamble), values])
+        stated = preamble.get("Export Frame Rate", preamble.get("Capture Frame Rate", ""))
+        rate = float(to_numbers(np.array(stated, object)))
+        names = [cell.lower() for cell in text.cells[start - 1]]
+        column = next((index for index, cell in enumerate(names) if cell.startswith("time (sec")), None)
+        if column is None and not 0 < rate < 1e6:  # NaN compares false
+            raise NeecoError(f"{path}: has no column of times and no Export Frame Rate; export the take with its times")
+        times = to_numbers(text.cells[start:, column or 0]) / (rate if column is None else 1.0)
+        rows = np.column_stack([times, values])
         header = ("t_s", *(axis + suffix for axis in "xyz"), *QUATS)
         return Table(path, header, rows, text.lines[start:], stream=name)
 
@@ -70,15 +77,3 @@ def _columns(path: Path) -> tuple[int, dict[str, dict[tuple[str, str], int]]]:
         part, axis = lower[start - 2, column], lower[start - 1, column]
         places.setdefault(text.cells[types[0] + 1, column], {})[part, axis] = column
     return start, places
-
-
-def _times(path: Path, text: Cells, start: int, preamble: dict[str, str]) -> np.ndarray:
-    """Return times [R] s: the time column, else the frame numbers at the export's rate."""
-    for column, name in enumerate(text.cells[start - 1]):
-        if name.lower().startswith("time (sec"):
-            return to_numbers(text.cells[start:, column])
-    stated = preamble.get("Export Frame Rate", preamble.get("Capture Frame Rate", ""))
-    rate = float(to_numbers(np.array(stated, object)))
-    if not 0 < rate < 1e6:  # NaN compares false
-        raise NeecoError(f"{path}: has no column of times and no Export Frame Rate; export the take with its times")
-    return to_numbers(text.cells[start:, 0]) / rate

@@ -1,13 +1,12 @@
 """Sequences of the PLUS toolkit and 3D Slicer: transforms of tools by name, and images, in MetaImage or NRRD.
 
-A text header precedes the images. Sizes in the header are not trusted: no memory is allocated by them, and compressed
-data is decompressed frame by frame.
+A text header precedes the images, which are read where they are not compressed. Sizes in the header are not trusted: no
+memory is allocated by them.
 """
 
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -35,11 +34,13 @@ GOOD = "ok"
 _ENDS = re.compile(r"(\w+?)To([A-Z0-9]\w*)")
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w{1,200})")
 _UCHAR = ("uchar", "unsigned char", "uint8", "uint8_t", "met_uchar")
-_META_READ = {
-    "ElementType": _UCHAR, "BinaryData": ("", "true"), "HeaderSize": ("", "0"), "CompressedData": ("", "true", "false"),
-}  # fmt: skip
-_SKIPS = dict.fromkeys(("line skip", "lineskip", "byte skip", "byteskip"), ("", "0"))
-_NRRD_READ = {"type": _UCHAR, "encoding": ("raw", "gzip", "gz"), **_SKIPS}  # the values of fields that can be read
+_READ = {"type": _UCHAR, "ElementType": _UCHAR, "BinaryData": ("true",), "HeaderSize": ("0",)}
+_READ |= dict.fromkeys(("line skip", "lineskip", "byte skip", "byteskip"), ("0",))
+_READ["encoding"] = ("gzip", "gz", "bzip2", "bz2", "raw")  # the values of fields that are known
+PACKED = (
+    "its images are compressed, which is not supported; save the sequence without compression (3D Slicer: untick "
+    "Compress; PLUS: EditSequenceFile without --use-compression)"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +52,6 @@ class SequenceLimits:
     frames: int = 10_000_000
     min_images: int = 2
     side_px: int = 8192
-    zlib_ratio: int = 1032  # largest ratio of unpacked to packed bytes
-    chunk_bytes: int = 1 << 20  # bytes read, and unpacked, at once
 
 
 LIMITS = SequenceLimits()
@@ -60,25 +59,20 @@ LIMITS = SequenceLimits()
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameSequence:
-    """The header of a sequence. size: (width, height) px, (0, 0) without images; count: number of frames; channels: 1
-    or 3; fields: by name, each frame's text by its number; data: the file of the images, and their first byte; packed:
-    whether the images are compressed."""
+    """The header of a sequence. shape: (height, width, channels) of an image, (0, 0, 1) without images; count: number
+    of frames; fields: by name, each frame's text by its number; data: the file of the images, and their first byte;
+    packed: whether the images are compressed."""
 
     path: Path
-    size: tuple[int, int]
+    shape: tuple[int, int, int]
     count: int
-    channels: int
     fields: dict[str, dict[int, str]]
     data: tuple[Path, int]
     packed: bool
 
     @property
     def has_images(self) -> bool:
-        return min(self.size) > 1  # recordings of poses alone have images of 0 x 0 or 1 x 1
-
-    @property
-    def frame_bytes(self) -> int:
-        return self.size[0] * self.size[1] * self.channels
+        return min(self.shape[:2]) > 1  # recordings of poses alone have images of 0 x 0 or 1 x 1
 
     @property
     def transforms(self) -> list[str]:
@@ -116,25 +110,6 @@ class FrameSequence:
         stamps = to_numbers(np.array([*texts.values()], object)).tolist()
         return {frame: stamp for frame, stamp in zip(texts, stamps, strict=True) if np.isfinite(stamp)}
 
-    def read_frames(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """Yield the numbers and bytes of frames: the requested ones of raw data, all of compressed data in order. The
-        last one may be incomplete."""
-        (file, start), length = self.data, self.frame_bytes
-        with open_file(file, "images of a sequence") as stream:
-            for number in () if self.packed else numbers:
-                stream.seek(start + number * length)
-                yield number, stream.read(length)
-            stream.seek(start)
-            decompressor, frame, number = zlib.decompressobj(zlib.MAX_WBITS | 32), b"", 0  # zlib or gzip
-            while self.packed:
-                packed = decompressor.unconsumed_tail or stream.read(LIMITS.chunk_bytes)
-                frame += decompressor.decompress(packed, length - len(frame))
-                if len(frame) == length:
-                    yield number, frame
-                    frame, number = b"", number + 1
-                elif decompressor.eof or not packed:
-                    return
-
     def statuses(self, name: str) -> dict[int, str]:
         """Return the status of each frame that has a transform."""
         stated = self.fields.get(name + TRANSFORM + STATUS, {})
@@ -154,15 +129,19 @@ def read_sequence(path: Path) -> FrameSequence:
         raise NeecoError(f"{path}: {problem}; give a PLUS sequence, or another log")
     sizes = _integers(path, plain, "sizes" if is_nrrd else "DimSize")
     usual = "" if is_nrrd else " ".join(["domain"] * (len(sizes) - 1) + ["list"])
-    size, count, channels = _dimensions(path, sizes, plain.get("kinds", usual).lower().split())
+    kinds, channels = plain.get("kinds", usual).lower().split(), 1
+    if len(kinds) == len(sizes) and (kinds[0] == "vector" or kinds[0].endswith("color")):
+        channels, sizes, kinds = sizes[0], sizes[1:], kinds[1:]
+    if kinds[-1:] not in (["list"], ["time"]) or kinds[:-1] != ["domain"] * (len(sizes) - 1):
+        raise _fault(path, "kinds: expected domain ... list, with the frames last")
+    if len(sizes) not in (3, 4) or (len(sizes) == 4 and sizes[2] > 1):
+        raise _fault(path, f"{sizes} is not a sequence of images, expected width, height, frames")
+    if max(sizes[:2]) > LIMITS.side_px or sizes[-1] > LIMITS.frames:
+        raise _fault(path, f"{sizes} is too large")
+    width, height, count = sizes[0], sizes[1], sizes[-1]
     if "elementnumberofchannels" in plain:
         channels = _integers(path, plain, "ElementNumberOfChannels")[0]
-    if min(size) > 1:
-        for name, allowed in (_NRRD_READ if is_nrrd else _META_READ).items():
-            if (value := plain.get(name.lower(), "")).lower() not in allowed:
-                raise _fault(path, f"{name}: {printable(value or 'nothing')} is not supported, {allowed[-1]} is")
-        if channels not in (1, 3):
-            raise _fault(path, f"has {channels} channels, expected 1 (grey) or 3 (RGB)")
+    packed = plain.get("encoding", "raw").lower() != "raw" or plain.get("compresseddata", "").lower() == "true"
     name = plain.get("data file", plain.get("datafile", plain.get("elementdatafile", "LOCAL")))
     file = path
     if name.upper() != "LOCAL":
@@ -170,20 +149,19 @@ def read_sequence(path: Path) -> FrameSequence:
         if Path(name).name != name or not file.is_file():
             problem = f"data file {printable(name)} is missing next to {path.name}"
             raise NeecoError(f"{path}: {problem}; copy it there")
-    packed = plain.get("encoding", "raw").lower() != "raw" or plain.get("compresseddata", "").lower() == "true"
-    sequence = FrameSequence(
-        path=path, size=size, count=count, channels=channels, fields=frames, data=(file, start), packed=packed
-    )
+    shape = (height, width, channels)
+    sequence = FrameSequence(path=path, shape=shape, count=count, fields=frames, data=(file, start), packed=packed)
     if sequence.has_images:
+        required = "type" if is_nrrd else "ElementType"
+        for field, allowed in _READ.items():
+            if (value := plain.get(field.lower(), "")).lower() not in allowed and (value or field == required):
+                raise _fault(path, f"{field}: {printable(value or 'nothing')} is not supported, {allowed[-1]} is")
+        if channels not in (1, 3):
+            raise _fault(path, f"has {channels} channels, expected 1 (grey) or 3 (RGB)")
         require_content(file)
-        available, promised = file.stat().st_size - start, sequence.frame_bytes * count
-        stored = plain.get("compresseddatasize", "")
-        if not packed and available != promised:
-            raise _fault(file, f"holds {available / sequence.frame_bytes:.4g} images, its header states {count}")
-        if packed and re.fullmatch(r"\d{1,18}", stored) and available < int(stored):
-            raise _fault(file, f"holds {available} bytes of compressed images, its header states {stored}")
-        if packed and promised > LIMITS.zlib_ratio * (available + 64):
-            raise _fault(file, f"holds {available} bytes, too few for {count} images of {size}")
+        stored = (file.stat().st_size - start) / np.prod(shape)
+        if not packed and stored != count:
+            raise _fault(file, f"holds {stored:.4g} images, its header states {count}")
     return sequence
 
 
@@ -223,20 +201,6 @@ def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> tuple[dict[str,
     return plain, frames, stream.tell()
 
 
-def _dimensions(path: Path, sizes: list[int], kinds: list[str]) -> tuple[tuple[int, int], int, int]:
-    """Return (width, height), the number of frames, and channels; frames must be the last axis."""
-    channels = 1
-    if len(kinds) == len(sizes) and kinds and (kinds[0] == "vector" or kinds[0].endswith("color")):
-        channels, sizes, kinds = sizes[0], sizes[1:], kinds[1:]
-    if kinds != [*["domain"] * (len(sizes) - 1), kinds[-1] if kinds else ""] or kinds[-1] not in ("list", "time"):
-        raise _fault(path, "kinds: expected domain ... list, with the frames last")
-    if len(sizes) not in (3, 4) or (len(sizes) == 4 and sizes[2] > 1):
-        raise _fault(path, f"{sizes} is not a sequence of images, expected width, height, frames")
-    if max(sizes[:2]) > LIMITS.side_px or sizes[-1] > LIMITS.frames:
-        raise _fault(path, f"{sizes} is too large")
-    return (sizes[0], sizes[1]), sizes[-1], channels
-
-
 @dataclass(frozen=True, kw_only=True)
 class SequenceImages(VideoSource):
     """Images of a sequence; frames: frame number of each in the file."""
@@ -245,19 +209,16 @@ class SequenceImages(VideoSource):
     frames: tuple[int, ...]
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        sequence, remaining = self.sequence, {self.frames[int(index)]: int(index) for index in indices}
-        file, shape = sequence.data[0], (sequence.size[1], sequence.size[0], sequence.channels)
-        with one_line(file, "its images are damaged", "copy or export the sequence again"):
-            for number, content in sequence.read_frames(sorted(remaining)):
-                if number == sequence.count:
-                    raise _fault(file, "holds more images than its header states")
-                if number in remaining and len(content) == sequence.frame_bytes:
-                    pixels = np.frombuffer(content, np.uint8).reshape(shape)
-                    yield remaining.pop(number), np.broadcast_to(pixels, (*shape[:2], 3)).copy()
-                if not remaining and number + 1 < sequence.count:
-                    return
-        if remaining:
-            raise _fault(file, "its images are truncated")
+        (file, start), shape = self.sequence.data, self.sequence.shape
+        length = int(np.prod(shape))
+        with (
+            one_line(file, "its images are damaged", "copy or export the sequence again"),
+            open_file(file, "images") as stream,
+        ):
+            for index in sorted({int(index) for index in indices}):
+                stream.seek(start + self.frames[index] * length)
+                pixels = np.frombuffer(stream.read(length), np.uint8).reshape(shape)
+                yield index, np.broadcast_to(pixels, (*shape[:2], 3)).copy()
 
 
 class PlusSequence(RecordingFormat):
@@ -272,14 +233,13 @@ class PlusSequence(RecordingFormat):
         sequence = read_sequence(path)
         span, streams = float(np.ptp([*sequence.times.values()])), list[Stream]()
         if sequence.has_images:
-            frames, notes = sequence.images
-            title = f"{'grey' if sequence.channels == 1 else 'RGB'} images of {sequence.size[0]}x{sequence.size[1]}"
+            (frames, notes), (height, width, channels) = sequence.images, sequence.shape
+            title = f"{'grey' if channels == 1 else 'RGB'} images of {width}x{height}"
             why = f" ({notes[0].partition(': ')[2]})" if notes else ""
             few = f"only {len(frames)} of {sequence.count} images can be used{why}; record again"
-            problem = few if len(frames) < LIMITS.min_images else None
-            streams.append(
-                Stream(IMAGE_STREAM, Kind.IMAGES, title, len(frames), _rate(sequence.count, span), problem=problem)
-            )
+            problem = PACKED if sequence.packed else few if len(frames) < LIMITS.min_images else None
+            rate = _rate(sequence.count, span)
+            streams.append(Stream(IMAGE_STREAM, Kind.IMAGES, title, len(frames), rate, problem=problem))
         for name in sequence.transforms:
             texts, (body, _, meaning) = sequence.fields[name + TRANSFORM], _ends(name)
             # a constant transform is a calibration (ImageToProbe), not motion
@@ -312,9 +272,9 @@ class PlusSequence(RecordingFormat):
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         sequence = read_sequence(path)
         self.choose(path, stream, Kind.IMAGES)
-        frames, notes = sequence.images
+        (frames, notes), (height, width, _) = sequence.images, sequence.shape
         seconds = np.array([sequence.times[frame] for frame in frames])
-        return SequenceImages(path, sequence.size, notes, seconds, sequence=sequence, frames=tuple(frames))
+        return SequenceImages(path, (width, height), notes, seconds, sequence=sequence, frames=tuple(frames))
 
 
 def _rate(count: int, span: float) -> float | None:

@@ -7,7 +7,7 @@ has none. Lengths are in m and angles in rad, as in ROS.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -25,11 +25,12 @@ from neeco.geometry.rotations import rigid
 from neeco.ingest.calibration.camera_fields import cameras_in
 from neeco.ingest.calibration.stereo import RosCamera, from_projections
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, file_state
-from neeco.ingest.readers.columns import BASE, PoseColumns
+from neeco.ingest.readers.columns import BASE
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, camera_order, meaning_of, of_dvrk
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import SETTINGS as LOGS
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.readers.sections import PoseColumns
 
 if TYPE_CHECKING:
     from neeco.ingest.readers._bagfile import Samples, Survey
@@ -124,39 +125,34 @@ def _streams(survey: Survey) -> tuple[Stream, ...]:
         for name, log in sorted(survey.images.items(), key=lambda item: camera_order(item[0]))
     ]
     meanings = {name: _meaning(survey, name) for name in sorted(survey.poses)}
-    arms = {name for name in meanings if _DVRK_POSE.search(name)}
-    poses = [_pose_stream(survey, name, meanings, arms) for name in meanings]
-    return (*images, *poses, *(_joint_stream(survey, name) for name in sorted(survey.joints)), *survey.others)
-
-
-def _pose_stream(survey: Survey, name: str, meanings: Mapping[str, NamedFrame], arms: Collection[str]) -> Stream:
-    """Return a stream of poses. arms: the streams of a dVRK's."""
-    log, meaning = survey.poses[name], meanings[name]
-    if arms:
-        offered = name in arms
-    elif name.startswith("tf:"):
-        offered = not log.static and all(topic.startswith("tf:") for topic in survey.poses)
-    else:
-        offered = not _COMMANDS.search(name)
-    frame, bases = ", ".join(sorted(log.frames)) or "no named frame", ""
-    hints = meaning.hints or (f"poses are expressed in {frame}",)
-    if name in arms and _body(name) == DVRK_CAMERA:
-        instruments = (topic for topic in arms if topic != name and meanings[topic].frame not in CAMERA_FRAMES)
-        of_arms = {base for topic in instruments for base in survey.poses[topic].frames}
-        if of_arms - log.frames:  # the endoscope's poses would not register these arms
-            offered, bases = False, f", the arms in {', '.join(sorted(of_arms))}"
-    elif name in arms:
-        hints = (*hints, DVRK_HINT)
-    kind, static = (Kind.OTHER, ", static") if log.static else (Kind.POSES, "")
-    stream = survey.stream(name, log, kind, f" in {frame}{static}{bases}")
-    return replace(stream, offered=offered, body=_body(name), hints=hints, asks=meaning.asks)
-
-
-def _joint_stream(survey: Survey, name: str) -> Stream:
-    log, offered, wrist = survey.joints[name], not _COMMANDS.search(name), None
-    if _DVRK.search(name):
-        offered, wrist = bool(_DVRK_JOINTS.search(name)), wrist_joints(_joint_names(name, log), "jaw" in name)
-    return replace(survey.stream(name, log, Kind.READINGS), offered=offered, body=_body(name), joints=wrist)
+    arms, poses, joints = {name for name in meanings if _DVRK_POSE.search(name)}, list[Stream](), list[Stream]()
+    for name, meaning in meanings.items():
+        log = survey.poses[name]
+        if arms:
+            offered = name in arms
+        elif name.startswith("tf:"):
+            offered = not log.static and all(topic.startswith("tf:") for topic in survey.poses)
+        else:
+            offered = not _COMMANDS.search(name)
+        frame, bases = ", ".join(sorted(log.frames)) or "no named frame", ""
+        hints = meaning.hints or (f"poses are expressed in {frame}",)
+        if name in arms and _body(name) == DVRK_CAMERA:
+            instruments = (topic for topic in arms if topic != name and meanings[topic].frame not in CAMERA_FRAMES)
+            of_arms = {base for topic in instruments for base in survey.poses[topic].frames}
+            if of_arms - log.frames:  # the endoscope's poses would not register these arms
+                offered, bases = False, f", the arms in {', '.join(sorted(of_arms))}"
+        elif name in arms:
+            hints = (*hints, DVRK_HINT)
+        kind, static = (Kind.OTHER, ", static") if log.static else (Kind.POSES, "")
+        stream = survey.stream(name, log, kind, f" in {frame}{static}{bases}")
+        poses.append(replace(stream, offered=offered, body=_body(name), hints=hints, asks=meaning.asks))
+    for name, log in sorted(survey.joints.items()):
+        offered, wrist = not _COMMANDS.search(name), None
+        if _DVRK.search(name):
+            offered, wrist = bool(_DVRK_JOINTS.search(name)), wrist_joints(_joint_names(name, log), "jaw" in name)
+        stream = survey.stream(name, log, Kind.READINGS)
+        joints.append(replace(stream, offered=offered, body=_body(name), joints=wrist))
+    return (*images, *poses, *joints, *survey.others)
 
 
 def _image_frames(survey: Survey) -> set[str]:
@@ -213,27 +209,7 @@ def _chained(survey: Survey, stream: str) -> Table:
         listed = printable(", ".join(sorted(names)), 300).strip("'")
         remedy = f"choose one of: {listed}" if names else "the bag has no tf; use a topic"
         raise NeecoError(f"{where}: there is no transform of {printable(missing[0])}; {remedy}")
-    ups, downs = _path(survey, where, child, frame)
-    moving = [edge for edge in (*ups, *downs) if not survey.poses[f"tf:{edge}"].static]
-    if not moving:
-        raise NeecoError(f"{where}: does not move: all transforms between are static; use another frame")
-    seconds = np.unique(survey.seconds(survey.poses[f"tf:{moving[0]}"]))
-    frame_from_child = np.linalg.inv(_composed(survey, downs, seconds)) @ _composed(survey, ups, seconds)
-    covered = np.isfinite(frame_from_child).all(axis=(1, 2))
-    quats = np.full((len(seconds), 4), np.nan)
-    quats[covered] = Rotation.from_matrix(frame_from_child[covered, :3, :3]).as_quat()
-    rows = np.column_stack([seconds, frame_from_child[:, :3, 3], quats])
-    meaning = meaning_of(frame, _image_frames(survey), dvrk=of_dvrk(child))
-    lines = np.arange(1, len(rows) + 1)
-    return Table(
-        survey.path, CHAIN_HEADER, rows, lines, stream=stream, record="message", stated_in=frame, meaning=meaning
-    )
-
-
-def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str], list[str]]:
-    """Return the transforms from a child and from a frame up to their common ancestor, each by its child. Raises
-    NeecoError."""
-    chains: list[list[str]] = []
+    chains: list[list[str]] = []  # the transforms from each up to the root, by their children
     for name in (child, frame):
         chain = [name]
         while (key := f"tf:{chain[-1]}") in survey.poses:
@@ -249,7 +225,21 @@ def _path(survey: Survey, where: str, child: str, frame: str) -> tuple[list[str]
     if shared is None:
         roots = f"their roots are {ups[-1]} and {downs[-1]}"
         raise NeecoError(f"{where}: no transforms connect {child} to {frame} ({roots}); use frames of one tree")
-    return ups[: ups.index(shared)], downs[: downs.index(shared)]
+    ups, downs = ups[: ups.index(shared)], downs[: downs.index(shared)]
+    moving = [edge for edge in (*ups, *downs) if not survey.poses[f"tf:{edge}"].static]
+    if not moving:
+        raise NeecoError(f"{where}: does not move: all transforms between are static; use another frame")
+    seconds = np.unique(survey.seconds(survey.poses[f"tf:{moving[0]}"]))
+    frame_from_child = np.linalg.inv(_composed(survey, downs, seconds)) @ _composed(survey, ups, seconds)
+    covered = np.isfinite(frame_from_child).all(axis=(1, 2))
+    quats = np.full((len(seconds), 4), np.nan)
+    quats[covered] = Rotation.from_matrix(frame_from_child[covered, :3, :3]).as_quat()
+    rows = np.column_stack([seconds, frame_from_child[:, :3, 3], quats])
+    meaning = meaning_of(frame, _image_frames(survey), dvrk=of_dvrk(child))
+    lines = np.arange(1, len(rows) + 1)
+    return Table(
+        survey.path, CHAIN_HEADER, rows, lines, stream=stream, record="message", stated_in=frame, meaning=meaning
+    )
 
 
 def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.ndarray:

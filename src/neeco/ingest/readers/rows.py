@@ -11,7 +11,8 @@ from neeco.base.errors import NeecoError, counted
 from neeco.capture.documents import printable
 from neeco.ingest.readers import Table, column_index, numbers
 from neeco.ingest.readers import columns as named
-from neeco.ingest.readers.columns import JointColumns, PoseColumns, RecognisedColumns
+from neeco.ingest.readers.columns import RecognisedColumns
+from neeco.ingest.readers.sections import JointColumns, PoseColumns
 
 DAY_S = 86400.0  # period of a time-of-day clock, s
 COUNTERS = (2.0**32, 2.0**16)  # periods of unsigned counters
@@ -73,24 +74,24 @@ class Rows:
 
 def keep_measured(rows: Rows, source: PoseColumns, recognised: str | None) -> None:
     """Drop the rows whose state does not mark them as measured."""
-    table, name = rows.table, source.state or recognised
+    table, name, good = rows.table, source.columns.state or recognised, source.columns.good
     if name is None or not len(table.rows):
         return
     states = table.rows[:, column_index(table, name)].astype(str)
-    bad = ~np.isin(np.char.lower(states), [value.lower() for value in source.good])
+    bad = ~np.isin(np.char.lower(states), [value.lower() for value in good])
     for state, _ in Counter(states[bad].tolist()).most_common(SETTINGS.states):
         rows.drop(states == state, f"{name} is {state[:20] or 'empty'!r}")
     rows.keep &= ~bad
     if not rows.keep.any():
         raise NeecoError(
-            f"{table.where}: {name}: no row is {' or '.join(source.good)} ({table.list_rows(table.lines[:1])} has "
+            f"{table.where}: {name}: no row is {' or '.join(good)} ({table.list_rows(table.lines[:1])} has "
             f"{str(states[0])[:20]!r}); set columns.good in the recording to the values of measured rows"
         )
 
 
 def read_times(rows: Rows, source: PoseColumns | JointColumns, recognised: RecognisedColumns) -> np.ndarray:
     """Return times [R] in s; rows without one are dropped."""
-    table, names, rate = rows.table, source.time or recognised.time, source.rate_hz
+    table, names, rate = rows.table, source.columns.time or recognised.time, source.rate_hz
     if names is None and rate is not None:
         if headers := _headers(table, range(len(table.rows))):
             problem = f"line {headers[0]} repeats the header, and its rows have no times"

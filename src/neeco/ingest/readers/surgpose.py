@@ -21,15 +21,14 @@ from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, read_once
-from neeco.ingest.readers.rosbag import DVRK_HINT
+from neeco.ingest.readers.rosbag import DVRK_HINT, joint_column, wrist_joints
 from neeco.ingest.readers.rows import SETTINGS as ROWS
 from neeco.ingest.readers.video import open_video
 
 POSE_FILE, JOINT_FILE = "api_cp_data.yaml", "api_jp_data.yaml"
 FRAMES_PER_SECOND = 30.0
 JOINTS_BEHIND = "_joints"  # suffix of a joint stream, after the arm's name
-JOINT_NAMES = ("yaw_rad", "pitch_rad", "insertion_m", "roll_rad", "wrist_pitch_rad", "wrist_yaw_rad", "jaw_rad")
-WRIST = (("wrist_pitch", "wrist_pitch_rad"), ("wrist_yaw", "wrist_yaw_rad"), ("jaw", "jaw_rad"))
+JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw", "jaw")
 POSE_HEADER = ("t_s", *(f"m{row}{column}{'_m' if column == 3 else ''}" for row in range(3) for column in range(4)))
 GREEN = "green"  # folder of videos that show the ultraviolet paint
 _ByArm = dict[str, tuple[np.ndarray, np.ndarray]]  # by arm: frames [T] and rows [T, C]
@@ -48,15 +47,14 @@ class SurgPose(RecordingFormat):
         poses, joints = _read(path)
         count = max(len(frames) for frames, _ in poses.values())
         stream = partial(Stream, rate_hz=FRAMES_PER_SECOND)
-        # the left camera's are the frames; others are listed
-        streams = [
-            stream(name, Kind.IMAGES, "video", count, offered=number == 0) for number, name in enumerate(_videos(path))
-        ]
+        videos = [file.relative_to(path).as_posix() for file in visible_entries(path, "**/*_video.mp4")]
+        videos.sort(key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
+        # the left camera's in visible light are the frames; others are listed
+        streams = [stream(name, Kind.IMAGES, "video", count, offered=number == 0) for number, name in enumerate(videos)]
         for name, (frames, _) in sorted(poses.items()):
             streams.append(stream(name, Kind.POSES, "poses", len(frames), body=name, hints=(DVRK_HINT,)))
         for name, (frames, values) in sorted(joints.items()):
-            wrist = tuple(joint for joint in WRIST if joint[1] in JOINT_NAMES[: values.shape[1]])
-            title = f"{name}{JOINTS_BEHIND}"
+            wrist, title = wrist_joints(JOINT_NAMES[: values.shape[1]], False), f"{name}{JOINTS_BEHIND}"
             streams.append(stream(title, Kind.READINGS, "joints", len(frames), body=name, joints=wrist))
         labels = sorted(file.name for file in path.glob("keypoints_*.yaml"))
         return (*streams, *(Stream(name, Kind.OTHER, "labels", count) for name in labels))
@@ -69,7 +67,7 @@ class SurgPose(RecordingFormat):
             (frames, values), header, stated_in = poses[name], POSE_HEADER, f"{name}_base"
         else:
             frames, values = joints[name.removesuffix(JOINTS_BEHIND)]
-            header = ("t_s", *JOINT_NAMES[: values.shape[1]])
+            header = ("t_s", *map(joint_column, JOINT_NAMES[: values.shape[1]]))
         rows = np.column_stack([frames / FRAMES_PER_SECOND, values])
         return Table(
             path, header, rows, frames, stream=name, record="frame", stated_in=stated_in, image_hz=FRAMES_PER_SECOND
@@ -88,12 +86,6 @@ class SurgPose(RecordingFormat):
             return None  # videos of different light, or two left cameras
         calibrations = visible_entries(path, "*.ini")
         return read_stereo(calibrations[0]) if len(calibrations) == 1 else None
-
-
-def _videos(path: Path) -> list[str]:
-    """Return the videos, the left one in visible light first."""
-    videos = [file.relative_to(path).as_posix() for file in visible_entries(path, "**/*_video.mp4")]
-    return sorted(videos, key=lambda name: (name.startswith(GREEN), "right" in Path(name).name))
 
 
 def _read(path: Path) -> tuple[_ByArm, _ByArm]:

@@ -186,6 +186,9 @@ class _Video(VideoSource):
     buffered: tuple[Any, ...] = ()  # all frames, decoded; empty where they are too large
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        from av.video.reformatter import Interpolation as Way
+
+        exact = Way.BICUBIC | Way.ACCURATE_RND | Way.FULL_CHR_H_INT | Way.BITEXACT
         remaining = {self.stamps[int(index)]: int(index) for index in indices}
         frames = self.buffered or _Scan(self.path, threads=self.threads, part=self.part).decoded()
         for number, frame in enumerate(frames):
@@ -193,7 +196,8 @@ class _Video(VideoSource):
                 return
             index = remaining.pop(number if self.numbered else frame.pts, None)
             if index is not None:
-                yield index, _rgb(frame)
+                # the converter's fast default is more than one level too dark, hence exact rounding
+                yield index, frame.to_ndarray(format="rgb24", interpolation=exact)
         if remaining:
             problem = f"frame {min(remaining.values())} can no longer be read; do not modify the file during a run"
             raise NeecoError(f"{self.path}: {problem}")
@@ -301,7 +305,26 @@ class _Scan:
             why = f" ({self.failure})" if self.failure else ""
             raise NeecoError(f"{self.path}: {len(self.stamps)} frames can be decoded{why}; give an intact video file")
         stamps = [stamp for stamp in self.stamps if stamp is not None]
-        order, numbered, own_rate, notes = sorted(set(stamps)), False, None, self._notes(stamps)
+        order, numbered, own_rate, notes = sorted(set(stamps)), False, None, list[str]()
+        if self.failure or self.corrupt:
+            damage = f"{self.failure or 'corrupt frames'}; {len(self.stamps)} frames could be read"
+            notes.append(f"is damaged: {damage}, the others are left out")
+        elif self.promised > max(len(self.stamps), self.packets) and self.part is None:
+            # unless frames reach the end that the file states: those missing are decoded and not shown (edit list)
+            step = float(np.median(np.diff(sorted(stamps)))) if len(stamps) > 1 else 0.0
+            if self.end is None or not self.time_base or not stamps or order[-1] + 1.5 * step < self.end:
+                notes.append(f"is truncated: only {len(self.stamps)} of {self.promised} frames exist")
+        if self.others:
+            which = f"the first is read (others: {', '.join(self.others)})"
+            remedy = "to read another, copy it to a separate file: ffmpeg -map 0:v:1 -c copy"
+            notes.append(f"holds {1 + len(self.others)} video streams; {which}; {remedy}")
+        if self.pixel_aspect != 1:
+            shape = f"are not square ({self.pixel_aspect:.3g} times as wide as high); its frames are used as stored"
+            notes.append(f"its pixels {shape}, so fl_x / fl_y is {1 / self.pixel_aspect:.3g}")
+        if self.interlaced:
+            notes.append("is interlaced; deinterlace it (ffmpeg -vf yadif) for sharper frames")
+        if self.turned:
+            notes.append(f"states a rotation by {self.turned} degrees; its frames are used as stored")
         if len(stamps) == len(self.stamps) and self.time_base and len(order) > 0.9 * len(stamps):
             times = (np.array(order, dtype=np.float64) - order[0]) * self.time_base
             if any(later < stamp for stamp, later in pairwise(stamps)):
@@ -329,37 +352,6 @@ class _Scan:
             numbered=numbered, threads=self.threads, part=self.part, own_fps=own_rate, pixel_aspect=self.pixel_aspect,
             buffered=tuple(self.buffered) if len(self.buffered) == len(self.stamps) else (),
         )  # fmt: skip
-
-    def _notes(self, stamps: list[int]) -> list[str]:
-        notes, read = [], len(self.stamps)
-        if self.failure or self.corrupt:
-            damage = f"{self.failure or 'corrupt frames'}; {read} frames could be read, the others are left out"
-            notes.append(f"is damaged: {damage}")
-        elif self.promised > max(read, self.packets) and self.part is None:
-            # unless frames reach the end that the file states: those missing are decoded and not shown (edit list)
-            step = float(np.median(np.diff(sorted(stamps)))) if len(stamps) > 1 else 0.0
-            if self.end is None or not self.time_base or not stamps or max(stamps) + 1.5 * step < self.end:
-                notes.append(f"is truncated: only {read} of {self.promised} frames exist")
-        if self.others:
-            which = f"the first is read (others: {', '.join(self.others)})"
-            remedy = "to read another, copy it to a separate file: ffmpeg -map 0:v:1 -c copy"
-            notes.append(f"holds {1 + len(self.others)} video streams; {which}; {remedy}")
-        if self.pixel_aspect != 1:
-            shape = f"are not square ({self.pixel_aspect:.3g} times as wide as high); its frames are used as stored"
-            notes.append(f"its pixels {shape}, so fl_x / fl_y is {1 / self.pixel_aspect:.3g}")
-        if self.interlaced:
-            notes.append("is interlaced; deinterlace it (ffmpeg -vf yadif) for sharper frames")
-        if self.turned:
-            notes.append(f"states a rotation by {self.turned} degrees; its frames are used as stored")
-        return notes
-
-
-def _rgb(frame: Any) -> np.ndarray:
-    """Return uint8 [H, W, 3]. The converter's fast default is more than one level too dark, hence exact rounding."""
-    from av.video.reformatter import Interpolation
-
-    exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.BITEXACT
-    return frame.to_ndarray(format="rgb24", interpolation=exact)
 
 
 def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[str]) -> tuple[list[Path], np.ndarray]:

@@ -19,7 +19,7 @@ from neeco.geometry.conventions import DVRK_ECM
 from neeco.geometry.rotations import rigid
 from neeco.ingest.readers.columns import CAMERA
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_of
-from neeco.ingest.recording.sections import Positive, existing_file, word
+from neeco.ingest.readers.sections import Positive, existing_file, word
 
 BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera; to the laparoscope's tracker
 UNKNOWN = "unknown"

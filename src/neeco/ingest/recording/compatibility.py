@@ -9,7 +9,7 @@ from typing import Any
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import format_of
-from neeco.ingest.readers.columns import JointColumns, PoseColumns
+from neeco.ingest.readers.sections import JointColumns, PoseColumns
 from neeco.ingest.recording.model import IngestSettings, InstrumentLogs, Recording, StereoPartner, VideoFile
 
 
@@ -35,7 +35,7 @@ def _of_episode(recording: Recording, episode: int) -> Recording:
             return replace(value, **values)
         if not isinstance(value, VideoFile | PoseColumns | JointColumns):
             return value
-        reader = format_of(value.file if isinstance(value, VideoFile) else value.path)
+        reader = format_of(value.file)
         if reader is None or reader.of_episode("", episode) is None:
             return value
         if value.stream is None:

@@ -13,8 +13,8 @@ from neeco.capture.documents import Node, as_float
 from neeco.capture.model import SEPARATE_TISSUES
 from neeco.ingest.readers import format_of
 from neeco.ingest.readers.columns import TRACKER_CLOCK, VIDEO_CLOCK
+from neeco.ingest.readers.sections import MAX_NUMBER, existing_file
 from neeco.ingest.recording.model import Recording, RecordingKeys, with_clock
-from neeco.ingest.recording.sections import MAX_NUMBER, existing_file
 
 
 def read_recording(path: Path) -> Recording:
@@ -45,7 +45,7 @@ def recording_of(document: Any, path: Path) -> Recording:
     sync, notes = _sync(Node(stated.sync or None, str(path), "sync"), recording.clocks)
     reader = None if recording.file is None else format_of(recording.file)
     for log in recording.logs if reader is not None else ():
-        if recording.file is None or reader is None or log.path != recording.file or log.clock != VIDEO_CLOCK:
+        if recording.file is None or reader is None or log.file != recording.file or log.clock != VIDEO_CLOCK:
             continue
         of_log, of_images = (reader.clock(recording.file, stream) for stream in (log.stream, recording.stream))
         if of_log and of_images and of_log != of_images:  # another part of one file, as of another episode

@@ -10,32 +10,33 @@ from typing import Annotated, Any, ClassVar, TypeVar
 import numpy as np
 
 from neeco.base.errors import NeecoError
-from neeco.base.settings import Fault, printable
+from neeco.base.settings import Fault, join_places, printable, read
 from neeco.capture.documents import Node
 from neeco.capture.kinematics import KinematicTree
+from neeco.capture.readers import read_dvrk_tool, read_urdf
+from neeco.capture.readers.kinematics import DVRK_READINGS, parse_kinematics
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.readers import DELIMITED, RecordingFormat, VideoSource, format_of
-from neeco.ingest.readers.columns import TRACKER_CLOCK, VIDEO_CLOCK, JointColumns, PoseColumns
+from neeco.ingest.readers.columns import TRACKER_CLOCK, VIDEO_CLOCK
 from neeco.ingest.readers.frame_names import CAMERA_FRAMES
-from neeco.ingest.readers.video import open_images, open_video
-from neeco.ingest.recording.base import BASE_KEY, WORLD_KEY, StatedBase, parse_base, parse_world_base
-from neeco.ingest.recording.sections import (
+from neeco.ingest.readers.sections import (
     Count,
     File,
+    JointColumns,
     Name,
+    PoseColumns,
     Positive,
     columns,
     existing_file,
     integer,
-    joint_log,
-    links,
     number,
-    pose_log,
     ranges,
     word,
 )
+from neeco.ingest.readers.video import open_images, open_video
+from neeco.ingest.recording.base import BASE_KEY, WORLD_KEY, StatedBase, parse_base, parse_world_base
 
 STILL, MOVING = "still", "moving"  # what `camera` may say of a scope
 MIN_FRAMES = 10  # from which cameras can be found
@@ -97,6 +98,32 @@ class ShaftInVideo:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LinksFile:
+    """A tool file of the dVRK, or a URDF. readings: the recording's names of its joints."""
+
+    dvrk_tool: File | None = None
+    urdf: File | None = None
+    root: Name | None = None
+    pose_of: Name | None = None
+    readings: dict[str, str] = field(default_factory=dict)
+
+
+def links(node: Node) -> KinematicTree | None:
+    """Return the links of an instrument, from a file or as transforms.json has them."""
+    if not node.has("dvrk_tool") and not node.has("urdf"):
+        return parse_kinematics(node)
+    stated: LinksFile = read(LinksFile, node)
+    if stated.urdf is not None:
+        return read_urdf(stated.urdf, stated.root, stated.pose_of, stated.readings)
+    for key in stated.readings.keys() - {*DVRK_READINGS}:
+        raise Fault(
+            join_places(node.field, "readings", key), f"unknown key; the keys here are {', '.join(DVRK_READINGS)}"
+        )
+    assert stated.dvrk_tool is not None
+    return read_dvrk_tool(stated.dvrk_tool, stated.readings)
+
+
+@dataclass(frozen=True, kw_only=True)
 class StatedBases:
     """The pose of a base relative to a still camera, or to the tracker of a scope that moves; one of the two."""
 
@@ -117,11 +144,11 @@ class InstrumentLogs(StatedBases):
     that was logged."""
 
     name: Name
-    poses: Annotated[PoseColumns, pose_log] | None = None
-    joints: dict[str, Annotated[JointColumns, joint_log]] = field(default_factory=dict)
+    poses: PoseColumns | None = None
+    joints: dict[str, JointColumns] = field(default_factory=dict)
     kinematics: Annotated[KinematicTree, links] | None = None
     from_video: ShaftInVideo | None = None
-    roll: Annotated[JointColumns, joint_log] | None = None
+    roll: JointColumns | None = None
 
     def __post_init__(self) -> None:
         if self.roll is not None and self.from_video is None:
@@ -157,7 +184,7 @@ class InstrumentLogs(StatedBases):
 def with_clock(log: Log, own: str, file: Path | None, poses: PoseColumns | None = None) -> Log:
     """Return a log with its clock; by default that of the poses or the images (`file`) in the same file, else its
     own."""
-    theirs = poses.clock if poses is not None and log.path == poses.path else VIDEO_CLOCK if log.path == file else own
+    theirs = poses.clock if poses is not None and log.file == poses.file else VIDEO_CLOCK if log.file == file else own
     return replace(log, clock=log.clock or theirs)
 
 
@@ -269,7 +296,7 @@ class RecordingKeys(CameraFrames, StatedBases):
     episodes: Annotated[tuple[int, ...], _episodes] = ()
     intrinsics: Annotated[Any, _intrinsics] = None
     instruments: tuple[InstrumentLogs, ...] = ()
-    laparoscope: Annotated[PoseColumns, pose_log] | None = None
+    laparoscope: PoseColumns | None = None
     sync: Any = field(default_factory=dict)
     frames: Annotated[int, integer(MIN_FRAMES)] | None = None
     splits: Splits | None = None

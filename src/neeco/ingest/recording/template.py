@@ -166,7 +166,27 @@ def write_template(
         raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
     for line, _ in files.problems:
         report(line)
-    return "\n".join(_draft(files, stands_still)) + "\n"
+    frames = files.frames
+    scopes = [(log, columns) for log, columns in files.poses if _SCOPE.search(log.stem)]
+    on_scope, right, still = _scope_lines(frames, [*map(_scalar, files.lenses)], stands_still)
+    lines = [
+        "# A recording, for `neeco ingest recording.yaml --output CAPTURE`, drafted by looking at the files. Check",
+        "# every line. Paths are relative to this file; docs/recording.md explains all keys.",
+        frames[0].line + ("   # the rate is a guess: correct it" if frames[0].line.startswith("images") else ""),
+        *(f"# {item.line}   # another one found" for item in frames[1:] if item.line != right),
+    ]
+    if files.episodes:
+        lines.append(f'# episodes: ["{files.episodes}"]   # of the data set, or [0, 3, 7]: they become one capture')
+    lines += [*on_scope, *_instrument_lines(files, in_camera=still or not scopes)]
+    if scopes:
+        hints, of_scope = scopes[0][0].says.hints, _pose_lines(*scopes[0])
+        lines += ["laparoscope:", *(f"  # {hint}" for hint in hints), *(f"  {line}" for line in of_scope)]
+        lines += [f"# laparoscope: {{{', '.join(log.lines())}}}   # another one found" for log, _ in scopes[1:]]
+    shared = any(log.stream is not None and log.file == frames[0].name for log, _ in files.poses)
+    offsets = f"# sync: {{{'video' if shared else 'em'}: 0.0}}   # s, t_log = t_video + offset, by clock"
+    lines.append(f"sync: {_scalar(files.syncs[0])}" if files.syncs else offsets)
+    lines += ["# There, too, and not used:", *(f"#   {line}" for line in files.others)] if files.others else []
+    return "\n".join(lines) + "\n"
 
 
 def _find_files(source: Path) -> _FolderFiles:
@@ -185,14 +205,36 @@ def _find_files(source: Path) -> _FolderFiles:
             files.leave_out(name, problem, images=True)
         elif suffix in VIDEOS:
             files.frames.append(_Frames(f"video: {_scalar(name)}", name, file))
-        elif format_of(file) is not None:
-            if not _add_streams(files, file, name):
-                _classify_table(files, name, file)
-        elif suffix == ".json" and _is_sync(file):
-            files.syncs.append(name)
-        elif suffix in (".yaml", ".yml", ".xml", ".json"):
+        elif format_of(file) is not None and not _add_streams(files, file, name):
+            try:
+                table = read_table(file)
+                meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
+            except NeecoError as error:
+                files.leave_out(name, error, file)
+                continue
+            log, pose, (value, when) = _Log(name), recognise_pose(table.header), recognise_value(table.header)
+            columns = [column for column in table.header if column]
+            angles = [one for one in columns if split_unit(one, "angle")[1] or one.lower().startswith("angle")]
+            if pose.rotation or "rotation" in pose.unclear:
+                files.poses.append((replace(log, says=meaning or log.says), pose))
+                joints = joint_columns(columns, pose_bodies(columns))
+                files.joints += [(log, when, column, _joint_of(column)) for column in joints]
+            elif value and when.time:
+                files.joints.append((log, when, value, None))
+            elif when.time and len(angles) > 1:
+                files.joints += [(log, when, column, _joint_of(column)) for column in angles]
+            elif len(columns) == 2 and angles and not when.time and len(table.rows) <= LIMITS.calibration_rows:
+                files.calibrations.append((name, table.header))
+            elif not (when.time and len(columns) <= 2):
+                files.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
+        elif format_of(file) is None and suffix in (".yaml", ".yml", ".xml", ".json"):
             with suppress(NeecoError):
-                files.lenses += [name] if read_lens(file) is not None else []
+                document = read_json(file) if suffix == ".json" else None
+                offsets = document.get("clocks") if isinstance(document, dict) else None
+                if isinstance(offsets, dict) and offsets and {*map(type, offsets.values())} <= {int, float}:
+                    files.syncs.append(name)
+                else:
+                    files.lenses += [name] if read_lens(file) is not None else []
     for parent, count in Counter(file.parent for file in entries if file.suffix.lower() in IMAGES).items():
         name = parent.relative_to(source).as_posix()
         line = f"images: {{folder: {_scalar(name)}, fps: {LIMITS.image_rate:g}}}"
@@ -218,9 +260,19 @@ def _add_streams(files: _FolderFiles, path: Path, name: str) -> bool:
             files.frames.append(_Frames(f"video: {{{', '.join(log.lines())}}}", name, path, stream.name))
         elif used and stream.kind in (Kind.POSES, Kind.READINGS):
             try:
-                _classify_stream(files, log, stream, path)
+                table = read_table(path, stream.name)
             except NeecoError as error:
                 files.leave_out(title, error, path)
+                continue
+            when = recognise_time(table.header)
+            joints: Sequence[tuple[str | None, str]] = stream.joints or ()
+            if stream.kind == Kind.POSES:
+                header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
+                in_base = table.frame in (None, BASE) and not stream.asks and stream.clock != TRACKER_CLOCK
+                files.poses.append((replace(log, in_base=in_base), recognise_pose(header)))
+            elif stream.joints is None:  # every angle is one
+                joints = [(None, column) for column in table.header if split_unit(column, "angle")[1]]
+            files.joints += [(log, when, column, joint) for joint, column in joints]
         elif stream.problem is not None:
             files.leave_out(title, stream.problem, path, stream.kind == Kind.IMAGES)
         else:
@@ -229,77 +281,6 @@ def _add_streams(files: _FolderFiles, path: Path, name: str) -> bool:
             if (several := _EPISODES.fullmatch(stream.name)) and reader.of_episode(stream.name, 0) is not None:
                 files.episodes = f"{several[1]}-{several[2]}"
     return bool(streams)
-
-
-def _classify_stream(files: _FolderFiles, log: _Log, stream: Stream, path: Path) -> None:
-    table = read_table(path, stream.name)
-    when = recognise_time(table.header)
-    joints: Sequence[tuple[str | None, str]] = stream.joints or ()
-    if stream.kind == Kind.POSES:
-        header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
-        in_base = table.frame in (None, BASE) and not stream.asks and stream.clock != TRACKER_CLOCK
-        files.poses.append((replace(log, in_base=in_base), recognise_pose(header)))
-    elif stream.joints is None:  # every angle is one
-        joints = [(None, column) for column in table.header if split_unit(column, "angle")[1]]
-    files.joints += [(log, when, column, joint) for joint, column in joints]
-
-
-def _classify_table(files: _FolderFiles, name: str, file: Path) -> None:
-    try:
-        table = read_table(file)
-        meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
-    except NeecoError as error:
-        files.leave_out(name, error, file)
-        return
-    log, pose, (value, when) = _Log(name), recognise_pose(table.header), recognise_value(table.header)
-    columns = [column for column in table.header if column]
-    angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
-    if pose.rotation or "rotation" in pose.unclear:
-        files.poses.append((replace(log, says=meaning or log.says), pose))
-        joints = joint_columns(columns, pose_bodies(columns))
-        files.joints += [(log, when, column, _joint_of(column)) for column in joints]
-    elif value and when.time:
-        files.joints.append((log, when, value, None))
-    elif when.time and len(angles) > 1:
-        files.joints += [(log, when, column, _joint_of(column)) for column in angles]
-    elif len(columns) == 2 and angles and not when.time and len(table.rows) <= LIMITS.calibration_rows:
-        files.calibrations.append((name, table.header))
-    elif not (when.time and len(columns) <= 2):
-        files.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
-
-
-def _is_sync(file: Path) -> bool:
-    with suppress(NeecoError):
-        document = read_json(file)
-        offsets = document.get("clocks") if isinstance(document, dict) else None
-        return isinstance(offsets, dict) and bool(offsets) and {*map(type, offsets.values())} <= {int, float}
-    return False
-
-
-def _draft(files: _FolderFiles, stands_still: StandsStill | None) -> Iterator[str]:
-    """Yield the lines of the draft."""
-    frames = files.frames
-    scopes = [(log, columns) for log, columns in files.poses if _SCOPE.search(log.stem)]
-    on_scope, right, still = _scope_lines(frames, [*map(_scalar, files.lenses)], stands_still)
-    yield "# A recording, for `neeco ingest recording.yaml --output CAPTURE`, drafted by looking at the files. Check"
-    yield "# every line. Paths are relative to this file; docs/recording.md explains all keys."
-    yield frames[0].line + ("   # the rate is a guess: correct it" if frames[0].line.startswith("images") else "")
-    yield from (f"# {item.line}   # another one found" for item in frames[1:] if item.line != right)
-    if files.episodes:
-        yield f'# episodes: ["{files.episodes}"]   # of the data set, or [0, 3, 7]: they become one capture'
-    yield from on_scope
-    yield from _instrument_lines(files, in_camera=still or not scopes)
-    if scopes:
-        yield "laparoscope:"
-        yield from (f"  # {hint}" for hint in scopes[0][0].says.hints)
-        yield from (f"  {line}" for line in _pose_lines(*scopes[0]))
-        yield from (f"# laparoscope: {{{', '.join(log.lines())}}}   # another one found" for log, _ in scopes[1:])
-    shared = any(log.stream is not None and log.file == frames[0].name for log, _ in files.poses)
-    offsets = f"# sync: {{{'video' if shared else 'em'}: 0.0}}   # s, t_log = t_video + offset, by clock"
-    yield f"sync: {_scalar(files.syncs[0])}" if files.syncs else offsets
-    if files.others:
-        yield "# There, too, and not used:"
-        yield from (f"#   {line}" for line in files.others)
 
 
 def _scope_lines(
@@ -395,9 +376,20 @@ def _instrument_lines(files: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
         if all(joint in DVRK_WRIST for *_, joint in logs):
             logs.sort(key=lambda log: DVRK_WRIST.index(str(log[3])))
         yield from ["    joints:"] if logs else []
-        for joint, joint_log in zip(_unique([_joint_name(*log) for log in logs]), logs, strict=True):
-            yield f"      {_scalar(joint)}:"
-            yield from (f"        {line}" for line in _joint_lines(files, *joint_log))
+        for joint, (log, when, value, named) in zip(_unique([_joint_name(*log) for log in logs]), logs, strict=True):
+            lines, stem = log.lines(), log.stem.lower()
+            if log.stream is None and named:  # a table of several joints is a robot's, as its poses are
+                lines.append("clock: em   # that of the poses: correct it where another computer logged it")
+            elif log.stream is None and not files.syncs:
+                lines.append("# clock: em   # left out, it is its own, whose offset nothing states")
+            tables = [name for name, header in files.calibrations if value in header]
+            tables += [name for name, _ in files.calibrations if Path(name).stem.lower().startswith(stem)]
+            lines += [
+                f"columns: {{value: {_scalar(value)}}}",
+                *(f"calibration: {_scalar(name)}" for name in tables[:1]),
+            ]
+            lines += _unit_lines(when, {} if tables else {"angle": (value,)})
+            yield from [f"      {_scalar(joint)}:", *(f"        {line}" for line in lines)]
 
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
@@ -409,18 +401,6 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
         lines += ["columns:", *(f"  {key}: [{', '.join(map(_scalar, names))}]" for key, names in stated if names)]
     lines += [f"# columns: {meaning} is not clear: {why}" for meaning, why in columns.unclear.items()]
     return lines + _unit_lines(columns, {"length": of_length})
-
-
-def _joint_lines(files: _FolderFiles, log: _Log, when: RecognisedColumns, value: str, named: str | None) -> list[str]:
-    lines, stem = log.lines(), log.stem.lower()
-    if log.stream is None and named:  # a table of several joints is a robot's, as its poses are
-        lines.append("clock: em   # that of the poses: correct it where another computer logged it")
-    elif log.stream is None and not files.syncs:
-        lines.append("# clock: em   # left out, it is its own, whose offset nothing states")
-    tables = [name for name, header in files.calibrations if value in header]
-    tables += [name for name, _ in files.calibrations if Path(name).stem.lower().startswith(stem)]
-    lines += [f"columns: {{value: {_scalar(value)}}}", *(f"calibration: {_scalar(name)}" for name in tables[:1])]
-    return lines + _unit_lines(when, {} if tables else {"angle": (value,)})
 
 
 def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | None]) -> list[str]:

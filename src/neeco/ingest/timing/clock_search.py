@@ -114,8 +114,11 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
     tracked = np.sqrt(np.where(before[1] & after[1], tracked, np.nanmedian(tracked)))
     observed = np.sqrt(np.interp(grid, middle, speed))  # square roots, lest a fast stroke outweighs all others
     rate, lags, scores = best_rate(observed, tracked)
-    if rate != 1:
-        rate = _finer_rate(observed, tracked, rate)
+    if rate != 1:  # the vertex of the correlation near the coarse rate
+        step = CLOCK.rate_mismatch_s / (len(observed) * CLOCK.step_s / 2) / 4
+        rates = rate * (1 + step * np.arange(-6, 7))
+        fits = np.array([correlate(_stretched(observed, one), tracked)[1].max(initial=-1.0) for one in rates])
+        rate *= 1 + step * _vertex(np.arange(-6.0, 7.0), fits)
         lags, scores = correlate(_stretched(observed, rate), tracked)
     best, length, stretched = _peak(lags, scores, rate, log), grid[-1] - grid[0], _stretched(observed, rate)
     if (sds := significance(stretched, tracked, best, float(scores.max()))) < CLOCK.min_significance:
@@ -124,25 +127,17 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
             f"correlation of {scores.max():.2f} is {sds:.1f} standard deviations of chance, of "
             f"{CLOCK.min_significance:g} that are needed; give it in `sync`, or record more motion"
         )
-    sd = _spread_of_parts(stretched, tracked, best)
-    rate_sd = np.sqrt(12) * sd / length if rate != 1 else 0.0  # of a line fitted to offsets spread over the video
-    seconds = log_grid[0] + _vertex(lags, scores) * CLOCK.step_s - rate * grid[0]
-    return ClockOffset(float(seconds), sd, INSTRUMENT_MOTION, rate, float(rate_sd))
-
-
-def _spread_of_parts(observed: np.ndarray, tracked: np.ndarray, best: int) -> float:
-    """Return the standard deviation, s, of the offsets of the video's first, middle and last half.
-
-    Each is searched near `best`, the lag of the whole video.
-    """
-    quarter = len(observed) // 4
-    offsets = []
+    # the offsets of the video's first, middle and last half, each searched near that of the whole
+    quarter, offsets = len(stretched) // 4, []
     for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
-        near, fit = correlate(observed[part], tracked)
+        near, fit = correlate(stretched[part], tracked)
         around = np.abs((near - part.start - best) * CLOCK.step_s) < CLOCK.lobe_s
         if around.any():
             offsets.append(_vertex(near[around] - part.start, fit[around]))
-    return max(float(np.std(offsets)) * CLOCK.step_s if len(offsets) > 1 else CLOCK.lobe_s, CLOCK.step_s / 4)
+    sd = max(float(np.std(offsets)) * CLOCK.step_s if len(offsets) > 1 else CLOCK.lobe_s, CLOCK.step_s / 4)
+    rate_sd = np.sqrt(12) * sd / length if rate != 1 else 0.0  # of a line fitted to offsets spread over the video
+    seconds = log_grid[0] + _vertex(lags, scores) * CLOCK.step_s - rate * grid[0]
+    return ClockOffset(float(seconds), sd, INSTRUMENT_MOTION, rate, float(rate_sd))
 
 
 def _check_span(log: PoseLog) -> None:
@@ -180,14 +175,6 @@ def best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, np
     if other[1].max(initial=-1.0) < max(scores.max(initial=-1.0) + CLOCK.rate_lead, CLOCK.rate_correlation):
         return 1.0, lags, scores
     return rate, *other
-
-
-def _finer_rate(video: np.ndarray, log: np.ndarray, rate: float) -> float:
-    """Return the rate near a coarse one at the vertex of the correlation."""
-    step = CLOCK.rate_mismatch_s / (len(video) * CLOCK.step_s / 2) / 4
-    rates = rate * (1 + step * np.arange(-6, 7))
-    fits = np.array([correlate(_stretched(video, one), log)[1].max(initial=-1.0) for one in rates])
-    return rate * (1 + step * _vertex(np.arange(-6.0, 7.0), fits))
 
 
 def _stretched(video: np.ndarray, rate: float) -> np.ndarray:

@@ -261,25 +261,22 @@ class Episodes:
     def instrument_poses(self, name: str, times: np.ndarray, lag: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Return poses [N, 4, 4] of an instrument, logged `lag` s later, and whether they are known.
 
-        In the world's frame if its base is known, else in the tracker's.
+        In the world's frame if its base is known, else in the tracker's; of one found in the video, with its roll where
+        that is logged.
         """
         if name in self.video_poses:
-            return self._found_poses(name, times)
+            video_times, poses = self.video_poses[name]
+            if not len(video_times):
+                return np.full((len(times), 4, 4), np.nan), np.zeros(len(times), dtype=bool)
+            row = np.abs(times[:, None] - video_times).argmin(1)
+            valid = np.abs(times - video_times[row]) < EPISODES.same_instant
+            resampled = np.where(valid[:, None, None], poses[row], np.nan)
+            if name in self.parts[0].rolls:
+                roll, logged = self._gathered(times, lambda part, t: part.logged_readings(part.rolls[name], t), ())
+                resampled, valid = with_roll(resampled, np.nan_to_num(roll)), valid & logged
+            return resampled, valid
         poses, valid = self._gathered(times, lambda part, t: part.logged_poses(part.poses[name], t + lag), (4, 4))
         return (self.world_from_base[name] @ poses if name in self.world_from_base else poses), valid
-
-    def _found_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`instrument_poses` of one found in the video, with its roll where that is logged."""
-        video_times, poses = self.video_poses[name]
-        if not len(video_times):
-            return np.full((len(times), 4, 4), np.nan), np.zeros(len(times), dtype=bool)
-        row = np.abs(times[:, None] - video_times).argmin(1)
-        valid = np.abs(times - video_times[row]) < EPISODES.same_instant
-        resampled = np.where(valid[:, None, None], poses[row], np.nan)
-        if name in self.parts[0].rolls:
-            roll, logged = self._gathered(times, lambda part, t: part.logged_readings(part.rolls[name], t), ())
-            resampled, valid = with_roll(resampled, np.nan_to_num(roll)), valid & logged
-        return resampled, valid
 
     def states_at(self, times: np.ndarray) -> tuple[States, np.ndarray]:
         """Return every instrument's states, and whether all of them are known. All clocks must be known.
@@ -296,9 +293,22 @@ class Episodes:
             for joint in self.parts[0].joints[name]:
 
                 def of(part: Episode, local: np.ndarray, name: str = name, joint: str = joint) -> Any:
-                    log = part.joints[name][joint]
+                    log, span = part.joints[name][joint], limits[name][joint]
                     values, valid = part.logged_readings(log, local)
-                    return self._within_limits(part, log, limits[name][joint], values), valid
+                    if span is None:
+                        return values, valid
+                    clipped = np.clip(values, *span)
+                    excess = float(np.nanmax(np.abs(values - clipped), initial=0.0))
+                    beyond = f"{np.degrees(excess):.1f} deg beyond the"
+                    if excess > EPISODES.limit_slack:
+                        raise NeecoError(
+                            f"{log.path}: readings go {beyond} joint's limits {span[0]:g} .. {span[1]:g} rad; correct "
+                            "`limits` in the recording, or the calibration"
+                        )
+                    if excess > 0:
+                        note = f"{log.path.name}: readings up to {beyond} limits are held at them"
+                        self.notes.add(note, self.parts.index(part))
+                    return clipped, valid
 
                 readings[joint], valid = self._gathered(times, of, ())
                 usable &= valid
@@ -337,27 +347,6 @@ class Episodes:
         for part, rows, local in self._each(times):
             values[rows], valid[rows] = of(part, local)
         return values, valid
-
-    def _within_limits(
-        self, part: Episode, log: ReadingLog, limits: tuple[float, float] | None, values: np.ndarray
-    ) -> np.ndarray:
-        """Return readings [N] rad clipped to the joint's stated limits. Raises NeecoError if they exceed these by more
-        than noise."""
-        if limits is None:
-            return values
-        clipped = np.clip(values, *limits)
-        excess = float(np.nanmax(np.abs(values - clipped), initial=0.0))
-        if excess > EPISODES.limit_slack:
-            raise NeecoError(
-                f"{log.path}: readings go {np.degrees(excess):.1f} deg beyond the joint's limits {limits[0]:g} .. "
-                f"{limits[1]:g} rad; correct `limits` in the recording, or the calibration"
-            )
-        if excess > 0:
-            self.notes.add(
-                f"{log.path.name}: readings up to {np.degrees(excess):.1f} deg beyond the limits are held at them",
-                self.parts.index(part),
-            )
-        return clipped
 
 
 def with_roll(poses: np.ndarray, roll: np.ndarray) -> np.ndarray:

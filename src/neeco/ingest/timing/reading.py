@@ -10,7 +10,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
-from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_lengths, format_of
+from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_counts, format_of
 from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording.base import STATED
@@ -48,28 +48,31 @@ def read_episodes(recordings: Sequence[Recording]) -> Episodes:
             start = before.start_s + before.times[-1] + EPISODES.pause_s - part.times[0]
             part = replace(part, start_s=start, first_frame=before.first_frame + len(before.times))
         parts.append(part)
-    _check_episodes(parts)
-    _check_split_names(recordings[0], names)
-    video = parts[0].video
-    if len(parts) > 1:
-        videos, first = tuple(part.video for part in parts), tuple(part.first_frame for part in parts)
-        times = np.concatenate([part.times + part.start_s for part in parts])
-        video = _JoinedVideo(video.path, video.size, (), times, videos, (*first, len(times)))
-    return Episodes(tuple(parts), video, notes)
-
-
-def _check_episodes(parts: Sequence[Episode]) -> None:
-    """Raise NeecoError for recordings that one capture cannot hold."""
     first = parts[0]
     for part in parts[1:]:
         if part.video.size != first.video.size:
             sizes = [f"{width}x{height}" for width, height in (part.video.size, first.video.size)]
             raise refusal(part.recording, f"images: are {sizes[0]}, not {sizes[1]} as", first.recording)
-    check_recordings([part.recording for part in parts])
+    check_recordings(recordings)
     for part in parts[1:]:
         for name, log in part.poses.items():
             if log.frame != first.poses[name].frame:
                 raise refusal(part.recording, f"instruments: {name}: poses are in another frame than", first.recording)
+    single, splits, video = len(names) == 1, recordings[0].splits, first.video
+    for name in splits.test_episodes + splits.unseen_episodes if splits else ():
+        if single or name not in names:
+            listed = "one recording has none" if single else f"they are {', '.join(names)}"
+            raise NeecoError(f"{recordings[0].path}: splits: no episode is called {name!r}; {listed}")
+    if not single and splits and (splits.test or splits.unseen):
+        raise NeecoError(
+            f"{recordings[0].path}: splits: test and unseen count one video's frames, and there are {len(names)} "
+            "recordings; name test_episodes and unseen_episodes"
+        )
+    if not single:
+        videos, starts = tuple(part.video for part in parts), [part.first_frame for part in parts]
+        times = np.concatenate([part.times + part.start_s for part in parts])
+        video = _JoinedVideo(video.path, video.size, (), times, videos, (*starts, len(times)))
+    return Episodes(tuple(parts), video, notes)
 
 
 def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episode:
@@ -80,7 +83,16 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
     joints = {item.name: {joint: read_reading_log(source) for joint, source in item.joints.items()} for item in items}
     rolls = {item.name: read_reading_log(item.roll) for item in items if item.roll is not None}
     scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
-    _check_bases(recording, scope, poses)
+    for item in items:  # nothing would register poses in bases of different names
+        posed, tracker = poses.get(item.name), None if scope is None else scope.stated_in
+        if tracker is None or item.base is not None or posed is None or posed.frame != BASE:
+            continue
+        if posed.stated_in not in (None, tracker):
+            raise NeecoError(
+                f"{recording.path}: laparoscope: its poses are stated in {tracker}, those of {item.name} in "
+                f"{posed.stated_in}; where these are one frame write `frame: base` for both, else state how they stand "
+                "(world_from_base)"
+            )
     require_answers(recording, poses)
     video = recording.source.open()
     logs: list[PoseLog | ReadingLog] = [*poses.values(), *([scope] if scope else [])]
@@ -93,11 +105,44 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
     placed = [item.name for item in items if item.placed]
     if not placed:
         notes.add("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)", episode)
-    _check_video(recording, video)
+    rate, length = 1 / float(np.median(np.diff(video.times))), video.times[-1] - video.times[0]
+    if not (READING.min_fps < rate < READING.max_fps and length < CLOCK.max_length_s):
+        raise NeecoError(
+            f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
+            "cannot be; correct fps or the times' unit"
+        )
+    if min(video.size) < (least := READING.min_side_px):
+        width, height = video.size
+        raise NeecoError(f"{video.path}: its frames are {width}x{height} pixels; give {least} or more each way")
     if recording.stereo is not None:  # before anything that takes long
-        notes.contradict("calibration", _check_partner(recording), severe=False, episode=episode)
-    for note in _length_notes(recording, video, logs):
-        notes.add(note, episode)
+        left, right, _, calibration = recording.read_stereo()
+        right.check_size(recording.stereo.source.open().size, calibration)
+        reader, stated, sentence = None if recording.file is None else format_of(recording.file), None, ""
+        with suppress(NeecoError):  # the calibration of the images' file is not used
+            stated = None if reader is None or recording.file is None else reader.lens(recording.file, recording.stream)
+        if stated is not None and abs(left.fl_x / stated.fl_x - 1) >= READING.same_focal:
+            sentence = (
+                f"stereo.calibration: {calibration.name} states a focal length of {left.fl_x:.0f} px, the images' own "
+                f"file one of {stated.fl_x:.0f} px: check that it is of this scope and zoom"
+            )
+        notes.contradict("calibration", sentence, severe=False, episode=episode)
+    for log in (log for log in logs if log.clock == VIDEO_CLOCK):
+        if log.image_hz is not None:  # its rows belong to images one by one
+            rows, images = (round(float(seconds) * log.image_hz) + 1 for seconds in (log.times[-1], length))
+            remedy = "give the video of this log"
+            if images != rows and abs(len(video.times) - rows) <= 1:
+                remedy = f"its {len(video.times)} images match the states: set `fps: {log.image_hz:g}`"
+            noun = f"states at {log.image_hz:g} Hz"
+            for note in compare_counts(video.path, images, rows, noun, MAX_UNLIKE, remedy):
+                notes.add(note, episode)
+        elif log.path != recording.file:
+            beyond = max(0.0, log.times[-1] - video.times[-1]) + max(0.0, video.times[0] - log.times[0])
+            if beyond > MAX_UNLIKE * length:
+                note = (
+                    f"{log.path.name}: goes from {log.times[0]:.1f} to {log.times[-1]:.1f} s on the video's clock, the "
+                    f"video from {video.times[0]:.1f} to {video.times[-1]:.1f} s: check that both are of one recording"
+                )
+                notes.add(note, episode)
     clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
     if VIDEO_CLOCK in recording.clocks:
         clocks.setdefault(VIDEO_CLOCK, ClockOffset(0.0, 0.0, VIDEOS_OWN))
@@ -115,38 +160,6 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
     return Episode(
         name=name, recording=recording, video=video, poses=poses, joints=joints, rolls=rolls, scope=scope, clocks=clocks
     )
-
-
-def _check_partner(recording: Recording) -> str:
-    """Return a sentence on a stereo calibration that differs from the lens that the images' file states; "" without.
-    Raises NeecoError for one of images of another size, and for a right camera without images."""
-    assert recording.stereo is not None
-    left, right, _, calibration = recording.read_stereo()
-    right.check_size(recording.stereo.source.open().size, calibration)
-    reader = None if recording.file is None else format_of(recording.file)
-    stated = None
-    with suppress(NeecoError):  # the file's calibration is not used
-        stated = None if reader is None or recording.file is None else reader.lens(recording.file, recording.stream)
-    if stated is None or abs(left.fl_x / stated.fl_x - 1) < READING.same_focal:
-        return ""
-    return (
-        f"stereo.calibration: {calibration.name} states a focal length of {left.fl_x:.0f} px, the images' own file "
-        f"one of {stated.fl_x:.0f} px: check that it is of this scope and zoom"
-    )
-
-
-def _check_bases(recording: Recording, scope: PoseLog | None, poses: Mapping[str, PoseLog]) -> None:
-    """Raise NeecoError where the scope's poses and an instrument's are stated in bases of different names: nothing
-    would register them."""
-    stated = None if scope is None else scope.stated_in
-    placed = {item.name for item in recording.instruments if item.base is not None}
-    for name, log in poses.items():
-        if stated is not None and name not in placed and log.stated_in not in (None, stated) and log.frame == BASE:
-            raise NeecoError(
-                f"{recording.path}: laparoscope: its poses are stated in {stated}, those of {name} in "
-                f"{log.stated_in}; where these are one frame write `frame: base` for both, else state how they stand "
-                "(world_from_base)"
-            )
 
 
 def require_answers(recording: Recording, poses: Mapping[str, PoseLog]) -> None:
@@ -176,55 +189,6 @@ def require_lens(recording: Recording, lens: Lens | None) -> None:
         raise NeecoError(
             f"{recording.path}: intrinsics: missing; images of a scope that stands still do not determine its "
             "lens; give fl_x, fl_y, cx, cy or a calibration"
-        )
-
-
-def _check_video(recording: Recording, video: VideoSource) -> None:
-    """Raise NeecoError for times that no recording has, and for frames too small."""
-    rate, length = 1 / float(np.median(np.diff(video.times))), video.times[-1] - video.times[0]
-    if not (READING.min_fps < rate < READING.max_fps and length < CLOCK.max_length_s):
-        raise NeecoError(
-            f"{video.path}: frames at {rate:.3g} a second over {length / 3600:.3g} h "
-            "cannot be; correct fps or the times' unit"
-        )
-    if min(video.size) < (least := READING.min_side_px):
-        width, height = video.size
-        raise NeecoError(f"{video.path}: its frames are {width}x{height} pixels; give {least} or more each way")
-
-
-def _length_notes(recording: Recording, video: VideoSource, logs: Sequence[PoseLog | ReadingLog]) -> list[str]:
-    """Return notes on logs on the video's clock that are longer than the video, and on those whose rows belong to
-    images one by one and are not as many. Raises NeecoError where these differ by far."""
-    notes: list[str] = []
-    times = video.times
-    for log in logs:
-        if log.clock != VIDEO_CLOCK:
-            continue
-        if log.image_hz is not None:
-            rows = round(float(log.times[-1]) * log.image_hz) + 1
-            notes += compare_lengths(video.path, video, rows, log.image_hz)
-        if log.image_hz is not None or log.path == recording.file:
-            continue
-        beyond = max(0.0, log.times[-1] - times[-1]) + max(0.0, times[0] - log.times[0])
-        if beyond > MAX_UNLIKE * (times[-1] - times[0]):
-            notes.append(
-                f"{log.path.name}: goes from {log.times[0]:.1f} to {log.times[-1]:.1f} s on the video's clock, the "
-                f"video from {times[0]:.1f} to {times[-1]:.1f} s: check that both are of one recording"
-            )
-    return notes
-
-
-def _check_split_names(first: Recording, names: tuple[str, ...]) -> None:
-    """Raise NeecoError for splits that name no episode."""
-    single, splits = len(names) == 1, first.splits
-    for episode in splits.test_episodes + splits.unseen_episodes if splits else ():
-        if single or episode not in names:
-            listed = "one recording has none" if single else f"they are {', '.join(names)}"
-            raise NeecoError(f"{first.path}: splits: no episode is called {episode!r}; {listed}")
-    if not single and splits and (splits.test or splits.unseen):
-        raise NeecoError(
-            f"{first.path}: splits: test and unseen count one video's frames, and there are {len(names)} "
-            "recordings; name test_episodes and unseen_episodes"
         )
 
 

@@ -1,20 +1,17 @@
-"""Parsers of values of recording.yaml, for the types of fields of frozen dataclasses (`neeco.base.settings.read`)."""
+"""Logs as recording.yaml states them, and the parsers of its values: types of fields of frozen dataclasses, which
+`neeco.base.settings.read` reads."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from neeco.base.settings import Fault, join_places, printable, read
+from neeco.base.settings import Fault, printable
 from neeco.capture.documents import Node
-from neeco.capture.kinematics import KinematicTree
-from neeco.capture.readers import read_dvrk_tool, read_urdf
-from neeco.capture.readers.kinematics import DVRK_READINGS, parse_kinematics
-from neeco.ingest.readers import columns as named
-from neeco.ingest.readers.columns import FORMS, JointColumns, PoseColumns, Units
+from neeco.ingest.readers.columns import FORMS, UNITS, canonical_unit, quaternion_form
 from neeco.ingest.readers.frame_names import FRAMES
 
 Parser = Callable[[Node], Any]
@@ -102,7 +99,7 @@ def _words(node: Node) -> Names:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseColumnsSection:
+class NamedPoseColumns:
     """Columns of a log of poses, with at most one form of rotation."""
 
     time: Annotated[Names, columns(1, 2)] | None = None
@@ -134,89 +131,74 @@ class PoseColumnsSection:
     def rotation(self) -> tuple[Names | None, str | None]:
         """The columns of the rotation, and their form."""
         if self.quaternion:
-            return self.quaternion, named.quaternion_form(self.quaternion)
+            return self.quaternion, quaternion_form(self.quaternion)
         return next(((getattr(self, form), form) for form in FORMS if getattr(self, form)), (None, None))
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointColumnsSection:
+class NamedJointColumns:
     """Columns of a log of a joint."""
 
     time: Annotated[Names, columns(1, 2)] | None = None
     value: Annotated[Names, columns(1)] | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class LogSection:
-    """Keys of every log, or its file alone."""
+def _unit(kind: str) -> Parser:
+    """Return the parser of a unit."""
+
+    def parse(node: Node) -> str:
+        unit = canonical_unit(str(node.value))
+        if unit not in UNITS[kind]:
+            node.fail(f"{printable(node.value)} is not a unit of {kind}", f"use one of: {', '.join(UNITS[kind])}")
+        return unit
+
+    return parse
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units stated in a recording; None: the column names state the unit."""
+
+    time: Annotated[str, _unit("time")] | None = None
+    length: Annotated[str, _unit("length")] | None = None
+    angle: Annotated[str, _unit("angle")] | None = None
+
+
+@dataclass(frozen=True)
+class LogColumns:
+    """A log, or its file alone. clock: "" where the recording names none; stream: name, if the file has several;
+    rate_hz: frame rate if the column of times counts frames, or of rows without times."""
 
     shorthand: ClassVar[str] = "file"
     file: File
-    stream: Name | None = None
     clock: Name = ""
+    _: KW_ONLY
+    stream: Name | None = None
     units: Units = field(default_factory=Units)
     rate_hz: Positive | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class PoseSection(LogSection):
-    """A log of poses."""
+@dataclass(frozen=True)
+class PoseColumns(LogColumns):
+    """A log of poses (tracker_from_sensor). columns: those that are None are recognised from the header; tool: another
+    word for `stream`; frame: of the poses, one of `frame_names.FRAMES` (CAMERA, BASE: a robot's base or a tracker's
+    frame); None: as stated by the file, else BASE."""
 
-    columns: PoseColumnsSection = field(default_factory=PoseColumnsSection)
+    _: KW_ONLY
+    columns: NamedPoseColumns = field(default_factory=NamedPoseColumns)
     tool: Name | None = None
     frame: Annotated[str, word(*FRAMES)] | None = None
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stream", self.stream or self.tool)
 
-@dataclass(frozen=True, kw_only=True)
-class JointSection(LogSection):
-    """A log of a joint's readings."""
 
-    columns: JointColumnsSection = field(default_factory=JointColumnsSection)
+@dataclass(frozen=True)
+class JointColumns(LogColumns):
+    """A log of a joint. calibration: table from counts to angles (None: the column holds angles); limits: joint limits
+    for the capture, rad."""
+
+    _: KW_ONLY
+    columns: NamedJointColumns = field(default_factory=NamedJointColumns)
     calibration: File | None = None
     limits: Annotated[tuple[float, float], lambda node: node.range("rad")] | None = None
-
-
-def pose_log(node: Node) -> PoseColumns:
-    """Return a log of poses; its clock is "" where the recording names none."""
-    log: PoseSection = read(PoseSection, node)
-    (rotation, form), stated = log.columns.rotation, log.columns
-    return PoseColumns(
-        log.file, log.clock, time=stated.time, position=stated.position, rotation=rotation, form=form,
-        euler_convention=stated.euler_convention, state=stated.state, good=stated.good, units=log.units,
-        rate_hz=log.rate_hz, stream=log.stream or log.tool, frame=log.frame,
-    )  # fmt: skip
-
-
-def joint_log(node: Node) -> JointColumns:
-    """Return a log of a joint; its clock as that of `pose_log`."""
-    log: JointSection = read(JointSection, node)
-    return JointColumns(
-        log.file, log.clock, time=log.columns.time, value=(log.columns.value or (None,))[0], units=log.units,
-        rate_hz=log.rate_hz, calibration=log.calibration, limits=log.limits, stream=log.stream,
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinksFile:
-    """A tool file of the dVRK, or a URDF. readings: the recording's names of its joints."""
-
-    dvrk_tool: File | None = None
-    urdf: File | None = None
-    root: Name | None = None
-    pose_of: Name | None = None
-    readings: dict[str, str] = field(default_factory=dict)
-
-
-def links(node: Node) -> KinematicTree | None:
-    """Return the links of an instrument, from a file or as transforms.json has them."""
-    if not node.has("dvrk_tool") and not node.has("urdf"):
-        return parse_kinematics(node)
-    stated: LinksFile = read(LinksFile, node)
-    if stated.urdf is not None:
-        return read_urdf(stated.urdf, stated.root, stated.pose_of, stated.readings)
-    for key in stated.readings.keys() - {*DVRK_READINGS}:
-        raise Fault(
-            join_places(node.field, "readings", key), f"unknown key; the keys here are {', '.join(DVRK_READINGS)}"
-        )
-    assert stated.dvrk_tool is not None
-    return read_dvrk_tool(stated.dvrk_tool, stated.readings)
