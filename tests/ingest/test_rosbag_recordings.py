@@ -20,7 +20,7 @@ from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.ingest.cameras.still_scene import read_right_camera
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.readers import read_table
+from neeco.ingest.readers import _bagfile, read_table
 from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.readers.sections import JointColumns, PoseColumns
@@ -286,6 +286,17 @@ def test_metadata_larger_than_any_recorder_writes_is_refused(tmp_path, bags):
         metadata.write(b"#" * (16 << 20))
     said = refusal(lambda: known(path).streams(path))
     assert "metadata.yaml: is too large; rewrite it with `ros2 bag reindex`" in said
+
+
+def test_chunks_that_unpack_without_measure_are_refused(tmp_path, monkeypatch):
+    """The limit is lowered: a bomb of its real size would take seconds to make."""
+    monkeypatch.setattr(_bagfile, "LIMITS", _bagfile.BagLimits(chunk_bytes=60_000))
+    for kind, packed in (("a.bag", "bz2"), ("b.bag", "lz4"), ("c.bag", None), ("d-mcap", "zstd"), ("e-db3", "zstd")):
+        with BagWriter(tmp_path, kind, packed=packed) as bag:
+            for time in range(4):
+                bag.pose("/dvrk/PSM1/measured_cp", float(time), [0, 0, 0], [1, 0, 0, 0])
+                bag.image(LEFT, float(time), np.zeros((200, 200, 3), np.uint8), "rgb8")
+        assert "a chunk of its messages" in refusal(lambda bag=bag: known(bag.path).open_images(bag.path))
 
 
 def test_definitions_in_a_bag_are_never_executed(tmp_path: Path, bags: dict[str, Path]) -> None:

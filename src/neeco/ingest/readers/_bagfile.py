@@ -6,6 +6,7 @@ types that are read have been the same for years, and a bag with other digests i
 
 from __future__ import annotations
 
+import bz2
 import io
 import re
 import sys
@@ -14,15 +15,17 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import KW_ONLY, dataclass, field
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from lz4.frame import LZ4FrameDecompressor
 from PIL import Image
 from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag1.reader import decompressors
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import McapReader
@@ -43,6 +46,7 @@ else:
     from backports import zstd
 
 MCAP_HEADER_AT, MCAP_SCHEMA = 17, 3  # byte where the header's content begins, and the opcode of schemas
+_DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
 _REPAIRS = {".bag": "`rosbag reindex`", ".mcap": "`mcap recover`", "": "`ros2 bag reindex`"}  # by suffix
 POSE = {"geometry_msgs/PoseStamped", "geometry_msgs/TransformStamped"}
 TRANSFORMS = {"tf2_msgs/TFMessage", "tf/tfMessage"}
@@ -66,6 +70,7 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 class BagLimits:
     """Limits on what is read of a bag."""
 
+    chunk_bytes: int = 256 << 20  # limit on the unpacked bytes of a chunk; recorders write some MiB
     metadata_bytes: int = 16 << 20
     joints: int = 400  # limit on the joints of one topic
     bodies: int = 2000  # limit on the streams: bodies of all transforms, and topics of the other kinds
@@ -156,8 +161,9 @@ class Bag:
                 for connection, received, data in source.messages(requested, start, stop) if requested else ():
                     if not 0 <= received < 2**63:
                         raise ReaderError("a message has an invalid receipt time")
+                    data = unpack(data, "zstd" if packed else "none", LIMITS.chunk_bytes)
                     try:
-                        message = deserialize(zstd.decompress(data) if packed else data, connection.msgtype)
+                        message = deserialize(data, connection.msgtype)
                     except Exception:  # rosbags raises many types for damaged messages; the others are still read
                         message = None
                     yield connection.topic, received, message
@@ -193,9 +199,44 @@ def open_bag(path: Path) -> Iterator[Bag]:
             reader.open()
             stack.callback(reader.close)
             sources = reader.storages if path.is_dir() else [reader]
-            if any(isinstance(one, McapReader) and not one.chunks and one.metadata.message_count for one in sources):
-                raise ReaderError("its messages are not in chunks")
+            for source in sources:
+                _limit_chunks(source)
         yield Bag(path, reader, sources)
+
+
+def unpack(data: bytes, compression: str, max_bytes: int) -> bytes:
+    """Return the decompressed bytes. Raises ReaderError if they exceed `max_bytes` or are incomplete."""
+    if compression == "none":
+        return data
+    decompressor = _DECOMPRESSORS[compression]()
+    unpacked = decompressor.decompress(data, max_length=max_bytes + 1)
+    _check_size(len(unpacked), max_bytes)
+    if not decompressor.eof:
+        raise ReaderError("a chunk of its messages is truncated")
+    return unpacked
+
+
+def _limit_chunks(reader: Any) -> None:
+    """Make an open ROS 1 or MCAP reader reject chunks above the memory limit. Raises ReaderError.
+
+    An index states the unpacked size of MCAP's chunks; ROS 1 bags state none, so these are unpacked up to the limit.
+    """
+    if isinstance(reader, McapReader):
+        if not reader.chunks and reader.metadata.message_count:
+            raise ReaderError("its messages are not in chunks")
+        for listed in reader.chunks:
+            _check_size(max(listed.uncompressed_size, listed.compressed_size), LIMITS.chunk_bytes)
+    elif isinstance(reader, Ros1Reader):
+        names = {decompress: name for name, decompress in decompressors.items()}
+        for place, chunk in reader.chunks.items():
+            _check_size(chunk.datasize, LIMITS.chunk_bytes)
+            limited = partial(unpack, compression=names[chunk.decompressor], max_bytes=LIMITS.chunk_bytes)
+            reader.chunks[place] = chunk._replace(decompressor=limited)
+
+
+def _check_size(size: int, max_bytes: int) -> None:
+    if size > max_bytes:
+        raise ReaderError(f"a chunk of its messages is larger than {max_bytes >> 20} MiB")
 
 
 def _naming_damage(path: Path) -> AbstractContextManager[None]:
