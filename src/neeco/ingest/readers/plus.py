@@ -39,7 +39,7 @@ _READ |= dict.fromkeys(("line skip", "lineskip", "byte skip", "byteskip"), ("0",
 _READ["encoding"] = ("gzip", "gz", "bzip2", "bz2", "raw")  # the values of fields that are known
 PACKED = (
     "its images are compressed, which is not supported; save the sequence without compression (3D Slicer: untick "
-    "Compress; PLUS: EditSequenceFile without --use-compression)"
+    "Compress)"
 )
 
 
