@@ -291,7 +291,7 @@ def test_a_frame_that_is_off_along_the_shaft_is_found_and_no_joint_is_called_rev
     found = asked.scene.diagnostics["registration_of_links"]["tool"]
     assert abs(found["frame_off_along_shaft_mm"] - along_mm) < 1.5
     assert not asked.scene.diagnostics.get("doubted_readings")
-    assert pivots_off_mm(asked, links, off[0], true[0]) < 2.5  # mm
+    assert pivots_off_mm(asked, links, off[0], true[0]) < 2.6  # mm
 
 
 def test_a_base_that_is_off_is_corrected(carved: tuple[Evidence, CarvedShape]) -> None:
