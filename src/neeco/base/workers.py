@@ -167,7 +167,8 @@ class Processes:
         else:
             context = multiprocessing.get_context("spawn")  # a forked one would share threads' locks
             parent_end, child_end = context.Pipe()
-            slot, gpu = self._slots.pop(0), None
+            slot = self._slots.pop(0)
+            gpu = None
             if self._workers.gpu:  # what CUDA_VISIBLE_DEVICES is to be
                 number = slot % (self._workers.shared_gpus or self.capacity)
                 visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]

@@ -45,7 +45,8 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
             message = f"has {len(tool_masks)} masks for {len(parsed.frames)} images"
             report.error(f"{MASKS}/", "", message, "each image needs one, in the order of the sorted names")
         report.raise_first(folder)
-        capture, notes = capture_of(parsed), list[str]()
+        capture = capture_of(parsed)
+        notes = list[str]()
         frames = list(capture.frames)
         if count := len(parsed.absent):
             total, first = count + len(frames), parsed.absent[0]
@@ -53,7 +54,8 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
         if tool_masks:
             frames, mask_notes = _with_tool_masks(frames, tool_masks, work / "tool")
             notes += mask_notes
-        border, sizes = None, {(frame.camera.width, frame.camera.height) for frame in frames}
+        border = None
+        sizes = {(frame.camera.width, frame.camera.height) for frame in frames}
         if len(sizes) == 1 and not any(frame.mask_path for frame in frames):
             chosen = evenly_spaced(len(frames), BORDERS.max_frames, floor=True)
             border = find_border(frames[index].load_image_bytes().numpy() for index in chosen)

@@ -299,7 +299,8 @@ def assign_splits(
     moving = [name for name, values in joints.items() if np.ptp(values) > SPLITS.min_range]
     joint = rule.unseen_by or (moving[0] if moving else None)
     share = rule.unseen_fraction if rule.unseen_by or joint is None else rule.unseen_fraction / 2
-    unseen, why = np.zeros(len(poses), dtype=bool), []
+    unseen = np.zeros(len(poses), dtype=bool)
+    why = []
     if joint is not None:
         limit = float(np.quantile(joints[joint], 1 - share))
         unseen |= joints[joint] > limit

@@ -260,7 +260,8 @@ def _carve_instruments(
     settings = data.recording.settings
     rows = np.unique(np.linspace(0, len(sfm.indices) - 1, settings.shape_frames).astype(int))
     evidence = flow.moving_pixels(rows, settings.moving_px)
-    on_instruments, names = np.zeros(len(sfm.observations), dtype=bool), data.parts[0].poses
+    on_instruments = np.zeros(len(sfm.observations), dtype=bool)
+    names = data.parts[0].poses
     shapes = carve_shapes(evidence, tracked_in(data, names, views, rows), flow.pinhole)
     for name, poses_at in tracked_in(data, shapes, views, slice(None)).items():
         poses, valid = poses_at(0.0)
@@ -323,10 +324,12 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     data = data.with_assumed_clocks()
     names = (*data.world_from_base, *data.video_poses)
     progress("finding the tissue behind the instrument", 0, 0)
-    settings, shapes = data.recording.settings, dict[str, RoughShape]()
+    settings = data.recording.settings
+    shapes = dict[str, RoughShape]()
     if names:
         rows = np.unique(np.linspace(0, count - 1, settings.shape_frames).astype(int))
-        moved, tracked = moving_shares(views, rows), tracked_in(data, names, views, rows)
+        moved = moving_shares(views, rows)
+        tracked = tracked_in(data, names, views, rows)
         shapes = carve_shapes(moved, tracked, views.reduced_pinhole)
     poses = {name: poses_at(0.0) for name, poses_at in tracked_in(data, names, views, slice(None)).items()}
     tissue, how = look_behind(data.notes, views, shapes, poses, settings, right)

@@ -109,7 +109,8 @@ def posed_picture(
             image.paste(OUTLINE_COLOR, (0, 0), edge.filter(ImageFilter.MaxFilter(3)))
         painter = ImageDraw.Draw(image)
         if name in shafts:  # its two contours, and its end
-            diameter, z_axis = shafts[name], np.array([0.0, 0.0, 1.0])
+            diameter = shafts[name]
+            z_axis = np.array([0.0, 0.0, 1.0])
             along = np.linspace(-SETTINGS.shaft_diameters, 0, 61)[:, None] * diameter * z_axis  # [61, 3]
             centre = np.linalg.inv(pose.numpy()) @ camera.world_from_camera.double().numpy()[:, 3]  # [4] mm
             aside = np.cross(centre[:3] - along, z_axis)

@@ -52,7 +52,9 @@ def augment(planes: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     count, _, height, width = planes.shape
     random = _Random(rng, count, planes.device)
     # flips, rotations, zooms and shifts [B, 2, 3]
-    aspect, placed, flip = width / height, random.some(CHANGES.placed), 1 - 2 * random.some(0.5)
+    aspect = width / height
+    placed = random.some(CHANGES.placed)
+    flip = 1 - 2 * random.some(0.5)
     turn, zoom = placed * random.uniform(-CHANGES.turn, CHANGES.turn), CHANGES.zoom ** (placed * random.uniform(-1, 1))
     cosine, sine = turn.cos() / zoom, turn.sin() / zoom
     shift = placed[:, None] * random.uniform(-2 * CHANGES.shift, 2 * CHANGES.shift, 2)

@@ -243,7 +243,8 @@ class RecordedMotion:
 
     def __init__(self, recorded: Recorded, instruments: Sequence[Recorded] = ()) -> None:
         order = sorted(range(len(recorded.states)), key=lambda k: recorded.states[k].time)
-        self._motions, states = list[Motion](), []
+        self._motions = list[Motion]()
+        states = []
         for first, second in pairwise(order):
             a, b = recorded.states[first], recorded.states[second]
             if 0 < b.time - a.time <= SETTINGS.max_gap_s and set(a.instruments) == set(b.instruments):

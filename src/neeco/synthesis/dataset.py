@@ -114,7 +114,8 @@ def synthesize(
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
     folders = {name: ImageFolder.of(folder, name).digest() for name, folder in settings.image_folders().items()}
     check_formats(formats, settings)
-    recorded, states_sha256 = scene.recorded.cameras[0], None
+    recorded = scene.recorded.cameras[0]
+    states_sha256 = None
     if settings.states not in SAMPLERS:
         absent = "no such file; --states takes interpolate, extrapolate, grid, path:FILE.jsonl or FILE.jsonl"
         content = read_bytes(states_file(settings.states), "a file of states", absent)

@@ -214,7 +214,9 @@ class SampleGenerator:
         """
         rng = self._rng(index, EFFECTS_STREAM)
         effects = {} if self.effects is None else self.effects.draw(rng)
-        settings, sampling, refused = self.settings, self._rng(index), Counter[str]()
+        settings = self.settings
+        sampling = self._rng(index)
+        refused = Counter[str]()
         for _ in range(1 if self.sampler.fixed(index) else settings.max_attempts):
             state, camera = self.sampler(index, sampling)
             drawing = draw_layers(self.scene, self.labeller, state, self.cameras(camera), settings.min_component)

@@ -50,7 +50,8 @@ class Access:
     def at(cls, host: str, port: int) -> Access:
         """Return the access of a server on `host` and `port`, or the next free one, with a new token. Raises
         NeecoError."""
-        host, last = host.strip("[]"), None
+        host = host.strip("[]")
+        last = None
         if not 0 < port < 65536:
             raise NeecoError(f"--port must be 1 to 65535 (got {port})")
         for candidate in range(port, min(port + MAX_PORTS, 65536)):

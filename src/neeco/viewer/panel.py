@@ -177,7 +177,8 @@ class InstrumentPanel:
                 step = 10.0**-digits
                 lower = round(math.floor(lower / step) * step, digits)
                 upper = round(math.ceil(upper / step) * step, digits)
-                unit, begin = "mm" if per_unit == 1 else "°", min(max(0.0, lower), upper)
+                unit = "mm" if per_unit == 1 else "°"
+                begin = min(max(0.0, lower), upper)
                 self._joints[joint] = gui.add_slider(f"{joint} ({unit})", lower, upper, step, begin)
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
             end, angle = "About the shaft's end.", PANEL.yaw_deg

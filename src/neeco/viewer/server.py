@@ -239,12 +239,16 @@ class ClientSession:
             self._client.gui.reset()
             self._client.scene.reset()
             self._build(current)
-        self._loaded, window, unit = current, self._client.camera, self._run.unit
+        self._loaded = current
+        window = self._client.camera
+        unit = self._run.unit
         if (shape := aspect_of(window)) != self._shape:  # fit the whole recorded image, where it stands at its camera
-            self._shape, recorded = shape, current.recorded.cameras[self._camera_frame]
+            self._shape = shape
+            recorded = current.recorded.cameras[self._camera_frame]
             if stands_at(browser_camera(window, unit, VIEWER.min_px), recorded, self._run.distance):
                 window.fov = fitting_view(recorded, shape)
-        controls, panel = self._panel.controls(self.overlays), self._panel  # of before sliders follow the recording
+        controls = self._panel.controls(self.overlays)
+        panel = self._panel  # of before sliders follow the recording
         state = interpolated_state(current.recorded.states, controls.frame)
         for instrument in panel.instruments:
             instrument.follow(state.instruments[instrument.name])
@@ -274,7 +278,8 @@ class ClientSession:
         if not sharp and now - self.status_at < VIEWER.status_every_s:
             return
         self.status_at = now
-        notes, score = [self._run.trouble or current.trouble, picture.note], None
+        notes = [self._run.trouble or current.trouble, picture.note]
+        score = None
         if sharp and as_recorded and current.frames:  # else things move on before it is read
             try:
                 with current.scene.torch_threads():

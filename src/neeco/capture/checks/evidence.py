@@ -236,7 +236,8 @@ class ColorEvidence:
             near = self.neighbours[:, :count]
             return np.asarray((values * inside)[:, near].sum(-1) / inside[:, near].sum(-1).clip(1))
 
-        planes, count = (observed, np.tile(self.brightness, (len(u), 1))), SETTINGS.neighbours
+        planes = (observed, np.tile(self.brightness, (len(u), 1)))
+        count = SETTINGS.neighbours
         observed, color = (
             mean(values, count) - mean(values, SETTINGS.far_neighbours) if coarse else values - mean(values, count)
             for values in planes
@@ -310,7 +311,8 @@ class MotionEvidence:
         differences = in_threads(find, range(len(valid)))
         # [F, h, w] confidence in [0, 1] that a pixel moves
         moving = np.stack([cv2.blur(((pixels - low) / (high - low)).clip(0, 1), (3, 3)) for pixels in differences])
-        generator, each = np.random.default_rng(0), -(-SETTINGS.rays // len(moving))
+        generator = np.random.default_rng(0)
+        each = -(-SETTINGS.rays // len(moving))
         places = [
             (index, place)
             for index, pixels in enumerate(moving)
@@ -349,7 +351,9 @@ class MotionEvidence:
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         world = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1) @ pose[:3, :3].T + pose[:3, 3]
         # others with cameras near this one, spread over the time that they span
-        poses, predictions, observed = self.cameras.poses, [], np.zeros(depth.shape, int)
+        poses = self.cameras.poses
+        predictions = []
+        observed = np.zeros(depth.shape, int)
         cosine = (np.einsum("ij,fij->f", pose[:3, :3], poses[:, :3, :3]) - 1) / 2
         distance = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.median(depth)
         distance += np.arccos(cosine.clip(-1, 1))

@@ -148,7 +148,8 @@ def _is_same(one: Frame, two: Frame) -> bool:
 def check_states(parsed: Parsed) -> None:
     """Report missing instruments and joints, exceeded limits, degrees for radians, and states that never change."""
     for instrument in parsed.instruments:
-        name, pairs = printable(instrument.name), zip(parsed.frames, parsed.places, strict=True)
+        name = printable(instrument.name)
+        pairs = zip(parsed.frames, parsed.places, strict=True)
         without = [place for frame, place in pairs if instrument.name not in frame.state.instruments]
         if len(without) == len(parsed.frames):
             message = f"instrument {name} is declared, but not in any frame"

@@ -70,7 +70,9 @@ class ImageVerdicts:
         if colors is None:
             return Verdict("contradicted" if has_errors else "undecided")
         fine = float(colors.recorded.mean())
-        all_poses, rows, candidates = colors.all_cameras.poses, colors.rows, list[Candidate]()
+        all_poses = colors.all_cameras.poses
+        rows = colors.rows
+        candidates = list[Candidate]()
         for steps in range(-SETTINGS.max_offset, SETTINGS.max_offset + 1):
             if steps:
                 at = (rows + steps).clip(0, len(all_poses) - 1)
@@ -106,7 +108,8 @@ class ImageVerdicts:
         """Return the verdicts whether instruments are at their stated poses, by motion. Needs states in all frames."""
         poses: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # [N, 4, 4] as recorded, and to the root: most visible
         for item in self.parsed.instruments:
-            tree, states = item.kinematics, [state for _, state in self.parsed.states_of(item.name)]
+            tree = item.kinematics
+            states = [state for _, state in self.parsed.states_of(item.name)]
             if len(states) == len(self.parsed.frames):
                 back = [np.eye(4) if tree is None else tree.world_from_root(np.eye(4), one.joints) for one in states]
                 poses[item.name] = np.stack([state.pose.numpy() for state in states]), np.stack(back)
@@ -115,13 +118,15 @@ class ImageVerdicts:
     def _verdict(self, instrument: str, poses: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Verdict:
         if instrument not in poses or self._motion is None:
             return Verdict("undecided")
-        rows, (recorded, root_from_recorded) = self._motion.rows, poses[instrument]
+        rows = self._motion.rows
+        recorded, root_from_recorded = poses[instrument]
         roots = recorded @ root_from_recorded
         other_paths = [(other @ back)[rows] for name, (other, back) in poses.items() if name != instrument]
         motion = self._motion.without(other_paths, roots[rows])
         if motion is None:
             return Verdict("undecided")
-        name, motion = printable(instrument), motion.with_recorded(roots[rows])
+        name = printable(instrument)
+        motion = motion.with_recorded(roots[rows])
         if (mistake := self._mistake(name, recorded, root_from_recorded, motion)) is not None:
             return Verdict.of(mistake, POSES, STATES)
         evidence = motion.mean(roots[rows])
@@ -286,8 +291,10 @@ ALL_IN_MM = "give all lengths in mm"
 
 def check_placement(parsed: Parsed, verdicts: ImageVerdicts) -> None:
     """Check points, cameras against points, then instruments against both (unless the cameras are wrong)."""
-    report, placed = parsed.places[0].report, parsed.with_cameras()
-    before, place = len(errors_only(report.problems)), parsed.points_place
+    report = parsed.places[0].report
+    placed = parsed.with_cameras()
+    before = len(errors_only(report.problems))
+    place = parsed.points_place
     assert place is not None  # there are frames
     points = None  # the measured ones [P, 3] float64; None where there are none, or all coincide
     if parsed.points is None or not parsed.points.measured:

@@ -178,7 +178,10 @@ def _parse(path: Path) -> Any:
 
 
 def _parse_binary(kind: str, content: bytes) -> Any:
-    cameras, images, points, offset = dict[int, _Intrinsics](), list[_Image](), list[tuple[float, ...]](), 0
+    cameras = dict[int, _Intrinsics]()
+    images = list[_Image]()
+    points = list[tuple[float, ...]]()
+    offset = 0
 
     def take(layout: str) -> tuple:
         nonlocal offset
@@ -212,7 +215,8 @@ def _parse_binary(kind: str, content: bytes) -> Any:
 
 def _parse_text(kind: str, content: bytes) -> Any:
     lines = [line for line in content.decode("utf-8").splitlines() if not line.startswith("#")]
-    cameras, images = dict[int, _Intrinsics](), list[_Image]()
+    cameras = dict[int, _Intrinsics]()
+    images = list[_Image]()
     if kind == "images":  # two lines each; the second (observations) may be empty, so only every other line is read
         for line in (line for line in list(dropwhile(lambda line: not line.strip(), lines))[::2] if line.strip()):
             _, *pose, camera_id, name = line.split(maxsplit=9)

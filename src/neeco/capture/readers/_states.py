@@ -176,7 +176,8 @@ def _parse_state_line(node: Node, instruments: Sequence[Instrument]) -> StateLin
         if name.value in parsed:
             name.fail(f"{printable(name.value)} is listed twice", "keep one state per instrument")
         parsed[name.value] = _parse_state(item)[1]
-        joints, instrument = item.child("joints"), by_name[name.value]
+        joints = item.child("joints")
+        instrument = by_name[name.value]
         if not all(joints.has(joint) for joint in instrument.joints if joint not in instrument.unrecorded):
             joints.fail(f"expected these joints, in rad: {', '.join(instrument.joints)}")
         for joint, angle in (joints.value or {}).items():

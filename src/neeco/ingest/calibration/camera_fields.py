@@ -231,7 +231,9 @@ def _camera(where: Path | str, keys: Mapping[str, Any], pair_of: bool = False) -
     if isinstance(both, list) and len(both) == 2:
         size = (both[0], both[1])
     fisheye = bool(models & FISHEYE)
-    bends, vector, named = list[float](), first_of(keys, _DISTORTION), dict(keys)
+    bends = list[float]()
+    vector = first_of(keys, _DISTORTION)
+    named = dict(keys)
     for section in (keys.get("projectionparameters"), keys.get("distortionparameters")):
         named |= _plain(section) if isinstance(section, dict) else {}
     names: tuple[str, ...] = _COEFFICIENTS if not fisheye else _FISHEYE_COEFFICIENTS["mu" in named]

@@ -382,7 +382,8 @@ class StructureFromMotion:
         self.seconds += run_worker(job_file, self.source, progress)
 
     def _run(self, job: dict[str, Any], progress: StageProgress) -> SfmResult:
-        result, best = self.work / "result.npz", best_attempt(self.attempts)
+        result = self.work / "result.npz"
+        best = best_attempt(self.attempts)
         result.unlink(missing_ok=True)
         self._work(job, progress)
         with np.load(result) as saved:  # plain arrays; object arrays are refused by default

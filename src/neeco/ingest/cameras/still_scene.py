@@ -259,7 +259,8 @@ def _by_stereo(
         return None
     size = views.reduced_pinhole.size
     assert size is not None
-    right_from_left, lenses = np.linalg.inv(other.world_from_camera), (views.pinhole, other.pinhole)
+    right_from_left = np.linalg.inv(other.world_from_camera)
+    lenses = (views.pinhole, other.pinhole)
     error = epipolar_error(left.colors, right.colors, lenses, right_from_left)
     limit = STILL_SCOPE.max_epipolar * left.colors.shape[1]
     if error is not None and error > limit:

@@ -199,7 +199,8 @@ class ResidualFlow:
     """
 
     def __init__(self, sfm: SfmResult, views: Views) -> None:
-        self.episodes, times = views.episodes, views.times
+        self.episodes = views.episodes
+        times = views.times
         camera = views.pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS)
         self.sfm, self.pinhole = sfm, Lens.of(camera)
         self.estimator: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # its stub asks for a flow

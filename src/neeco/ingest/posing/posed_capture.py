@@ -161,7 +161,8 @@ class SolvedPosing:
             if not self.answers and not chosen:  # all are equal; open jaws show their hinge best
                 variance = self.measured.widths
             frame = int(np.argmax(np.where(usable, variance, -np.inf)))
-            widths, reason = self.measured.widths, "the chain of rolls breaks here"
+            widths = self.measured.widths
+            reason = "the chain of rolls breaks here"
             if self.joints and widths[frame] >= np.quantile(widths, 1 - POSING.extreme):
                 reason = "jaws at their widest"
             elif not len(breaks) or np.abs(breaks - frame).min() > POSING.near_break:

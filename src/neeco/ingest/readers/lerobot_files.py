@@ -107,7 +107,8 @@ class DataSet:
             place = {name: record.get(f"data/{name}") for name in ("chunk_index", "file_index")}
         films, absent = {}, {}
         for key in (key for key, feature in self.features.items() if feature.dtype == "video"):
-            of_film, part = place, None
+            of_film = place
+            part = None
             if self.version == 3:
                 of_film = {name: record.get(f"videos/{key}/{name}") for name in FILM_COLUMNS}
                 if None in of_film.values():
@@ -161,7 +162,8 @@ def _described(path: Path, state: tuple[object, ...]) -> DataSet:
         fps = info.child("fps").number(above=0, below=1e5)
         data_path = info.child("data_path").text("correct it")
         chunks_size = info.child("chunks_size").integer(1) if info.has("chunks_size") else 1000
-    number, films = 2 if match[2] is None else 3, [key for key, one in feature_of.items() if one.dtype == "video"]
+    number = 2 if match[2] is None else 3
+    films = [key for key, one in feature_of.items() if one.dtype == "video"]
     return DataSet(
         path=path,
         version=number,

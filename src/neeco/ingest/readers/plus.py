@@ -129,7 +129,8 @@ def read_sequence(path: Path) -> FrameSequence:
         raise NeecoError(f"{path}: {problem}; give a PLUS sequence, or another log")
     sizes = _integers(path, plain, "sizes" if is_nrrd else "DimSize")
     usual = "" if is_nrrd else " ".join(["domain"] * (len(sizes) - 1) + ["list"])
-    kinds, channels = plain.get("kinds", usual).lower().split(), 1
+    kinds = plain.get("kinds", usual).lower().split()
+    channels = 1
     if len(kinds) == len(sizes) and (kinds[0] == "vector" or kinds[0].endswith("color")):
         channels, sizes, kinds = sizes[0], sizes[1:], kinds[1:]
     if kinds[-1:] not in (["list"], ["time"]) or kinds[:-1] != ["domain"] * (len(sizes) - 1):
@@ -209,7 +210,8 @@ class SequenceImages(VideoSource):
     frames: tuple[int, ...]
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        (file, start), shape = self.sequence.data, self.sequence.shape
+        file, start = self.sequence.data
+        shape = self.sequence.shape
         length = int(np.prod(shape))
         with (
             one_line(file, "its images are damaged", "copy or export the sequence again"),

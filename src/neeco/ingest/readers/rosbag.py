@@ -125,7 +125,9 @@ def _streams(survey: Survey) -> tuple[Stream, ...]:
         for name, log in sorted(survey.images.items(), key=lambda item: camera_order(item[0]))
     ]
     meanings = {name: _meaning(survey, name) for name in sorted(survey.poses)}
-    arms, poses, joints = {name for name in meanings if _DVRK_POSE.search(name)}, list[Stream](), list[Stream]()
+    arms = {name for name in meanings if _DVRK_POSE.search(name)}
+    poses = list[Stream]()
+    joints = list[Stream]()
     for name, meaning in meanings.items():
         log = survey.poses[name]
         if arms:
@@ -147,7 +149,8 @@ def _streams(survey: Survey) -> tuple[Stream, ...]:
         stream = survey.stream(name, log, kind, f" in {frame}{static}{bases}")
         poses.append(replace(stream, offered=offered, body=_body(name), hints=hints, asks=meaning.asks))
     for name, log in sorted(survey.joints.items()):
-        offered, wrist = not _COMMANDS.search(name), None
+        offered = not _COMMANDS.search(name)
+        wrist = None
         if _DVRK.search(name):
             offered, wrist = bool(_DVRK_JOINTS.search(name)), wrist_joints(_joint_names(name, log), "jaw" in name)
         stream = survey.stream(name, log, Kind.READINGS)

@@ -74,7 +74,9 @@ class Rows:
 
 def keep_measured(rows: Rows, source: PoseColumns, recognised: str | None) -> None:
     """Drop the rows whose state does not mark them as measured."""
-    table, name, good = rows.table, source.columns.state or recognised, source.columns.good
+    table = rows.table
+    name = source.columns.state or recognised
+    good = source.columns.good
     if name is None or not len(table.rows):
         return
     states = table.rows[:, column_index(table, name)].astype(str)
@@ -91,7 +93,9 @@ def keep_measured(rows: Rows, source: PoseColumns, recognised: str | None) -> No
 
 def read_times(rows: Rows, source: PoseColumns | JointColumns, recognised: RecognisedColumns) -> np.ndarray:
     """Return times [R] in s; rows without one are dropped."""
-    table, names, rate = rows.table, source.columns.time or recognised.time, source.rate_hz
+    table = rows.table
+    names = source.columns.time or recognised.time
+    rate = source.rate_hz
     if names is None and rate is not None:
         if headers := _headers(table, range(len(table.rows))):
             problem = f"line {headers[0]} repeats the header, and its rows have no times"

@@ -54,7 +54,8 @@ class SurgPose(RecordingFormat):
         for name, (frames, _) in sorted(poses.items()):
             streams.append(stream(name, Kind.POSES, "poses", len(frames), body=name, hints=(DVRK_HINT,)))
         for name, (frames, values) in sorted(joints.items()):
-            wrist, title = wrist_joints(JOINT_NAMES[: values.shape[1]], False), f"{name}{JOINTS_BEHIND}"
+            wrist = wrist_joints(JOINT_NAMES[: values.shape[1]], False)
+            title = f"{name}{JOINTS_BEHIND}"
             streams.append(stream(title, Kind.READINGS, "joints", len(frames), body=name, joints=wrist))
         labels = sorted(file.name for file in path.glob("keypoints_*.yaml"))
         return (*streams, *(Stream(name, Kind.OTHER, "labels", count) for name in labels))

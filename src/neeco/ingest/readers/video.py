@@ -305,7 +305,10 @@ class _Scan:
             why = f" ({self.failure})" if self.failure else ""
             raise NeecoError(f"{self.path}: {len(self.stamps)} frames can be decoded{why}; give an intact video file")
         stamps = [stamp for stamp in self.stamps if stamp is not None]
-        order, numbered, own_rate, notes = sorted(set(stamps)), False, None, list[str]()
+        order = sorted(set(stamps))
+        numbered = False
+        own_rate = None
+        notes = list[str]()
         if self.failure or self.corrupt:
             damage = f"{self.failure or 'corrupt frames'}; {len(self.stamps)} frames could be read"
             notes.append(f"is damaged: {damage}, the others are left out")

@@ -179,7 +179,8 @@ def write_template(
         lines.append(f'# episodes: ["{files.episodes}"]   # of the data set, or [0, 3, 7]: they become one capture')
     lines += [*on_scope, *_instrument_lines(files, in_camera=still or not scopes)]
     if scopes:
-        hints, of_scope = scopes[0][0].says.hints, _pose_lines(*scopes[0])
+        hints = scopes[0][0].says.hints
+        of_scope = _pose_lines(*scopes[0])
         lines += ["laparoscope:", *(f"  # {hint}" for hint in hints), *(f"  {line}" for line in of_scope)]
         lines += [f"# laparoscope: {{{', '.join(log.lines())}}}   # another one found" for log, _ in scopes[1:]]
     shared = any(log.stream is not None and log.file == frames[0].name for log, _ in files.poses)

@@ -424,5 +424,6 @@ def overlap(problem: ArticulatedProblem, fit: ArticulatedFit) -> float:
     for row, cone in np.argwhere(projected.valid):
         cv2.fillPoly(filled[row], [corners[row, cone]], 1)
         cv2.circle(filled[row], ends[row, cone].tolist(), int(min(projected.widths[row, cone, 1], 1e3)), 1, -1)
-    masks, inside = problem.silhouettes.masks, filled.astype(bool)
+    masks = problem.silhouettes.masks
+    inside = filled.astype(bool)
     return int((inside & masks).sum()) / max(int((inside | masks).sum()), 1)

@@ -292,7 +292,9 @@ def _among_cameras(arm: _Arm, registration: Registration | None) -> _Arm:
 
 def _find(data: Episodes, arm: _Arm, observed: _Observed, arms: Sequence[_Arm]) -> BaseRegistration:
     """Find a base from the outlines of what moves, of several arms from what is nearest to its own."""
-    masks, cameras, known = _own_masks(arm, observed, arms), np.linalg.inv(observed.cameras), arm.clock.source in KNOWN
+    masks = _own_masks(arm, observed, arms)
+    cameras = np.linalg.inv(observed.cameras)
+    known = arm.clock.source in KNOWN
     try:
         return find_base(
             masks, observed.intrinsics, cameras, arm.motion, arm.prior, hidden=observed.hidden, clock_known=known

@@ -109,13 +109,17 @@ def search_bases(
 ) -> Candidates:
     """The best bases by lines (the masks' shafts where None) and tips of the masks; stated: what links say of the shaft
     (see `ShaftViews`)."""
-    prior, base, cameras = problem.prior, problem.prior.world_from_base, np.linalg.inv(problem.camera_from_world)
+    prior = problem.prior
+    base = problem.prior.world_from_base
+    cameras = np.linalg.inv(problem.camera_from_world)
     half = float(np.median([mask.max() for mask in problem.silhouettes.distances]))
     distance = guess = COARSE.typical_radius_mm * problem.silhouettes.intrinsics[0] / max(half, 0.5)
     if prior.sd_rad is None or prior.sd_mm is None:
         rotations = Rotation.random(COARSE.n_uniform, random_state=generator).as_matrix()
         # the instrument is where most of the cameras look
-        center, sd_mm, step = (cameras[:, :3, 3] + guess * cameras[:, :3, 2]).mean(0), guess, 0.2
+        center = (cameras[:, :3, 3] + guess * cameras[:, :3, 2]).mean(0)
+        sd_mm = guess
+        step = 0.2
     else:
         rotations = rotations_about(base[:3, :3], prior.sd_rad, COARSE.n_rotations, generator)
         center, sd_mm, step = problem.pivot(base), prior.sd_mm, 0.5 * prior.sd_rad

@@ -170,7 +170,9 @@ def solve_axes(video: ShaftVideo, start: ShaftAxes, edges: ShaftEdges, *, covari
         return axes
     information = sparse.csc_matrix(problem.linearise(axes).information)
     solver = splu((information + sparse.diags(1e-12 * information.diagonal() + 1e-12)).tocsc())
-    size, blocks, scale_sd = information.shape[0], [], None
+    size = information.shape[0]
+    blocks = []
+    scale_sd = None
     for frame in range(len(axes.points)):
         part = slice(LOCAL * frame, LOCAL * (frame + 1))
         blocks.append(solver.solve(np.eye(size, LOCAL, -part.start))[part])

@@ -77,12 +77,15 @@ def outline_edges(
     Returns the axes, each from its own image, with points at the shaft's end; points on both edges; and which frames
     have them [F].
     """
-    count, border = len(masks), border_of(masks.shape[1:], None)
+    count = len(masks)
+    border = border_of(masks.shape[1:], None)
     points, axes = np.tile([0.0, 0.0, 1.0], (2, count, 1))
     pixels, deviations = np.zeros((count, 2, EDGE.places, 2)), np.full((count, 2, EDGE.places), np.inf)
     valid = np.zeros(count, dtype=bool)
     for frame in np.flatnonzero(np.isfinite(ends[:, 0])):
-        piece, end, direction = largest_piece(masks[frame]), ends[frame], directions[frame]
+        piece = largest_piece(masks[frame])
+        end = ends[frame]
+        direction = directions[frame]
         for _ in range(2):  # the second time about the shaft's own middle
             _, middles, widths = slices_across(piece, border, end, direction)
             aside = np.array([-direction[1], direction[0]])

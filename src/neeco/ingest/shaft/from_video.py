@@ -111,7 +111,8 @@ def find_shaft(
     what to film, when the shaft is not visible.
     """
     _require_one(masks)
-    notes, known_scale = [], video.scaled
+    notes = []
+    known_scale = video.scaled
     head = working_length or SHAFT.default_head_diameters * 2 * video.radius  # mm, where it cannot be measured
     video = replace(video, trocar=trocar is not False, scaled=video.scaled or trocar is False)
     axes, edges, ends = _first_axes(images, masks, video, head)
@@ -362,7 +363,8 @@ def find_in_video(
         np.array([getattr(item, name) for item in shaft.uncertainties])[shaft.known]
         for name in ("rotation_deg", "translation_mm")
     )
-    scale, scale_sd = "", shaft.axes.scale_sd
+    scale = ""
+    scale_sd = shaft.axes.scale_sd
     if scale_sd is not None:
         scale = f"; the cameras' scale is known to {scale_sd:.0%}, from the trocar"
     data.notes.add(

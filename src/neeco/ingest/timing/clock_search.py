@@ -128,7 +128,8 @@ def clock_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -
             f"{CLOCK.min_significance:g} that are needed; give it in `sync`, or record more motion"
         )
     # the offsets of the video's first, middle and last half, each searched near that of the whole
-    quarter, offsets = len(stretched) // 4, []
+    quarter = len(stretched) // 4
+    offsets = []
     for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
         near, fit = correlate(stretched[part], tracked)
         around = np.abs((near - part.start - best) * CLOCK.step_s) < CLOCK.lobe_s

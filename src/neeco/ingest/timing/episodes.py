@@ -293,7 +293,8 @@ class Episodes:
             for joint in self.parts[0].joints[name]:
 
                 def of(part: Episode, local: np.ndarray, name: str = name, joint: str = joint) -> Any:
-                    log, span = part.joints[name][joint], limits[name][joint]
+                    log = part.joints[name][joint]
+                    span = limits[name][joint]
                     values, valid = part.logged_readings(log, local)
                     if span is None:
                         return values, valid

@@ -58,7 +58,9 @@ def read_episodes(recordings: Sequence[Recording]) -> Episodes:
         for name, log in part.poses.items():
             if log.frame != first.poses[name].frame:
                 raise refusal(part.recording, f"instruments: {name}: poses are in another frame than", first.recording)
-    single, splits, video = len(names) == 1, recordings[0].splits, first.video
+    single = len(names) == 1
+    splits = recordings[0].splits
+    video = first.video
     for name in splits.test_episodes + splits.unseen_episodes if splits else ():
         if single or name not in names:
             listed = "one recording has none" if single else f"they are {', '.join(names)}"
@@ -84,7 +86,8 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
     rolls = {item.name: read_reading_log(item.roll) for item in items if item.roll is not None}
     scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
     for item in items:  # nothing would register poses in bases of different names
-        posed, tracker = poses.get(item.name), None if scope is None else scope.stated_in
+        posed = poses.get(item.name)
+        tracker = None if scope is None else scope.stated_in
         if tracker is None or item.base is not None or posed is None or posed.frame != BASE:
             continue
         if posed.stated_in not in (None, tracker):
@@ -117,7 +120,9 @@ def _read(recording: Recording, name: str, notes: Notes, episode: int) -> Episod
     if recording.stereo is not None:  # before anything that takes long
         left, right, _, calibration = recording.read_stereo()
         right.check_size(recording.stereo.source.open().size, calibration)
-        reader, stated, sentence = None if recording.file is None else format_of(recording.file), None, ""
+        reader = None if recording.file is None else format_of(recording.file)
+        stated = None
+        sentence = ""
         with suppress(NeecoError):  # the calibration of the images' file is not used
             stated = None if reader is None or recording.file is None else reader.lens(recording.file, recording.stream)
         if stated is not None and abs(left.fl_x / stated.fl_x - 1) >= READING.same_focal:

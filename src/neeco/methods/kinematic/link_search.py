@@ -412,7 +412,8 @@ class _Volumes:
         """Return a low quantile, over samples of frames, of the volume with changed readings over that with recorded
         ones (bootstrap)."""
         recorded, changed = self.motions(dict), self.motions(change)
-        generator, count = torch.Generator().manual_seed(0), len(self.readings)
+        generator = torch.Generator().manual_seed(0)
+        count = len(self.readings)
         ratios = []
         for _ in range(LINKS.n_resamples):
             frames = torch.randint(count, (count,), generator=generator)
