@@ -14,24 +14,24 @@ from source_trees import module_paths, module_trees
 
 # lines of Python: the limit, and the aim
 ROOMS = {
-    "cli": (1785, 1700),
-    "viewer": (2855, 2100),
-    "report": (1523, 1500),
-    "studies": (2978, 2600),
-    "ingest": (15_312, 10_500),
+    "cli": (1787, 1700),
+    "viewer": (2862, 2100),
+    "report": (1524, 1500),
+    "studies": (2980, 2600),
+    "ingest": (15_362, 10_500),
     "tracking": (1373, 1200),
-    "synthesis": (4168, 3200),
+    "synthesis": (4174, 3200),
     "evaluation": (1326, 1200),
     "labels": (892, 800),
-    "methods": (5186, 3500),
+    "methods": (5187, 3500),
     "training": (2021, 1700),
     "states": (3270, 2600),
     "evidence": (1001, 1200),
     "scene": (1956, 1800),
-    "capture": (4530, 3900),
+    "capture": (4547, 3900),
     "raster": (3990, 3800),
     "geometry": (983, 1000),
-    "base": (1554, 1500),
+    "base": (1555, 1500),
 }
 FILES, FUNCTIONS, NUMBERS = (280, 240), (3168, 3000), (284, 300)
 
