@@ -343,7 +343,8 @@ def doubted_readings(
 
     Swapped logs and reversed signs pass all numeric checks, but not a comparison with the images."""
     volumes = _Volumes(links, evidence, instrument.name, readings, session.config.seed)
-    named = volumes.of(volumes.motions(dict))
+    unchanged = volumes.motions(dict)
+    named = volumes.of(unchanged)
     recorded = [name for name in links.reading_names if name not in instrument.unrecorded]
     changes: list[tuple[tuple[str, ...], str, Callable[[Readings], Readings]]] = []
     for one, other in combinations(recorded, 2):
@@ -353,13 +354,13 @@ def doubted_readings(
     for name in recorded:
         words = f"with the sign of {name} reversed: is its axis, or its gain, the wrong way round?"
         changes.append(((name,), words, partial(_changed, {name: (-1.0, name)})))
-    trials = [(volumes.of(volumes.motions(change)), index) for index, (_, _, change) in enumerate(changes)]
-    most, index = max(trials, default=(0.0, 0))
+    motions = [volumes.motions(change) for _, _, change in changes]
+    most, index = max(((volumes.of(moved), index) for index, moved in enumerate(motions)), default=(0.0, 0))
     if most <= LINKS.min_volume_ratio * named:
         return None
-    names, words, change = changes[index]
-    if volumes.resampled_ratio(change) <= LINKS.min_volume_ratio:
+    if volumes.resampled_ratio(unchanged, motions[index]) <= LINKS.min_volume_ratio:
         return None
+    names, words, change = changes[index]
     return DoubtedReadings(names, most / max(named, 1), words, change)
 
 
@@ -408,10 +409,9 @@ class _Volumes:
             total += float((on_evidence * (visible > LINKS.check_min_visible_share)).sum())
         return total
 
-    def resampled_ratio(self, change: Callable[[Readings], Readings]) -> float:
-        """Return a low quantile, over samples of frames, of the volume with changed readings over that with recorded
+    def resampled_ratio(self, recorded: Tensor, changed: Tensor) -> float:
+        """Return a low quantile, over samples of frames, of the volume with changed motions over that with recorded
         ones (bootstrap)."""
-        recorded, changed = self.motions(dict), self.motions(change)
         generator = torch.Generator().manual_seed(0)
         count = len(self.readings)
         ratios = []
