@@ -29,7 +29,7 @@ from playwright.sync_api import sync_playwright
 
 from neeco.evaluation.image_metrics import psnr, to_uint8
 from neeco.training.run import open_gaussian_run
-from neeco.viewer.other_viewers import exported_states, moving_scene, write_glb
+from neeco.viewer.scene_files import exported_states, moving_scene, write_glb
 
 ENGINE = "playcanvas@2.23.3"
 SETTLE_MS = 6000  # until the engine has sorted the Gaussians of a new state

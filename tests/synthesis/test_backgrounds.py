@@ -22,8 +22,8 @@ from neeco.labels.labellers import CompositedLabels
 from neeco.scene import GaussianScene
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import SampleGenerator
-from neeco.synthesis.other_tissue import Appearance, ImageFolder, Layers, split
 from neeco.synthesis.settings import Settings
+from neeco.synthesis.tissue_replacement import Appearance, ImageFolder, Layers, split
 from neeco.synthesis.torch_datasets import LabelledImages
 
 SETTINGS = Settings(count=3, seed=3, tissue_tolerance_mm=2.0)

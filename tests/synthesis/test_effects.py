@@ -37,9 +37,9 @@ from neeco.synthesis.camera_effects import (
 )
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import SampleGenerator
-from neeco.synthesis.other_tissue import Appearance
 from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.settings import Settings
+from neeco.synthesis.tissue_replacement import Appearance
 
 SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0)
 

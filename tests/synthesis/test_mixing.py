@@ -22,8 +22,8 @@ from neeco.raster.native import torch_threads
 from neeco.scene import GaussianScene
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import ENTERS_ANOTHER, Acceptance
-from neeco.synthesis.other_tissue import Mixture, tissue_depth, tissue_gaussians
 from neeco.synthesis.settings import Settings
+from neeco.synthesis.tissue_replacement import Mixture, tissue_depth, tissue_gaussians
 
 FINE = Camera(torch.eye(4, dtype=torch.float64), 240.0, 240.0, 128.0, 96.0, 256, 192, learned_fx=240.0)
 SETTINGS = Settings(count=4, seed=1, tissue_tolerance_mm=2.0)

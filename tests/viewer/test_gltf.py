@@ -18,7 +18,7 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
-from neeco.viewer.other_viewers import exported_states, moving_scene, write_glb
+from neeco.viewer.scene_files import exported_states, moving_scene, write_glb
 
 PREFIX = "KHR_gaussian_splatting:"
 AXES = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))  # glTF's from the capture's

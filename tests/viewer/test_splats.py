@@ -21,7 +21,7 @@ from neeco.cli import main
 from neeco.evaluation.image_metrics import psnr
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
-from neeco.viewer.other_viewers import exported_state, ply_bytes, splats_of, spz_bytes
+from neeco.viewer.scene_files import exported_state, ply_bytes, splats_of, spz_bytes
 
 TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=CAMERA.world_from_camera.dtype))
 TURNED = replace(CAMERA, world_from_camera=TURN @ CAMERA.world_from_camera)  # in axes right, up, back

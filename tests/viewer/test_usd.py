@@ -18,7 +18,7 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
-from neeco.viewer.other_viewers import moving_scene, write_usd
+from neeco.viewer.scene_files import moving_scene, write_usd
 
 TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # about x, to y up
 

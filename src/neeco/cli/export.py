@@ -40,7 +40,7 @@ def run(arguments: Arguments) -> int:
     from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run
-    from neeco.viewer import other_viewers as files
+    from neeco.viewer import scene_files
 
     format = arguments.format or "ply"
     if arguments.output is not None:
@@ -53,22 +53,24 @@ def run(arguments: Arguments) -> int:
     if arguments.unit != "m" and format != "glb":
         raise NeecoError("--unit: applies to glb only; remove it")
     if format == "usdc":
-        files.require_usd()
+        scene_files.require_usd()
     with open_gaussian_run(arguments.run, "export", device_of(arguments.device)) as trained:
         scene, frames = trained.scene, len(trained.scene.recorded.states)
         if not 0 <= arguments.frame < frames:
             raise NeecoError(f"--frame: must be from 0 to {frames - 1}, the training frames (got {arguments.frame})")
-        state, camera = files.exported_state(scene, arguments.frame, arguments.states)
+        state, camera = scene_files.exported_state(scene, arguments.frame, arguments.states)
         output = arguments.output or arguments.run / f"scene.{format}"
         if format == "glb" or format == "usdc":
-            moving = files.moving_scene(scene, files.exported_states(scene, state, arguments.states), camera)
+            moving = scene_files.moving_scene(
+                scene, scene_files.exported_states(scene, state, arguments.states), camera
+            )
             if format == "glb":
-                files.write_glb(moving, camera, output, arguments.unit)
+                scene_files.write_glb(moving, camera, output, arguments.unit)
             else:
-                files.write_usd(moving, output)
+                scene_files.write_usd(moving, output)
             note = f"{len(moving.times)} states; {moving.blended:.0%} of the instruments' Gaussians blend links"
         else:
             note = "without joints and labels"
-            files.write_splats(files.splats_of(scene, state, camera), output, format, arguments.spz_version)
+            scene_files.write_splats(scene_files.splats_of(scene, state, camera), output, format, arguments.spz_version)
     print(f"{output}: {scene.num_gaussians:,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, {note}")
     return 0

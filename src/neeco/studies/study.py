@@ -104,8 +104,10 @@ def run_jobs(
     opened in its worker, which sees one exclusive GPU; on a cluster, whose machines may have GPUs that this one lacks,
     each worker gets a GPU unless the jobs request the CPU. record: called with all results after each job; finished:
     earlier results by job index. captures: already read captures by path. light: small jobs, which reuse a worker and
-    share GPUs. Raises NeecoError before any work if a job's folder belongs to
-    another job or the cluster does not respond, and KeyboardInterrupt naming the stopped job.
+    share GPUs.
+
+    Raises NeecoError before any work if a job's folder belongs to another job or the cluster does not respond, and
+    KeyboardInterrupt naming the stopped job.
     """
     device = device_of(jobs[0].device if jobs else "cpu", drawing=False)
     check_workers(workers, device, light)

@@ -25,8 +25,8 @@ from neeco.labels.drawing import LayeredDrawing, keypoint_arrays, surface_depth,
 from neeco.labels.settings import LABELS
 from neeco.raster import rasterize
 from neeco.scene import GaussianScene
-from neeco.synthesis.other_tissue import tissue_gaussians
 from neeco.synthesis.samplers import surface_points
+from neeco.synthesis.tissue_replacement import tissue_gaussians
 from neeco.synthesis.writers import CONTACT as FIELDS
 
 NONE, TOUCHING, GRASPING = "none", "touching", "grasping"

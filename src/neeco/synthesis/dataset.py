@@ -38,7 +38,6 @@ from neeco.synthesis.generator import (
     draw_in_workers,
     format_counts,
 )
-from neeco.synthesis.other_tissue import ImageFolder
 from neeco.synthesis.samplers import SAMPLING, states_file
 from neeco.synthesis.settings import (
     DEFAULT_FORMATS,
@@ -49,6 +48,7 @@ from neeco.synthesis.settings import (
     format_names,
     parse_class_names,
 )
+from neeco.synthesis.tissue_replacement import ImageFolder
 from neeco.synthesis.writers import (
     DEPTH_MM_PER_COUNT,
     FOLDERS,

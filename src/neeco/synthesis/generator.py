@@ -49,7 +49,9 @@ from neeco.synthesis.camera_effects import (
     subframes,
 )
 from neeco.synthesis.contact import labels_of
-from neeco.synthesis.other_tissue import (
+from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler, states_file
+from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Settings
+from neeco.synthesis.tissue_replacement import (
     ALL_AS_RECORDED,
     Appearance,
     Appearances,
@@ -58,8 +60,6 @@ from neeco.synthesis.other_tissue import (
     Mixture,
     split,
 )
-from neeco.synthesis.samplers import RECORDED_CAMERAS, DrawnCameras, Sampler, make_sampler, states_file
-from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Settings
 from neeco.synthesis.writers import Encoded, Record, encoded_sample, skipped_sample
 
 # separate random streams per image: camera effects and appearances do not affect the sampled state and view

@@ -92,7 +92,7 @@ class ImageFolder:
     def crop(self, number: int, rng: Generator, width: int, height: int) -> np.ndarray:
         """Sample a background, float32 [height, width, 3] in [0, 1]: a random crop of an image, possibly mirrored,
         resized. Raises NeecoError where the file cannot be read."""
-        image = _DECODED(self.files[number])
+        image = _decoded(self.files[number])
         rows, columns = image.shape[:2]
         scale = rng.uniform(IMAGES.min_crop, 1) * min(columns / width, rows / height)
         size = max(1, int(scale * width)), max(1, int(scale * height))
@@ -103,7 +103,7 @@ class ImageFolder:
         return cv2.resize(np.ascontiguousarray(crop), (width, height), interpolation=way).astype(np.float32) / 255
 
 
-_DECODED = lru_cache(maxsize=IMAGES.cached_images)(read_image_bytes)
+_decoded = lru_cache(maxsize=IMAGES.cached_images)(read_image_bytes)
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Colors:
         return np.clip((image - colors.mean) * gains + self.mean, 0, 1).astype(np.float32)
 
 
-_COLORS = lru_cache(maxsize=4096)(lambda file: Colors.of(read_image_bytes(file).astype(np.float32) / 255))
+_colors_of = lru_cache(maxsize=4096)(lambda file: Colors.of(read_image_bytes(file).astype(np.float32) / 255))
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ class Appearances:
         appearance = Appearance()
         if self.frames is not None and matched < IMAGES.replaced:
             file = self.frames.files[int(frame * len(self.frames.files))]
-            appearance = replace(appearance, colors=_COLORS(file))
+            appearance = replace(appearance, colors=_colors_of(file))
         if self.backgrounds is None or replaced >= IMAGES.replaced:
             return appearance
         number = int(place * len(self.backgrounds.files))

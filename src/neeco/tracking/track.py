@@ -27,7 +27,7 @@ from neeco.capture.readers import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.scene import Recorded
 from neeco.scene.io import save_scene
-from neeco.synthesis.other_tissue import merged_scene
+from neeco.synthesis.tissue_replacement import merged_scene
 from neeco.tracking.follow import FOLLOW, Follower, Step
 from neeco.tracking.parameters import TrackedParameters, fitter_of
 from neeco.tracking.trust import Reference

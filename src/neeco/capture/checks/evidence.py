@@ -236,7 +236,7 @@ class ColorEvidence:
             near = self.neighbours[:, :count]
             return np.asarray((values * inside)[:, near].sum(-1) / inside[:, near].sum(-1).clip(1))
 
-        planes = (observed, np.tile(self.brightness, (len(u), 1)))
+        planes = observed, np.tile(self.brightness, (len(u), 1))
         count = SETTINGS.neighbours
         observed, color = (
             mean(values, count) - mean(values, SETTINGS.far_neighbours) if coarse else values - mean(values, count)

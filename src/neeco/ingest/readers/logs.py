@@ -161,7 +161,7 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     if source.calibration is not None:
         # monotone interpolation of the table (PCHIP, Fritsch & Carlson 1980): readings just outside it become its end
         counts, angles = read_calibration(source.calibration, source.units.angle)
-        low, high = (counts[0], counts[-1])
+        low, high = counts[0], counts[-1]
         title = source.calibration.name
         values = np.where(rows.keep, values, low)
         excess = np.maximum(low - values, values - high)
