@@ -34,9 +34,9 @@ class Event:
 
     def passed(self, progress: tuple[float, float], iterations: tuple[int, int]) -> bool:
         """Return whether the event is after the first and not after the second of two `progress` (shares of the run) or
-        `iterations`."""
+        `iterations`; at the end of a run, where no step follows, only shares count."""
         before, now = progress if self.at <= 1 else iterations
-        return before < self.at <= now
+        return before < self.at <= now and (self.at <= 1 or progress[1] < 1)
 
 
 # Iterations. Opacity, at its learning rate, is back about 150 steps after a reset. Rates do not scale with the run's

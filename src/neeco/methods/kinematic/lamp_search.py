@@ -29,7 +29,7 @@ class LampSearchSettings:
     n_lamp_directions: int = 8  # candidate directions around the lens
     # minimum share of the frames' changes in error, in sum, that are reductions; frames without a visible shadow have
     # hardly any change
-    min_agreement: float = 0.7
+    min_agreement: float = 0.75
     min_explained: float = 0.005  # minimum share of the squared error near the instruments explained by each lamp
     margin_px: int = 3  # px of search images, around compared pixels, that must show no instrument
     max_brightness: float = 0.8  # of white: errors at highlights exceed those of any shadow
