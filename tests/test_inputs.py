@@ -241,6 +241,7 @@ def test_init_names_a_pipe_and_goes_on(tmp_path: Path, name: str, capsys: pytest
         ["compare", "PIPE", "--methods", "3dgs", "--iterations", "3", "--output", "out"],
         ["sweep", "PIPE", "PIPE", "--output", "out"],
         ["track", "PIPE", "PIPE", "--output", "out"],
+        ["adapt", "PIPE", "PIPE", "--output", "out"],
         ["refine", "PIPE", "PIPE", "--output", "out"],
     ],
     ids=lambda words: "-".join(words[:2]),

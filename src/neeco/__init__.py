@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neeco.api import Run, Scene, check, ingest, load, synthesize, track, train
+    from neeco.api import Run, Scene, adapt, check, ingest, load, synthesize, track, train
     from neeco.base.errors import NeecoError
     from neeco.capture import Camera, State, read_capture
     from neeco.synthesis.torch_datasets import LabelledImages, sample_states
@@ -24,6 +24,7 @@ __all__ = [
     "Run",
     "Scene",
     "State",
+    "adapt",
     "check",
     "ingest",
     "load",
@@ -35,7 +36,7 @@ __all__ = [
 ]
 
 _MODULES = {
-    "neeco.api": ("Run", "Scene", "check", "ingest", "load", "synthesize", "track", "train"),
+    "neeco.api": ("Run", "Scene", "adapt", "check", "ingest", "load", "synthesize", "track", "train"),
     "neeco.capture": ("Camera", "State", "read_capture"),
     "neeco.base.errors": ("NeecoError",),
     "neeco.synthesis.torch_datasets": ("LabelledImages", "sample_states"),

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 from neeco.base.errors import NeecoError, naming_arguments
 from neeco.base.plausible import focal_fault
+from neeco.base.settings import Device
 from neeco.capture import Camera, Capture, Problem, State, check_capture, read_capture
 from neeco.capture.model import Instrument
 from neeco.evaluation.evaluate import evaluate_run
@@ -33,6 +34,7 @@ from neeco.training.train import train as train_run
 
 if TYPE_CHECKING:
     from neeco.report.ingest_page import Ingested
+    from neeco.studies.adaptation.adapt import Adapted
     from neeco.tracking.track import Tracked
 
 PathLike = str | os.PathLike[str]
@@ -383,6 +385,47 @@ def track(
         write_track_page(tracked)
     tracked.require_trusted()
     return tracked
+
+
+@naming_arguments()
+def adapt(
+    run: Run | PathLike,
+    footage: PathLike,
+    output: PathLike,
+    *,
+    progress: Progress | None = None,
+    device: Device = "auto",
+    force: bool = False,
+    **options: Any,
+) -> Adapted:
+    """Label frames of another operation that show the run's instrument, as `neeco adapt` does.
+
+    Args:
+        run: a run of method kinematic that learned one instrument, or its folder
+        footage: a video, a folder of images, or a capture, whose states are not read
+        output: data set folder to write
+        progress: is called with what is being done, how much of it is done, and of how much
+        device: where a run given as a folder is opened (see `Scene`)
+        force: use a run although its capture has changed since training, or its labels are doubtful
+        options: those of `neeco adapt --help` by their names: backgrounds, masks, intrinsics, frames, rounds, resume, …
+
+    The result has `output`, `records` (one for each frame), `accepted` (how many are in the data set) and `verdict`.
+    Raises NeecoError for a run or footage that cannot be used, and where hardly any frame is accepted.
+
+        adapted = neeco.adapt("runs/sample", "footage", "labelled", min_overlap=0.8)
+        print(adapted.verdict, adapted.accepted)
+    """
+    from neeco.studies.adaptation import AdaptRequest
+    from neeco.studies.adaptation.adapt import adapt_footage
+
+    opened = _opened(run, device, force).gaussians("adapt")
+    opened.require_trusted("adapt")
+    for name in ("backgrounds", "masks"):
+        options[name] = None if options.get(name) is None else Path(options[name])
+    place = {"run": Path(opened.path), "footage": Path(footage), "output": Path(output)}
+    request = AdaptRequest(**{**place, **options, "device": device, "force": force})
+    with opened.scene.torch_threads():
+        return adapt_footage(opened, request, progress or _silent)
 
 
 @naming_arguments()

@@ -23,6 +23,7 @@ WITH_BAD_PATH = {
     "render": [MISSING, "--output", "drawn"],
     "annotate": [MISSING, "--output", "out"],
     "track": [MISSING, MISSING, "--output", "out"],
+    "adapt": [MISSING, MISSING, "--output", "out"],
     "refine": [MISSING, MISSING, "--output", "out"],
     "synthesize": [MISSING, "--output", "dataset", "--count", "1"],
     "score-masks": [MISSING, MISSING],

@@ -27,6 +27,7 @@ OF_A_RUN = {
     "evaluate": [],
     "annotate": ["--output", "out"],
     "track": ["footage", "--output", "out"],
+    "adapt": ["footage", "--output", "out"],
     "refine": ["footage", "--output", "out"],
     "export": [],
     "view": ["--export", "page.html"],

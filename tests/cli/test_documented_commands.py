@@ -80,6 +80,7 @@ export RUN --states states.jsonl --output liver.usdc
 export RUN --output liver.spz
 ingest --formats
 score-masks PREDICTED TRUTH --classes shaft=1 wrist=2 jaws=3 jaws=4 --truth-classes shaft=1 wrist=2 jaws=3 jaws=4
+adapt RUN VIDEO --output SET --model unet --intrinsics 290 290 160 128 --rounds 2 --min-overlap 0
 downstream CAPTURE --sets few=dataset:2 many=dataset:4 --steps 1 --batch 2 --output OUT
 downstream CAPTURE --sets few=dataset:2 --classes parts --output OUT --workers 1
 downstream CAPTURE --sets few=dataset:2 --backgrounds PLATES --output OUT
@@ -126,6 +127,7 @@ SMALLER = (
 )
 TRAINING = {"train": "--iterations 40", "demo": "--minutes 0.05"}  # `refine` trains as its run was
 SMALL_SWEEP = ("--iterations 40", "--set max_tissue_gaussians=1500", "--set initial_points=400")
+SMALL_ADAPT = {"--frames": 4, "--count": 4, "--steps": 30, "--rounds": 1, "--min-overlap": 0}
 SMALL_STUDY = {"--folds": 1, "--steps": 1, "--size": 48, "--batch": 2, "--num-real": 2, "--device": "cpu"}
 
 
@@ -184,6 +186,8 @@ def smaller(line: str) -> str:
         line += " --set deformation.width=8 --set deformation.depth=2"
     if verb == "downstream":
         line += "".join(f" {option} {value}" for option, value in SMALL_STUDY.items() if option not in words)
+    if verb == "adapt":
+        line += "".join(f" {option} {value}" for option, value in SMALL_ADAPT.items() if option not in words)
     if verb == "synthesize" and "--count" not in words:
         line += " --count 2"
     if verb == "synthesize" and "--min-share" not in words:
@@ -192,7 +196,7 @@ def smaller(line: str) -> str:
         line += " --no-tissue-check"
     if verb == "track" and "--min-trust" not in words:
         line += " --min-trust 0"
-    if verb in ("synthesize", "annotate") and "--force" not in words:
+    if verb in ("synthesize", "annotate", "adapt") and "--force" not in words:
         line += " --force"  # a run of 40 iterations is no good one
     return line
 

@@ -38,6 +38,7 @@ VERBS = {
     "synthesize": "Render a labelled data set of unrecorded instrument states.",
     "annotate": "Label recorded frames with the learned scene, with a confidence per frame.",
     "track": "Estimate instrument states in footage without states, with a learned scene.",
+    "adapt": "Label frames of another operation: a segmenter proposes, the scene verifies.",
     "refine": "Train a run again, with additional frames that it tracked.",
     "downstream": "Train detectors and segmenters on synthetic images; test them on recorded frames.",
     "ablate": "Remove components of the methods one by one, for the paper's tables and ours; a sweep.",

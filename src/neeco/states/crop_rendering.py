@@ -16,6 +16,7 @@ from neeco.capture.model import Frame, State
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
 from neeco.raster import depth_maps, rasterize
+from neeco.raster.reference import SH_C0
 from neeco.raster.shadow import GAMMA, shadowed
 from neeco.raster.types import Gaussians
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
@@ -151,10 +152,14 @@ def downsampled(image: Tensor, size: float) -> Tensor:
 
 
 class InstrumentRenderer:
-    """Renders a scene's instruments without its tissue; images are on the CPU, on whatever device it renders."""
+    """Renders a scene's instruments without its tissue; images are on the CPU, on whatever device it renders.
 
-    def __init__(self, scene: GaussianScene) -> None:
+    flat_colors: colours [N, 3] of the instruments' Gaussians in all light, such as their parts'; None: as learned.
+    """
+
+    def __init__(self, scene: GaussianScene, flat_colors: Tensor | None = None) -> None:
         self.scene = scene
+        self._flat_colors = flat_colors
         self.alone = _without_tissue(scene)
         self._black = scene.canonical.means.new_zeros(3)
         self._poser = self.alone.deformation.poser(self.alone.canonical)
@@ -178,6 +183,9 @@ class InstrumentRenderer:
             unposed = self.alone.at(state)
             light = unposed.headlight and replace(unposed.headlight, shadow=None)  # nothing receives their shadow
             self._first = replace(unposed, headlight=light)
+            if self._flat_colors is not None:
+                harmonics = ((self._flat_colors - 0.5) / SH_C0)[:, None, :].contiguous()
+                self._first = replace(unposed, headlight=None, background=None, sh=harmonics)
         posed = replace(self._first, **geometry)
         self._latest.append((state, registered, posed))
         return registered, posed

@@ -97,17 +97,19 @@ class Search:
         None if no state explains the image better than the tissue alone.
         """
         fitter, prior = self.fitter, loose_prior(self.fitter.parameters, *STARTS.anywhere_prior)
-        starts = self._different(fitter.ranked(view, self.recorded_states(view.camera), 0.125), STARTS.n_starts)
+        recorded = fitter.ranked(view, self.recorded_states(view.camera), 0.125)
+        starts = distinct(fitter.parameters, recorded, STARTS.n_starts)
         fits = [fitter.fit(view, state, prior, levels=(0.125, 0.25), steps=(6, 4)) for state in starts]
-        fitted = _by_gain(fits)
+        fitted = by_gain(fits)
         if fitted:
-            distinct_states = self._different(fitter.ranked(view, self.turned(fitted[0].state), 0.25), STARTS.n_turned)
-            fits = [fitter.fit(view, state, prior, levels=(0.25,), steps=(6,)) for state in distinct_states]
-            fitted = _by_gain([*fitted, *fits])
+            turned = fitter.ranked(view, self.turned(fitted[0].state), 0.25)
+            others = distinct(fitter.parameters, turned, STARTS.n_turned)
+            fits = [fitter.fit(view, state, prior, levels=(0.25,), steps=(6,)) for state in others]
+            fitted = by_gain([*fitted, *fits])
         last = [
             fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4)) for fit in fitted[: STARTS.n_finalists]
         ]
-        best = _by_gain(last)
+        best = by_gain(last)
         return best[0] if best and best[0].gain > 0 else None
 
     def recorded_states(self, camera: Camera) -> list[State]:
@@ -139,19 +141,21 @@ class Search:
                         variants.append(parameters.with_joints(rolled, k, moved))
         return variants
 
-    def _different(self, states: Sequence[State], count: int) -> list[State]:
-        """Return the first `count` states that lead to distinct fits."""
-        chosen: list[State] = []
-        for state in states:
-            limits = STARTS.apart_deg, STARTS.apart_joint_deg, STARTS.apart_mm
-            if all(differ(self.fitter.parameters, state, other, *limits) for other in chosen):
-                chosen.append(state)
-            if len(chosen) == count:
-                break
-        return chosen
+
+def distinct(parameters: TrackedParameters, states: Sequence[State], count: int) -> list[State]:
+    """Return the first `count` states that lead to distinct fits."""
+    chosen: list[State] = []
+    for state in states:
+        limits = STARTS.apart_deg, STARTS.apart_joint_deg, STARTS.apart_mm
+        if all(differ(parameters, state, other, *limits) for other in chosen):
+            chosen.append(state)
+        if len(chosen) == count:
+            break
+    return chosen
 
 
-def _by_gain(fits: Iterable[StateFit | None]) -> list[StateFit]:
+def by_gain(fits: Iterable[StateFit | None]) -> list[StateFit]:
+    """Return the fits that stayed in the image, the largest `gain` first."""
     return sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.gain)
 
 
