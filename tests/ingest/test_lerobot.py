@@ -18,9 +18,9 @@ from neeco.ingest.readers.columns import CAMERA as CAMERA_FRAME
 from neeco.ingest.readers.lerobot import LeRobotLimits
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.readers.sections import NamedPoseColumns, PoseColumns, Units
-from neeco.ingest.recording.compatibility import separate
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template
+from neeco.ingest.timing.reading import separate
 
 pytest.importorskip("av")
 pyarrow = pytest.importorskip("pyarrow")
