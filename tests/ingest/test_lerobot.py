@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import format_of, lerobot, read_table
-from neeco.ingest.readers.columns import CAMERA as CAMERA_FRAME
 from neeco.ingest.readers.lerobot import LeRobotLimits
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.readers.names import CAMERA as CAMERA_FRAME
 from neeco.ingest.readers.sections import NamedPoseColumns, PoseColumns, Units
 from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template

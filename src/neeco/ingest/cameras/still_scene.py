@@ -24,7 +24,7 @@ from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
 from neeco.ingest.cameras.tissue_surface import TissueSurface, epipolar_error, surface_behind, surface_from_stereo
 from neeco.ingest.foreground.masks import FLOW, Background, find_background, moving_masks
 from neeco.ingest.foreground.rough_shape import RoughShape, project_mask
-from neeco.ingest.frames.images import SfmResult, StageProgress, Views, reduced
+from neeco.ingest.frames.images import StageProgress, Views, reduced
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import IngestSettings, Recording, VideoFile
 from neeco.ingest.timing.episodes import Notes
@@ -186,21 +186,6 @@ def _pairs(right: np.ndarray, left: np.ndarray, selected: np.ndarray, one_clock:
         if off[row] < step / 2 and int(nearest[row]) not in pairs.values():
             pairs[row] = int(nearest[row])
     return pairs
-
-
-def still_cameras(count: int) -> SfmResult:
-    """Return a reconstruction without points: all `count` cameras in one place."""
-    return SfmResult(
-        indices=np.arange(count),
-        world_from_camera=np.tile(np.eye(4), (count, 1, 1)),
-        points=np.zeros((0, 3)),
-        colors=np.zeros((0, 3), np.uint8),
-        errors=np.zeros(0),
-        lengths=np.zeros(0),
-        observations=np.zeros((0, 5)),
-        lens=None,
-        reprojection_px=0.0,
-    )
 
 
 def look_behind(

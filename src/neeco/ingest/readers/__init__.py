@@ -3,7 +3,7 @@
 A format is a subclass of `RecordingFormat`; `format_of` chooses it by the file's name and content, and nothing else
 names it. Whatever holds several streams (a bag, an episode, a sequence of images with transforms) lists them, and
 gives each as what the rest of the program takes: poses and readings as a table, images with their times, a lens. What a
-table's columns mean is the same for all formats (`columns.py`, `logs.py`).
+table's columns mean is the same for all formats (`names.py`, `logs.py`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from neeco.base.errors import NeecoError, install_hint, visible
 from neeco.base.registry import plugins
 from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
-from neeco.ingest.readers.frame_names import NamedFrame
+from neeco.ingest.readers.names import NamedFrame
 
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
 HUGE = 1e20
@@ -58,7 +58,7 @@ class Table:
 
     @property
     def frame(self) -> str | None:
-        """Frame of the poses, BASE or a camera's frame (`frame_names.CAMERA_FRAMES`); None if the file names none."""
+        """Frame of the poses, BASE or a camera's frame (`names.CAMERA_FRAMES`); None if the file names none."""
         return None if self.meaning is None else self.meaning.frame
 
     @property

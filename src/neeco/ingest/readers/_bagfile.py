@@ -199,8 +199,19 @@ def open_bag(path: Path) -> Iterator[Bag]:
             reader.open()
             stack.callback(reader.close)
             sources = reader.storages if path.is_dir() else [reader]
-            for source in sources:
-                _limit_chunks(source)
+            for source in sources:  # an index states the unpacked size of MCAP's chunks
+                if isinstance(source, McapReader):
+                    if not source.chunks and source.metadata.message_count:
+                        raise ReaderError("its messages are not in chunks")
+                    for listed in source.chunks:
+                        _check_size(max(listed.uncompressed_size, listed.compressed_size), LIMITS.chunk_bytes)
+                elif isinstance(source, Ros1Reader):  # none does, so these are unpacked up to the limit
+                    names = {decompress: name for name, decompress in decompressors.items()}
+                    for place, chunk in source.chunks.items():
+                        _check_size(chunk.datasize, LIMITS.chunk_bytes)
+                        compression = names[chunk.decompressor]
+                        limited = partial(unpack, compression=compression, max_bytes=LIMITS.chunk_bytes)
+                        source.chunks[place] = chunk._replace(decompressor=limited)
         yield Bag(path, reader, sources)
 
 
@@ -214,24 +225,6 @@ def unpack(data: bytes, compression: str, max_bytes: int) -> bytes:
     if not decompressor.eof:
         raise ReaderError("a chunk of its messages is truncated")
     return unpacked
-
-
-def _limit_chunks(reader: Any) -> None:
-    """Make an open ROS 1 or MCAP reader reject chunks above the memory limit. Raises ReaderError.
-
-    An index states the unpacked size of MCAP's chunks; ROS 1 bags state none, so these are unpacked up to the limit.
-    """
-    if isinstance(reader, McapReader):
-        if not reader.chunks and reader.metadata.message_count:
-            raise ReaderError("its messages are not in chunks")
-        for listed in reader.chunks:
-            _check_size(max(listed.uncompressed_size, listed.compressed_size), LIMITS.chunk_bytes)
-    elif isinstance(reader, Ros1Reader):
-        names = {decompress: name for name, decompress in decompressors.items()}
-        for place, chunk in reader.chunks.items():
-            _check_size(chunk.datasize, LIMITS.chunk_bytes)
-            limited = partial(unpack, compression=names[chunk.decompressor], max_bytes=LIMITS.chunk_bytes)
-            reader.chunks[place] = chunk._replace(decompressor=limited)
 
 
 def _check_size(size: int, max_bytes: int) -> None:
@@ -290,7 +283,25 @@ class Samples:
         if message is None:
             raise _UnusableError("is damaged")
         if self.type in IMAGE:
-            encoding, size = _inspect(message)
+            if hasattr(message, "encoding"):
+                encoding, size = message.encoding, (message.width, message.height)
+                if encoding not in ENCODINGS:
+                    raise _UnusableError(f"has the unsupported encoding {printable(encoding, 24)}")
+                if message.step < size[0] * ENCODINGS[encoding][0] or len(message.data) < message.step * size[1]:
+                    raise _UnusableError("has fewer pixels than its size states")
+            else:
+                try:
+                    with Image.open(BytesIO(message.data), formats=FORMATS) as image:
+                        encoding, size, mode = str(image.format), image.size, image.mode
+                        if encoding == "PNG":
+                            image.verify()
+                        elif b"\xff\xd9" not in message.data[-4096:].tobytes():
+                            raise ValueError("cut short")
+                except Exception:  # Pillow's readers raise many types
+                    name = printable(message.format, 24)
+                    raise _UnusableError(f"is not a complete JPEG or PNG ({name})") from None
+                if mode[0] in "IF":
+                    raise _UnusableError("has 16 bits per channel, which is not supported")
             if not 0 < size[0] * size[1] <= LIMITS.pixels:
                 raise _UnusableError(f"has {size[0]}x{size[1]} pixels")
             self.sizes[size] = self.encodings[encoding] = None
@@ -328,29 +339,6 @@ class Samples:
         """The type; for images as `sensor_msgs/Image (rgb8, 640x480)`."""
         details = [*self.encodings, *(f"{width}x{height}" for width, height in self.sizes)][:6]
         return f"{self.type} ({', '.join(details)})" if details else self.type
-
-
-def _inspect(message: Any) -> tuple[str, tuple[int, int]]:
-    """Return the encoding and size of an Image or CompressedImage. Raises _UnusableError."""
-    if hasattr(message, "encoding"):
-        encoding, size = message.encoding, (message.width, message.height)
-        if encoding not in ENCODINGS:
-            raise _UnusableError(f"has the unsupported encoding {printable(encoding, 24)}")
-        if message.step < size[0] * ENCODINGS[encoding][0] or len(message.data) < message.step * size[1]:
-            raise _UnusableError("has fewer pixels than its size states")
-        return encoding, size
-    try:
-        with Image.open(BytesIO(message.data), formats=FORMATS) as image:
-            kind, size, mode = str(image.format), image.size, image.mode
-            if kind == "PNG":
-                image.verify()
-            elif b"\xff\xd9" not in message.data[-4096:].tobytes():
-                raise ValueError("cut short")
-    except Exception:  # Pillow's readers raise many types
-        raise _UnusableError(f"is not a complete JPEG or PNG ({printable(message.format, 24)})") from None
-    if mode[0] in "IF":
-        raise _UnusableError("has 16 bits per channel, which is not supported")
-    return kind, size
 
 
 def decode(message: Any) -> np.ndarray:

@@ -18,7 +18,7 @@ from neeco.base.files import read_json
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, rate_of
-from neeco.ingest.readers.frame_names import camera_order
+from neeco.ingest.readers.names import camera_order
 from neeco.ingest.readers.rosbag import RosBag
 from neeco.ingest.readers.video import ChosenFrames, open_video
 

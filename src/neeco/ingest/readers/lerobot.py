@@ -34,8 +34,8 @@ from neeco.ingest.readers import (
     file_state,
     one_line,
 )
-from neeco.ingest.readers import columns as named
-from neeco.ingest.readers.frame_names import NamedFrame, camera_order, meaning_in, of_dvrk, unsaid, without_frame
+from neeco.ingest.readers import names as named
+from neeco.ingest.readers.names import NamedFrame, camera_order, meaning_in, of_dvrk, unsaid, without_frame
 from neeco.ingest.readers.video import ChosenFrames, open_video
 
 TIME = "timestamp_s"

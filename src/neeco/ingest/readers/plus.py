@@ -19,8 +19,7 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import open_file, require_content
 from neeco.capture.documents import printable
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, one_line, read_once, to_numbers
-from neeco.ingest.readers.columns import BASE, CAMERA
-from neeco.ingest.readers.frame_names import NamedFrame, meaning_of, of_dvrk
+from neeco.ingest.readers.names import BASE, CAMERA, NamedFrame, meaning_of, of_dvrk
 
 IMAGE_STREAM = "images"
 HEADER = (

@@ -22,14 +22,13 @@ from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid
-from neeco.ingest.calibration.camera_fields import cameras_in
+from neeco.ingest.calibration.lens import cameras_in
 from neeco.ingest.calibration.stereo import RosCamera, from_projections
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, file_state
-from neeco.ingest.readers.columns import BASE
-from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, camera_order, meaning_of, of_dvrk
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import SETTINGS as LOGS
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.readers.names import BASE, CAMERA_FRAMES, NamedFrame, camera_order, meaning_of, of_dvrk
 from neeco.ingest.readers.sections import PoseColumns
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from neeco.base.placeholders import read_head
 from neeco.capture.images import FORMATS, open_image
 from neeco.capture.readers.parsed import natural_order
 from neeco.ingest.readers import VideoSource, numbers, one_line, read_table, reason_of
-from neeco.ingest.readers.columns import recognise_time, scale_of
+from neeco.ingest.readers.names import recognise_time, scale_of
 
 FURTHER_FORMATS = {".bmp": "BMP", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}  # opened only with these suffixes
 IMAGES = (".png", ".jpg", ".jpeg", *FURTHER_FORMATS)

@@ -21,8 +21,7 @@ from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.readers import DELIMITED, RecordingFormat, VideoSource, format_of
-from neeco.ingest.readers.columns import TRACKER_CLOCK, VIDEO_CLOCK
-from neeco.ingest.readers.frame_names import CAMERA_FRAMES
+from neeco.ingest.readers.names import CAMERA_FRAMES, TRACKER_CLOCK, VIDEO_CLOCK
 from neeco.ingest.readers.sections import (
     MAX_NUMBER,
     Count,

@@ -14,8 +14,8 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.geometry.lens import Lens
 from neeco.ingest.readers import MAX_UNLIKE, VideoSource, compare_counts, format_of
-from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
+from neeco.ingest.readers.names import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.sections import JointColumns, PoseColumns
 from neeco.ingest.recording.base import STATED
 from neeco.ingest.recording.model import STILL, IngestSettings, InstrumentLogs, Recording, StereoPartner, VideoFile
