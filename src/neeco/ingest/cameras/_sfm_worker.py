@@ -114,9 +114,7 @@ def map_keyframes(job: dict[str, Any], database: Path) -> None:
             camera.has_prior_focal_length = True
             opened.update_camera(camera)
     say("mapping", done=0, total=len(job["names"]))
-    models = (
-        global_mapping(job, database, folder) if job["global_mapping"] else incremental_mapping(job, database, folder)
-    )
+    models = (global_mapping if job["global_mapping"] else incremental_mapping)(job, database, folder)
     stats: dict[str, Any] = {"models": [], "focal": 0.0, "distortion": 0.0, "points": 0, "error": 0.0, "parallax": 0.0}
     if models:
         model = max(models.values(), key=lambda model: model.num_reg_images())

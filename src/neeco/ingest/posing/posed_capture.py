@@ -68,8 +68,7 @@ def _joints(node: Node) -> dict[str, float]:
     return {str(name): _degrees(Node(value, node.file, str(name))) for name, value in node.value.items()}
 
 
-def _remark(node: Node) -> str:
-    return str(node.value)  # YAML reads some as dates
+Remark = Annotated[str, lambda node: str(node.value)]  # YAML reads some as dates
 
 
 @dataclass(frozen=True)
@@ -80,8 +79,8 @@ class HandPose:
     instrument: Name
     roll_deg: Annotated[float, _degrees]
     joints_deg: Annotated[dict[str, float], _joints] = field(default_factory=dict)
-    when: Annotated[str, _remark] | None = None
-    who: Annotated[str, _remark] | None = None
+    when: Remark | None = None
+    who: Remark | None = None
 
     @property
     def degrees(self) -> dict[str, float]:

@@ -9,7 +9,6 @@ SciPy's smoothing splines with robust weights are as accurate on positions, but 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -132,9 +131,24 @@ class _Series:
             # robust standard deviation of a sample about the line through its neighbours, per axis
             bend = self.values[1:-1] - (self.values[:-2] + self.values[2:]) / 2
             noise = max(1.48 * float(np.median(np.abs(bend))) / np.sqrt(1.5), 1e-9)
-            for rows, index, used, offsets in self._windows(times, width, leave_out):
-                around = self.values[index] - start[rows, None]
-                result[rows] = start[rows] + _local_polynomial(offsets, used, around, noise)
+            size = max(int(SETTINGS.chunk / max(2 * width / self.step, 8)), 1)
+            for first in range(0, len(times), size):  # times with enough samples [N, K] within `width`, in chunks
+                rows = np.arange(first, min(first + size, len(times)))
+                centers = times[rows]
+                left, right = self._around(centers)
+                nearest = np.where(self.times[right] == centers, right, left)
+                low = np.maximum(np.searchsorted(self.times, centers - width), self.first[nearest])
+                high = np.minimum(np.searchsorted(self.times, centers + width, side="right"), self.last[nearest])
+                index = low[:, None] + np.arange(max(int((high - low).max(initial=0)), 1))
+                index, used = np.minimum(index, len(self.times) - 1), index < high[:, None]
+                if leave_out is not None:
+                    used &= index != leave_out[rows, None]
+                enough = used.sum(axis=1) >= SETTINGS.min_samples
+                if enough.any():
+                    rows, index, used = rows[enough], index[enough], used[enough]
+                    offsets = (self.times[index] - times[rows, None]) / width
+                    around = self.values[index] - start[rows, None]
+                    result[rows] = start[rows] + _local_polynomial(offsets, used, around, noise)
         return result
 
     def best_width(self) -> float:
@@ -152,28 +166,6 @@ class _Series:
         limit = 5 * max(float(np.median(errors[0])), 1e-12)
         scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in errors]
         return widths[int(np.argmin(scores))]
-
-    def _windows(
-        self, times: np.ndarray, width: float, leave_out: np.ndarray | None
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield times with enough samples within `width`, in chunks: rows [N], their samples [N, K], bool [N, K]
-        whether a sample is used, and offsets [N, K] in half widths."""
-        size = max(int(SETTINGS.chunk / max(2 * width / self.step, 8)), 1)
-        for start in range(0, len(times), size):
-            rows = np.arange(start, min(start + size, len(times)))
-            centers = times[rows]
-            left, right = self._around(centers)
-            nearest = np.where(self.times[right] == centers, right, left)
-            low = np.maximum(np.searchsorted(self.times, centers - width), self.first[nearest])
-            high = np.minimum(np.searchsorted(self.times, centers + width, side="right"), self.last[nearest])
-            index = low[:, None] + np.arange(max(int((high - low).max(initial=0)), 1))
-            index, used = np.minimum(index, len(self.times) - 1), index < high[:, None]
-            if leave_out is not None:
-                used &= index != leave_out[rows, None]
-            enough = used.sum(axis=1) >= SETTINGS.min_samples
-            if enough.any():
-                rows, index, used = rows[enough], index[enough], used[enough]
-                yield rows, index, used, (self.times[index] - times[rows, None]) / width
 
     def _around(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples before and after each time [N] (the same sample twice at its own time)."""

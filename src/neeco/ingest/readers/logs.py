@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError, counted
 from neeco.geometry.conventions import OPENCV
-from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Table, column_index, numbers, read_table, to_numbers
 from neeco.ingest.readers import names as named
 from neeco.ingest.readers.rows import Rows, drop_stuck, find_gaps, in_order, keep_measured, read_cells, read_times
@@ -228,7 +227,22 @@ def _poses(rows: Rows, source: PoseColumns, recognised: named.RecognisedColumns)
             raise NeecoError(f"{table.where}: matrix: is in column-major order; list its columns row by row")
     if form not in (named.EULER, named.ROTATION_VECTOR):  # trackers write zeros where they have no rotation
         rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
-    quats, good = to_quaternions(form, turns, source.columns.euler_convention, angle)
+    # unit quaternions; rows that are not rotations are NaN, while scipy would accept any numbers
+    quats, good = np.full((len(turns), 4), np.nan), np.isfinite(turns).all(axis=1)
+    if form in (named.QUATERNION_WXYZ, named.QUATERNION_XYZW):
+        good &= np.abs(np.linalg.norm(turns, axis=1) - 1) <= SETTINGS.norm_tolerance
+        rotations = Rotation.from_quat(turns[good], scalar_first=form == named.QUATERNION_WXYZ)
+    elif form in (named.EULER, named.ROTATION_VECTOR):
+        good &= (np.abs(turns * angle) < 1e4).all(axis=1)  # larger values are not angles, or their sine is noise
+        angles, convention = turns[good] * angle, source.columns.euler_convention or ""
+        is_euler = form == named.EULER
+        rotations = Rotation.from_euler(convention, angles) if is_euler else Rotation.from_rotvec(angles)
+    else:
+        matrices = np.where(good[:, None], turns, 0).reshape(-1, 3, 3)
+        with np.errstate(all="ignore"):
+            good &= (rotation_error(matrices) <= SETTINGS.rounded_tolerance) & (np.linalg.det(matrices) > 0)
+        rotations = Rotation.from_matrix(matrices[good])
+    quats[good] = rotations.as_quat(scalar_first=True)
     expected = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
     rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {expected}; name the right columns")
     distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
@@ -238,29 +252,6 @@ def _poses(rows: Rows, source: PoseColumns, recognised: named.RecognisedColumns)
             "; correct the unit in the header or in units.length"
         )
     return positions, quats
-
-
-def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit quaternions wxyz [R, 4] of rotation columns [R, C], and bool [R] whether they are rotations.
-
-    form: see `names.FORMS`; matrices by rows, 4x4 ones as their 9 rotation cells; convention: of Euler angles;
-    scale: of angles, to rad. Rows that are not rotations are NaN; scipy would accept any numbers.
-    """
-    quats, good = np.full((len(cells), 4), np.nan), np.isfinite(cells).all(axis=1)
-    if form in (named.QUATERNION_WXYZ, named.QUATERNION_XYZW):
-        good &= np.abs(np.linalg.norm(cells, axis=1) - 1) <= SETTINGS.norm_tolerance
-        turns = Rotation.from_quat(cells[good], scalar_first=form == named.QUATERNION_WXYZ)
-    elif form in (named.EULER, named.ROTATION_VECTOR):
-        good &= (np.abs(cells * scale) < 1e4).all(axis=1)  # larger values are not angles, or their sine is noise
-        angles = cells[good] * scale
-        turns = Rotation.from_euler(convention or "", angles) if form == named.EULER else Rotation.from_rotvec(angles)
-    else:
-        matrices = np.where(good[:, None], cells, 0).reshape(-1, 3, 3)
-        with np.errstate(all="ignore"):
-            good &= (rotation_error(matrices) <= SETTINGS.rounded_tolerance) & (np.linalg.det(matrices) > 0)
-        turns = Rotation.from_matrix(matrices[good])
-    quats[good] = turns.as_quat(scalar_first=True)
-    return quats, good
 
 
 def continuous(quats: np.ndarray) -> tuple[np.ndarray, int]:

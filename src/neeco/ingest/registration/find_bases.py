@@ -15,6 +15,7 @@ from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid
 from neeco.ingest.frames.images import StageProgress, Views, reduced
 from neeco.ingest.readers.interpolate import poses_at, readings_at
+from neeco.ingest.readers.logs import ReadingLog
 from neeco.ingest.readers.names import CAMERA
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
@@ -22,7 +23,7 @@ from neeco.ingest.registration.articulated import LoggedMotion, find_base
 from neeco.ingest.registration.base import BASES, BaseRegistration, Prior
 from neeco.ingest.registration.hand_eye import HAND_EYE, Registration
 from neeco.ingest.timing.clock_search import ASSUMED, GIVEN, SCOPE_MOTION, VIDEOS_OWN, ClockOffset
-from neeco.ingest.timing.episodes import Episodes
+from neeco.ingest.timing.episodes import Episode, Episodes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,7 +236,11 @@ def _arm(data: Episodes, item: InstrumentLogs, observed: _Observed) -> _Arm:
     def readings_later(shift: float) -> dict[str, np.ndarray]:
         later_readings = {}
         for joint in item.joints:
-            reading = data.joint_log(lambda part, joint=joint: part.joints[item.name][joint])
+
+            def of_joint(part: Episode, joint: str = joint) -> ReadingLog:
+                return part.joints[item.name][joint]
+
+            reading = data.joint_log(of_joint)
             reading_clock = data.clock(reading.clock) or clock
             # a clock that is known does not move with the pose's
             later = 0.0 if reading_clock.source in KNOWN else shift

@@ -359,7 +359,8 @@ def _coverage(part: Episode) -> tuple[np.ndarray, np.ndarray]:
     """`Episodes.coverage_states` of one episode, [V] its frames."""
     columns, usable = [], np.ones(len(part.times), dtype=bool)
     placed = [item.name for item in part.recording.instruments if item.placed]
-    logs = [*part.poses.values(), *(log for name in placed for log in part.joints[name].values())]
+    logs: list[PoseLog | ReadingLog] = [*part.poses.values()]
+    logs += [log for name in placed for log in part.joints[name].values()]
     for log in (log for log in logs if log.clock in part.clocks):
         values, valid = part.logged(log, part.times)
         usable &= valid
