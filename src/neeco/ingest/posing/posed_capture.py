@@ -172,7 +172,10 @@ class SolvedPosing:
                     reason = "jaws at their narrowest"
             chosen.append(Suggestion(frame, reason))
             usable[frame] = False
-            solved = [some.with_answer(frame) for some in solved]
+            for number, some in enumerate(solved):  # with one more hand-posed frame; the values stay
+                column = some.covariance[:, frame]
+                gained = np.outer(column, column) / (column[frame] + np.radians(SETTINGS.hand_sd_deg) ** 2)
+                solved[number] = AnglePosterior(some.values, some.covariance - gained)
         return chosen
 
     def outliers(self) -> list[OutlierAnswer]:

@@ -12,7 +12,7 @@ import importlib.util
 from abc import ABC
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from enum import StrEnum
 from functools import cache, lru_cache, wraps
 from pathlib import Path
@@ -110,25 +110,28 @@ class Stream:
     problem: str | None = None
 
 
+Images = Callable[[list[int]], Iterator[tuple[int, np.ndarray]]]
+
+
 @dataclass(frozen=True)
 class VideoSource:
     """Frames with their times. size: (width, height) px, as stored; notes: unreadable parts, as text; times [N]
-    s, increasing, of a video from its first frame; pixel_aspect: width of a stored pixel by its height."""
+    s, increasing, of a video from its first frame; pixel_aspect: width of a stored pixel by its height; own_fps: frame
+    rate stated by the file if it differs from the requested one; images: reader of some frames, given in increasing
+    order, as (index, uint8 [H, W, 3] RGB)."""
 
     path: Path
     size: tuple[int, int]
     notes: tuple[str, ...]
     times: np.ndarray
-    pixel_aspect: float = field(default=1.0, kw_only=True)
-
-    @property
-    def own_fps(self) -> float | None:
-        """Frame rate stated by the file if it differs from the requested one, else None."""
-        return None
+    _: KW_ONLY
+    images: Images
+    pixel_aspect: float = 1.0
+    own_fps: float | None = None
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield (index, uint8 [H, W, 3] RGB) of the requested frames, in increasing order. Raises NeecoError."""
-        raise NotImplementedError
+        return self.images(sorted({int(index) for index in indices}))
 
 
 class RecordingFormat(ABC):

@@ -12,7 +12,7 @@ import re
 import sys
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cache, lru_cache, partial
@@ -443,38 +443,7 @@ def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
     return survey
 
 
-@dataclass(frozen=True, kw_only=True)
-class BagImages(VideoSource):
-    """Images of a topic. arrived: receipt time of each of its messages, ns; numbers: message index of each frame."""
-
-    topic: str
-    arrived: np.ndarray
-    numbers: np.ndarray
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        requested = np.array(sorted({int(index) for index in indices}), np.int64)
-        steps = np.diff(self.numbers[requested])
-        cuts = np.flatnonzero((steps <= 0) | (steps > LIMITS.skipped_images)) + 1
-        with open_bag(self.path) as bag:
-            for stretch in np.split(requested, cuts):
-                numbers = {int(self.numbers[index]): int(index) for index in stretch}
-                times = self.arrived[list(numbers)]
-                start, stop = int(times.min(initial=2**62)), int(times.max(initial=-1)) + 1
-                passed = np.flatnonzero((self.arrived >= start) & (self.arrived < stop)).tolist()
-                messages = bag.messages([self.topic], start, stop)
-                for number, (_, _, message) in zip(passed, messages, strict=False):
-                    if number in numbers:
-                        where = f"{self.path}: {self.topic}: message {number + 1}"
-                        with one_line(where, "cannot be decoded", "remove it with `rosbag filter`"):
-                            pixels = decode(message)
-                        if pixels.shape[1::-1] != self.size:
-                            raise NeecoError(f"{where}: changed its size; do not modify the bag during a run")
-                        yield numbers.pop(number), pixels
-                if numbers:
-                    raise NeecoError(f"{self.path}: {self.topic}: became shorter; do not modify the bag during a run")
-
-
-def open_topic(survey: Survey, topic: str) -> BagImages:
+def open_topic(survey: Survey, topic: str) -> VideoSource:
     """Return the images of a topic, sorted by time. Raises NeecoError."""
     log, where = survey.images[topic], f"{survey.path}: {topic}"
     seconds, notes = survey.seconds(log), survey.notes(topic, log, "image")
@@ -493,5 +462,30 @@ def open_topic(survey: Survey, topic: str) -> BagImages:
     if doubled := len(seconds) - len(times):
         left_out = f"{counted(doubled, 'image')} left out: duplicate time"
         notes = (*notes, f"{survey.path.name}: {topic}: {left_out}")
-    numbers, arrived = np.array(log.numbers, np.int64)[order], np.array(log.arrived, np.int64)
-    return BagImages(survey.path, next(iter(log.sizes)), notes, times, topic=topic, arrived=arrived, numbers=numbers)
+    # message of each frame, and receipt time of each message, ns
+    number_of, arrived = np.array(log.numbers, np.int64)[order], np.array(log.arrived, np.int64)
+    size = next(iter(log.sizes))
+
+    def images(indices: list[int]) -> Iterator[tuple[int, np.ndarray]]:
+        requested = np.array(indices, np.int64)
+        steps = np.diff(number_of[requested])
+        cuts = np.flatnonzero((steps <= 0) | (steps > LIMITS.skipped_images)) + 1
+        with open_bag(survey.path) as bag:
+            for stretch in np.split(requested, cuts):
+                numbers = {int(number_of[index]): int(index) for index in stretch}
+                received = arrived[list(numbers)]
+                start, stop = int(received.min(initial=2**62)), int(received.max(initial=-1)) + 1
+                passed = np.flatnonzero((arrived >= start) & (arrived < stop)).tolist()
+                messages = bag.messages([topic], start, stop)
+                for number, (_, _, message) in zip(passed, messages, strict=False):
+                    if number in numbers:
+                        place = f"{where}: message {number + 1}"
+                        with one_line(place, "cannot be decoded", "remove it with `rosbag filter`"):
+                            pixels = decode(message)
+                        if pixels.shape[1::-1] != size:
+                            raise NeecoError(f"{place}: changed its size; do not modify the bag during a run")
+                        yield numbers.pop(number), pixels
+                if numbers:
+                    raise NeecoError(f"{where}: became shorter; do not modify the bag during a run")
+
+    return VideoSource(survey.path, size, notes, times, images=images)

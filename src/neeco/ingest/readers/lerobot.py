@@ -36,7 +36,7 @@ from neeco.ingest.readers import (
 )
 from neeco.ingest.readers import names as named
 from neeco.ingest.readers.names import NamedFrame, camera_order, meaning_in, of_dvrk, unsaid, without_frame
-from neeco.ingest.readers.video import ChosenFrames, open_video
+from neeco.ingest.readers.video import chosen_frames, open_video
 
 TIME = "timestamp_s"
 UNNAMED = "instrument"  # default name of a body
@@ -387,11 +387,7 @@ class LeRobot(RecordingFormat):
         row = np.full(max(int(numbers[-1]) + 1, count), -1)
         row[places] = np.arange(len(times))
         usable = row[numbers] >= 0
-        frames = tuple(np.flatnonzero(usable).tolist())
-        times = times[row[numbers[usable]]]
-        return ChosenFrames(
-            video.path, video.size, notes, times, video=video, frames=frames, pixel_aspect=video.pixel_aspect
-        )
+        return chosen_frames(video, np.flatnonzero(usable).tolist(), times[row[numbers[usable]]], notes)
 
     def clock(self, path: Path, stream: str | None) -> str:
         match = _NAME.fullmatch(stream or "")

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError, counted
 from neeco.geometry.conventions import OPENCV
+from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Table, column_index, numbers, read_table, to_numbers
 from neeco.ingest.readers import names as named
 from neeco.ingest.readers.rows import Rows, drop_stuck, find_gaps, in_order, keep_measured, read_cells, read_times

@@ -118,7 +118,15 @@ def read_episodes(recordings: Sequence[Recording]) -> Episodes:
     if not single:
         videos, starts = tuple(part.video for part in parts), [part.first_frame for part in parts]
         times = np.concatenate([part.times + part.start_s for part in parts])
-        video = _JoinedVideo(video.path, video.size, (), times, videos, (*starts, len(times)))
+
+        def images(indices: list[int]) -> Iterator[tuple[int, np.ndarray]]:
+            wanted = np.asarray(indices, dtype=np.int64)
+            for part, before, after in zip(videos, starts, [*starts[1:], len(times)], strict=True):
+                local = wanted[(wanted >= before) & (wanted < after)] - before
+                for index, image in part.read(local.tolist()) if len(local) else ():
+                    yield index + before, image
+
+        video = VideoSource(video.path, video.size, (), times, images=images)
     return Episodes(tuple(parts), video, notes)
 
 
@@ -240,22 +248,6 @@ def require_lens(recording: Recording, lens: Lens | None) -> None:
             f"{recording.path}: intrinsics: missing; images of a scope that stands still do not determine its "
             "lens; give fl_x, fl_y, cx, cy or a calibration"
         )
-
-
-@dataclass(frozen=True)
-class _JoinedVideo(VideoSource):
-    """The frames of several videos, counted on. first: frames before each, and of all."""
-
-    videos: tuple[VideoSource, ...]
-    first: tuple[int, ...]
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        wanted = np.asarray(indices, dtype=np.int64)
-        for video, before, after in zip(self.videos, self.first, self.first[1:], strict=False):
-            local = wanted[(wanted >= before) & (wanted < after)] - before
-            if len(local):
-                for index, image in video.read(local.tolist()):
-                    yield index + before, image
 
 
 def episode_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
