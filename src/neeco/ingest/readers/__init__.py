@@ -239,11 +239,11 @@ def file_state(*files: Path) -> tuple[tuple[str, int, int], ...]:
         raise NeecoError(f"{error.filename}: cannot read: {error.strerror or error}; correct the path") from None
 
 
-def read_once(read: _Read) -> _Read:
-    """Cache a function's result per file, its first argument, until the file changes. Raises NeecoError if it does not
-    exist."""
+def read_once(read: _Read, files: Callable[[Path], Sequence[Path]] = lambda path: [path]) -> _Read:
+    """Cache a function's result per path, its first argument, until the path's `files` change. Raises NeecoError if
+    one does not exist."""
     cached = lru_cache(maxsize=4)(lambda state, *arguments: read(*arguments))
-    return cast(_Read, wraps(read)(lambda path, *arguments: cached(file_state(path), path, *arguments)))
+    return cast(_Read, wraps(read)(lambda path, *arguments: cached(file_state(*files(path)), path, *arguments)))
 
 
 def reason_of(error: BaseException) -> str:

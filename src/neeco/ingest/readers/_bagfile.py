@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import KW_ONLY, dataclass, field
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from neeco.base.files import require_content, visible_entries
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
-from neeco.ingest.readers import Kind, Stream, Table, VideoSource, one_line, rate_of
+from neeco.ingest.readers import Kind, Stream, Table, VideoSource, one_line, rate_of, read_once
 from neeco.ingest.readers.rows import restarts
 
 if sys.version_info >= (3, 14):
@@ -413,9 +413,9 @@ class Survey:
         return tuple(f"{self.path.name}: {name}: {note}" for note in notes)
 
 
-@lru_cache(maxsize=4)
-def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
-    """Read a bag once; `state` (`file_state`) is part of the cache key."""
+@partial(read_once, files=lambda path: visible_entries(path) if path.is_dir() else [path])
+def survey_of(path: Path) -> Survey:
+    """Read a bag. Raises NeecoError."""
     survey = Survey(path=path)
     with open_bag(path) as bag:
         kinds: dict[str, str] = {}

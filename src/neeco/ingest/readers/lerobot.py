@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -24,16 +24,7 @@ from neeco.base.files import read_json, read_text, require_content, require_insi
 from neeco.base.placeholders import read_head
 from neeco.base.settings import faults_in
 from neeco.capture.documents import Node, printable
-from neeco.ingest.readers import (
-    Kind,
-    RecordingFormat,
-    Stream,
-    Table,
-    VideoSource,
-    compare_counts,
-    file_state,
-    one_line,
-)
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, one_line, read_once
 from neeco.ingest.readers import names as named
 from neeco.ingest.readers.names import NamedFrame, camera_order, meaning_in, of_dvrk, unsaid, without_frame
 from neeco.ingest.readers.video import chosen_frames, open_video
@@ -161,15 +152,15 @@ class DataSet:
         return require_inside(self.path / parts, _boundary(self.path))
 
 
+def _described_in(path: Path) -> list[Path]:
+    """Return the files that describe a data set."""
+    files = [path / INFO, path / EPISODES_2, *sorted(path.glob(f"{EPISODES_3}/chunk-*/*.parquet"))]
+    return [file for file in files if file.exists()]
+
+
+@partial(read_once, files=_described_in)
 def read_data_set(path: Path) -> DataSet:
-    """Read meta/info.json and the list of episodes, cached until they change. Raises NeecoError."""
-    folder = path / EPISODES_3
-    files = [path / INFO, path / EPISODES_2, *(folder.glob("chunk-*/*.parquet") if folder.is_dir() else ())]
-    return _described(path, file_state(*sorted(file for file in files if file.exists())))
-
-
-@lru_cache(maxsize=4)
-def _described(path: Path, state: tuple[object, ...]) -> DataSet:
+    """Read meta/info.json and the list of episodes. Raises NeecoError."""
     file = require_inside(path / INFO, _boundary(path))
     info = Node(read_json(file), str(file))
     with faults_in(file):
