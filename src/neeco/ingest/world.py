@@ -30,12 +30,7 @@ from neeco.ingest.readers.names import CAMERA
 from neeco.ingest.recording.model import MIN_FRAMES, MOVING, STILL
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.clocks import find_instrument_clocks, register
-from neeco.ingest.registration.find_bases import (
-    check_reference_frames,
-    correct_placement,
-    find_bases,
-    follow_cameras,
-)
+from neeco.ingest.registration.find_bases import check_reference_frames, correct_placement, find_bases, follow_cameras
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.from_video import FoundShaft, find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes, States

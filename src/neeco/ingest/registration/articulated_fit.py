@@ -18,14 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.ingest.foreground.silhouettes import SHAFT_LINES, Silhouettes, border_of
-from neeco.ingest.registration.base import (
-    BASE,
-    CLOCK_SHIFTS_S,
-    MIDDLE,
-    BasePrior,
-    moved_base,
-    poses_at_clock,
-)
+from neeco.ingest.registration.base import BASE, CLOCK_SHIFTS_S, MIDDLE, BasePrior, moved_base, poses_at_clock
 from neeco.states.outline_model import ArticulatedModel, Outlines
 
 
