@@ -50,14 +50,16 @@ COARSE = SilhouetteSearchSettings()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShaftViews:
-    """Shafts [F] in the masks of a problem, and where the base may be: `center` [3] mm is the prior mean of the
+    """Shafts [F] in masks, the poses they are of, and where the base may be: `center` [3] mm is the prior mean of the
     instrument's mean position in the world, sd_mm its standard deviation; distance mm: approximate depth of the
     instrument; axis [3], end [3] and tips [F, 3] mm: the shaft's direction, its end, and the tip's places in the
     instrument's frame, as stated links have them; None where they are to be found, and the tip is on the shaft's
     line."""
 
-    problem: ArticulatedProblem
     lines: ShaftLines
+    intrinsics: tuple[float, float, float, float]
+    camera_from_world: np.ndarray  # [F, 4, 4]
+    base_from_instrument: np.ndarray  # [F, 4, 4]
     center: np.ndarray
     sd_mm: float
     distance: float
@@ -123,15 +125,30 @@ def search_bases(
         center, sd_mm, step = problem.pivot(base), prior.sd_mm, 0.5 * prior.sd_rad
         depth = float(np.median(problem.camera_from_world[:, 2, :3] @ center + problem.camera_from_world[:, 2, 3]))
         distance = depth if depth > 0.2 * guess else guess
-    lines = problem.silhouettes.shafts if lines is None else lines
-    views = ShaftViews(problem=problem, lines=lines, center=center, sd_mm=sd_mm, distance=distance, **stated)
-    best = _solve_all(views, rotations).distinct(COARSE.n_first, step)
-    while step > COARSE.min_step_rad:  # narrowed down around the best rotations
+    views = ShaftViews(
+        lines=problem.silhouettes.shafts if lines is None else lines,
+        intrinsics=problem.silhouettes.intrinsics,
+        camera_from_world=problem.camera_from_world,
+        base_from_instrument=problem.poses[MIDDLE],
+        center=center,
+        sd_mm=sd_mm,
+        distance=distance,
+        **stated,
+    )
+    candidates = search(views, rotations, generator, step)
+    return candidates.take(np.flatnonzero(candidates.costs < COARSE.max_start_cost))
+
+
+def search(views: ShaftViews, rotations: np.ndarray, generator: np.random.Generator, first_step: float) -> Candidates:
+    """The best bases, different from each other, after narrowing down around the best rotations [B, 3, 3]; first_step
+    rad: between these."""
+    best = _solve_all(views, rotations).distinct(COARSE.n_first, first_step)
+    step = first_step
+    while step > COARSE.min_step_rad:
         around = [rotations_about(base[:3, :3], step, COARSE.n_around, generator) for base in best.world_from_base]
         step /= 2
         best = _solve_all(views, np.concatenate(around)).distinct(COARSE.n_next, step)
-    best = best.distinct(COARSE.n_best, COARSE.distinct_rad)
-    return best.take(np.flatnonzero(best.costs < COARSE.max_start_cost))
+    return best.distinct(COARSE.n_best, COARSE.distinct_rad)
 
 
 def _solve_all(views: ShaftViews, rotations: np.ndarray) -> Candidates:
@@ -143,12 +160,12 @@ def _solve_all(views: ShaftViews, rotations: np.ndarray) -> Candidates:
 
 
 def _solve(views: ShaftViews, rotations: np.ndarray) -> Candidates:
-    fx, fy, cx, cy = views.problem.silhouettes.intrinsics
-    lines, distance, cameras = views.lines, views.distance, np.linalg.inv(views.problem.camera_from_world)
-    places, base_from_instrument = cameras[:, :3, 3], views.problem.poses[MIDDLE]
-    turned = np.einsum("bij,fjk->bfik", rotations, base_from_instrument[:, :3, :3])  # world_from_instrument
-    middle = base_from_instrument[:, :3, 3].mean(0)
-    ends = moved = np.einsum("bij,fj->bfi", rotations, base_from_instrument[:, :3, 3] - middle)
+    fx, fy, cx, cy = views.intrinsics
+    lines, distance, cameras = views.lines, views.distance, np.linalg.inv(views.camera_from_world)
+    places = cameras[:, :3, 3]
+    turned = np.einsum("bij,fjk->bfik", rotations, views.base_from_instrument[:, :3, :3])  # world_from_instrument
+    middle = views.base_from_instrument[:, :3, 3].mean(0)
+    ends = moved = np.einsum("bij,fj->bfi", rotations, views.base_from_instrument[:, :3, 3] - middle)
     if views.tips is not None:
         moved = moved + np.einsum("bfij,fj->bfi", turned, views.tips)
     if views.end is not None:
