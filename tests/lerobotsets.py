@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from neeco.base.files import write_text
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template
 
 CAMERA, STATE = "observation.images.endoscope.left", "observation.state"

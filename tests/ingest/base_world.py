@@ -133,7 +133,7 @@ def episodes(
     recording = Recording(
         path=Path("recording.yaml"), video=VideoFile(Path("video.mp4")), instruments=tuple(instruments)
     )
-    video = VideoSource(Path("video.mp4"), (WIDTH, HEIGHT), (), np.zeros(2))
+    video = VideoSource(Path("video.mp4"), (WIDTH, HEIGHT), (), np.zeros(2), images=lambda indices: iter(()))
     joints: dict[str, dict] = {name: {} for name in poses}
     part = Episode(
         name="recording",

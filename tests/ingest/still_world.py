@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.result import IngestResult
 
 WIDTH, HEIGHT, FOCAL, FRAMES, RATE = 160, 128, 150.0, 40, 25.0

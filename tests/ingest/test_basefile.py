@@ -9,7 +9,7 @@ import pytest
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.recording.base import read_dvrk_registration
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 
 # rotation about x by a quarter turn, and metres
 TRANSFORM = [[1.0, 0.0, 0.0, 0.05], [0.0, 0.0, -1.0, -0.02], [0.0, 1.0, 0.0, 0.17], [0.0, 0.0, 0.0, 1.0]]

@@ -15,7 +15,7 @@ import yaml
 from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.result import IngestResult
 
 pytest.importorskip("av")

@@ -14,8 +14,7 @@ from ingest.still_world import BASELINE, FOCAL, HEIGHT, WIDTH, Theatre
 from neeco.base.errors import NeecoError
 from neeco.cli import main
 from neeco.ingest.cameras.still_scene import video_stands_still
-from neeco.ingest.recording.file import read_recording
-from neeco.ingest.recording.model import Recording
+from neeco.ingest.recording.model import Recording, read_recording
 from neeco.ingest.recording.template import write_template
 from neeco.ingest.timing.reading import read_episodes
 

@@ -12,10 +12,10 @@ from damaged_files import refusals
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import format_of
-from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.readers.names import BASE, CAMERA
 from neeco.ingest.readers.sections import JointColumns, NamedJointColumns, PoseColumns
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template
 
 LATENCY = 0.06  # s

@@ -15,12 +15,10 @@ from neeco.capture.checks import inspect_capture
 from neeco.cli.ingest import Ingest, run
 from neeco.ingest.pipeline import assign_splits, ingest
 from neeco.ingest.readers.interpolate import poses_at
-from neeco.ingest.recording.compatibility import episode_names, separate
-from neeco.ingest.recording.file import read_recording
-from neeco.ingest.recording.model import Recording, VideoFile
+from neeco.ingest.recording.model import Recording, VideoFile, read_recording
 from neeco.ingest.sources import sources_of
 from neeco.ingest.timing.episodes import EPISODES
-from neeco.ingest.timing.reading import read_episodes
+from neeco.ingest.timing.reading import episode_names, read_episodes, separate
 
 BEGINS = (0.0, 2.0, 4.5)  # s of the bar's motion
 

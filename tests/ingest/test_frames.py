@@ -9,11 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers.columns import BASE, CAMERA
-from neeco.ingest.readers.frame_names import meaning_in, meaning_of, without_frame
 from neeco.ingest.readers.logs import PoseLog, read_pose_log
+from neeco.ingest.readers.names import BASE, CAMERA, meaning_in, meaning_of, without_frame
 from neeco.ingest.readers.sections import PoseColumns
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template
 
 COUNT = 12

@@ -19,7 +19,7 @@ from neeco.capture.model import State
 from neeco.geometry.lines import unit
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.posing.posed_capture import HandPose, PosedCapture
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.request import IngestRequest
 from neeco.ingest.result import assess_ingest
 from neeco.ingest.shaft.axis import axis_between, contour_normals, image_lines

@@ -12,7 +12,7 @@ from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.readers.sections import JointColumns, PoseColumns
 from neeco.ingest.readers.video import open_video
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template
 
 POSES, COUNTS, TABLE = "instrument.csv", "jaw.csv", "table.csv"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neeco.ingest.readers.interpolate import pose_smoothing, poses_at, reading_smoothing, readings_at
+from neeco.ingest.readers.interpolate import poses_at, readings_at, smoothing
 from neeco.ingest.readers.logs import PoseLog, ReadingLog
 
 QUERIES = np.linspace(0.3, 4.6, 87)
@@ -47,7 +47,7 @@ def test_noise_is_smoothed_by_more_than_half_and_rotations_too(world):
 
 
 def test_the_width_grows_with_the_noise(world):
-    widths = [pose_smoothing(pose_log(world, world.times, noise)).position_s for noise in (0.001, 0.1, 1.0)]
+    widths = [smoothing(pose_log(world, world.times, noise), "positions") for noise in (0.001, 0.1, 1.0)]
     assert widths[0] < widths[1] < widths[2]
 
 
@@ -103,7 +103,7 @@ def test_a_log_too_coarse_for_its_motion_is_taken_as_it_is():
     truth = lambda seconds: 0.6 + 0.5 * np.sin(5 * seconds)  # noqa: E731 a jaw that opens within three samples
     noise = np.random.default_rng(0).normal(0, 0.003, len(times))
     log = ReadingLog(Path("jaw.csv"), "jaw", times, truth(times) + noise)
-    assert reading_smoothing(log) == 0
+    assert smoothing(log, "values") == 0
     np.testing.assert_allclose(readings_at(log, times)[0], log.values, atol=1e-12)
     queries = np.linspace(0.5, 11.2, 200)
     off = np.abs(readings_at(log, queries)[0] - truth(queries))
@@ -117,7 +117,7 @@ def test_turns_of_a_coarse_log_are_followed_through_its_samples():
         return Rotation.from_euler("XYZ", np.stack([np.sin(3 * seconds), 0.6 * np.cos(2 * seconds), seconds], 1))
 
     log = PoseLog(Path("log.csv"), "em", times, np.zeros((50, 3)), turns(times).as_quat()[:, [3, 0, 1, 2]])
-    assert pose_smoothing(log).rotation_s == 0
+    assert smoothing(log, "quats") == 0
     queries = np.linspace(0.5, 9.0, 100)
     off = (Rotation.from_matrix(poses_at(log, queries)[0][:, :3, :3]).inv() * turns(queries)).magnitude()
     assert off.max() < 0.02

@@ -12,7 +12,7 @@ from neeco.base.errors import NeecoError
 from neeco.ingest.readers import format_of
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.readers.sections import PoseColumns
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template
 from neeco.ingest.timing.reading import read_episodes
 

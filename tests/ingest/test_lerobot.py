@@ -13,14 +13,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.ingest.readers import format_of, lerobot_files, read_table
-from neeco.ingest.readers.columns import CAMERA as CAMERA_FRAME
-from neeco.ingest.readers.lerobot_files import LeRobotLimits
+from neeco.ingest.readers import format_of, lerobot, read_table
+from neeco.ingest.readers.lerobot import LeRobotLimits
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.readers.names import CAMERA as CAMERA_FRAME
 from neeco.ingest.readers.sections import NamedPoseColumns, PoseColumns, Units
-from neeco.ingest.recording.compatibility import separate
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template
+from neeco.ingest.timing.reading import separate
 
 pytest.importorskip("av")
 pyarrow = pytest.importorskip("pyarrow")
@@ -485,7 +485,7 @@ def test_row_groups_that_unpack_to_more_than_memory_should_hold_are_refused(tmp_
     """Only those of the columns and the episode that are read count."""
     states = [{STATE: arm(20, number)} for number in range(40)]
     path = data_set(tmp_path, states=states, names={}, cameras=(), group=20)
-    monkeypatch.setattr(lerobot_files, "LIMITS", LeRobotLimits(group_bytes=8_000))
+    monkeypatch.setattr(lerobot, "LIMITS", LeRobotLimits(group_bytes=8_000))
     assert len(read(path, f"episode 33/{STATE}").rows) == 20
-    monkeypatch.setattr(lerobot_files, "LIMITS", LeRobotLimits(group_bytes=100))
+    monkeypatch.setattr(lerobot, "LIMITS", LeRobotLimits(group_bytes=100))
     assert "a row group exceeds" in refusal(path, f"episode 33/{STATE}")

@@ -10,7 +10,7 @@ import pytest
 from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.registration import hand_eye
 
 pytest.importorskip("av")

@@ -6,7 +6,7 @@ import pytest
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.readers.sections import NamedPoseColumns, PoseColumns, Units
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template
 
 # as NDI Track exports: tools with their markers

@@ -19,7 +19,7 @@ from neeco.capture.documents import errors_only
 from neeco.geometry.lens import Lens
 from neeco.ingest.frames.images import choose_images
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.timing.reading import read_episodes
 
 pytest.importorskip("pycolmap")

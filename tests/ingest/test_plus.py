@@ -13,7 +13,7 @@ from neeco.base.errors import NeecoError
 from neeco.ingest.readers import Kind, format_of
 from neeco.ingest.readers.logs import read_pose_log
 from neeco.ingest.readers.sections import PoseColumns
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template
 
 START = 12.5  # of PLUS's clock, s

@@ -14,7 +14,7 @@ from neeco.capture.readers import read_capture
 from neeco.cli import main
 from neeco.ingest.readers import read_table, recording_formats
 from neeco.ingest.readers.logs import read_pose_log
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 
 pytest.importorskip("av")
 

@@ -13,8 +13,7 @@ from PIL import Image
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
 from neeco.ingest.readers.sections import Units
-from neeco.ingest.recording.file import read_recording
-from neeco.ingest.recording.model import IngestSettings, Splits
+from neeco.ingest.recording.model import IngestSettings, Splits, read_recording
 from neeco.ingest.recording.template import open_questions, write_template
 from neeco.ingest.request import IngestRequest
 from neeco.ingest.sources import sources_of

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
 from neeco.ingest.readers import Kind, VideoSource, _bagfile, read_table
-from neeco.ingest.readers.columns import BASE, CAMERA
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import PoseLog, read_pose_log, read_reading_log
+from neeco.ingest.readers.names import BASE, CAMERA
 from neeco.ingest.readers.sections import JointColumns, NamedJointColumns, PoseColumns
 
 ARM, JAW, LEFT = "/PSM1/measured_cp", "/PSM1/jaw/measured_js", "/stereo/left/image_raw"

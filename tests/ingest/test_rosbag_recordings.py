@@ -21,10 +21,10 @@ from neeco.cli import main
 from neeco.ingest.cameras.still_scene import read_right_camera
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.readers import _bagfile, read_table
-from neeco.ingest.readers.columns import CAMERA, VIDEO_CLOCK
 from neeco.ingest.readers.logs import read_pose_log, read_reading_log
+from neeco.ingest.readers.names import CAMERA, VIDEO_CLOCK
 from neeco.ingest.readers.sections import JointColumns, PoseColumns
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.recording.template import write_template
 from neeco.ingest.timing.reading import read_episodes
 

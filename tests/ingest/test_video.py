@@ -12,7 +12,7 @@ from neeco.base.errors import NeecoError
 from neeco.ingest.frames.images import read_lens
 from neeco.ingest.readers import video
 from neeco.ingest.readers.video import open_images, open_video
-from neeco.ingest.recording.file import read_recording
+from neeco.ingest.recording.model import read_recording
 from neeco.ingest.timing.reading import read_episodes
 
 pytest.importorskip("av")

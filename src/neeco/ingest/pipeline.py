@@ -37,14 +37,13 @@ from neeco.capture.writer import write_capture
 from neeco.ingest.cameras.still_scene import RightCamera
 from neeco.ingest.frames.images import DropReason, StageProgress, choose_images
 from neeco.ingest.posing.posed_capture import prepare
-from neeco.ingest.recording.compatibility import separate
 from neeco.ingest.recording.model import Recording, Splits
 from neeco.ingest.registration.clocks import note_frame_rates
 from neeco.ingest.result import IngestResult
 from neeco.ingest.shaft.from_video import NOT_VISIBLE
 from neeco.ingest.staging import staged
 from neeco.ingest.timing.episodes import Episodes, States
-from neeco.ingest.timing.reading import read_episodes
+from neeco.ingest.timing.reading import read_episodes, separate
 from neeco.ingest.world import World, find_moving_world, find_still_world, is_still
 
 

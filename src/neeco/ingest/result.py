@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -223,9 +223,14 @@ class _Evidence:
         return cls(_lower(sentence).rstrip("."), 2 if severe else 1, sentence)
 
     @classmethod
-    def measured(cls, fact: str, value: float, limit: float, warning: str) -> _Evidence:
-        """A measured value that should stay below a limit."""
-        return cls(fact, 0 if value <= limit else 1 if value <= LIMITS.severe * limit else 2, warning)
+    def measured(
+        cls, fact: str, value: float, limit: float, warning: str = "", *, usual: str = "", severe: float = LIMITS.severe
+    ) -> _Evidence:
+        """A measured value that should stay below a limit, and is unsuitable beyond `severe` times that. warning: the
+        fact, with `only`, where it is left out."""
+        level = 0 if value <= limit else 1 if severe == np.inf or value <= severe * limit else 2
+        warning = warning or f"{fact[0].upper()}{fact[1:]} only."
+        return cls(f"{fact} (usual: {usual or f'{limit:g}'} or less)", level, warning)
 
 
 def rms(values: np.ndarray) -> float:
@@ -288,53 +293,44 @@ def _measured(result: IngestResult, capture: Capture) -> list[_Evidence]:
     registration = result.registration
     if registration is not None:
         position = rms(registration.position_residual)
-        says = f"cameras and laparoscope tracker agree to {position:.2f} mm rms (usual: {LIMITS.position_mm:g} or less)"
+        agree = f"cameras and laparoscope tracker agree to {position:.2f} mm rms"
         warning = f"Cameras and laparoscope tracker disagree by {position:.2f} mm rms."
-        evidence.append(_Evidence.measured(says, position, LIMITS.position_mm, warning))
+        evidence.append(_Evidence.measured(agree, position, LIMITS.position_mm, warning))
     if (pixels := result.reprojection_px) is not None:
-        says = f"tissue points are reprojected to {pixels:.2f} px (usual: {LIMITS.reprojection_px:g} or less)"
+        fact = f"tissue points are reprojected to {pixels:.2f} px"
         warning = f"Tissue points are off by {pixels:.2f} px on average in the images they were found in."
-        evidence.append(_Evidence.measured(says, pixels, LIMITS.reprojection_px, warning))
+        evidence.append(_Evidence.measured(fact, pixels, LIMITS.reprojection_px, warning))
     if registration is not None:
         rotation = float(np.degrees(rms(registration.rotation_residual)))
-        says = f"cameras and laparoscope tracker agree to {rotation:.2f}° rms (usual: {LIMITS.rotation_deg:g} or less)"
+        agree = f"cameras and laparoscope tracker agree to {rotation:.2f}° rms"
         warning = f"Cameras and laparoscope tracker disagree by {rotation:.2f}° rms."
-        evidence.append(_Evidence.measured(says, rotation, LIMITS.rotation_deg, warning))
-        says = f"lengths are known to {registration.scale_sd:.1%} (usual: {LIMITS.scale:.1%} or less)"
+        evidence.append(_Evidence.measured(agree, rotation, LIMITS.rotation_deg, warning))
+        fact, usual = f"lengths are known to {registration.scale_sd:.1%}", f"{LIMITS.scale:.1%}"
         warning = f"Lengths are known to {registration.scale_sd:.1%} only: the scope travelled too little."
-        evidence.append(_Evidence.measured(says, registration.scale_sd, LIMITS.scale, warning))
-        evidence += _placed(registration, capture, result.bases)
+        evidence.append(_Evidence.measured(fact, registration.scale_sd, LIMITS.scale, warning, usual=usual))
+        # the accuracy of the cameras' positions in the tracker's frame at instruments, except those with estimated
+        # bases. Residuals do not show it: if a scope hardly rotates, they are small but extrapolate badly
+        places = [
+            state.pose[:3, 3].numpy()
+            for frame in capture.frames
+            for name, state in frame.state.instruments.items()
+            if name not in result.bases
+        ]
+        sds = registration.placement_sd(np.stack(places)) if places else ()
+        for sd, unit, limit in zip(sds, (" mm", "°"), (HAND_EYE.placed_mm, HAND_EYE.placed_deg), strict=False):
+            fact = f"the place of instruments in the images is known to ±{sd:.1f}{unit}"
+            warning = f"{fact[0].upper()}{fact[1:]} only (hand-eye calibration): record more turns of the scope."
+            evidence.append(_Evidence.measured(fact, sd, limit, warning, severe=np.inf))
     for name, clock in result.clocks.items():
         moved = clock_cost_mm(name, clock.sd, capture)
         if moved is not None:
             sentence = f"Clock {name} is known to ±{clock.sd * 1000:.0f} ms, up to {moved:.1f} mm of instrument motion."
-            fact = f"{_lower(sentence).rstrip('.')} (usual: {LIMITS.clock_mm:g} or less)"
-            evidence.append(_Evidence.measured(fact, moved, LIMITS.clock_mm, sentence))
+            evidence.append(_Evidence.measured(_lower(sentence).rstrip("."), moved, LIMITS.clock_mm, sentence))
     train = len(capture.split("train"))
     fact = f"{train} frames to train on (usual: {PLAUSIBLE.few_train_frames} or more)"
     few = train < PLAUSIBLE.few_train_frames
     evidence.append(_Evidence(fact, 2 if few else 0, f"Only {train} frames are left to train on."))
     evidence.append(_Evidence(f"{result.points:,} tissue points (usual: {LIMITS.min_points} or more)", 0))
-    return evidence
-
-
-def _placed(registration: Registration, capture: Capture, found_in_images: Collection[str]) -> list[_Evidence]:
-    """Return the accuracy of the cameras' positions in the tracker's frame at instruments, except those with estimated
-    bases. Residuals do not show it: if a scope hardly rotates, they are small but extrapolate badly."""
-    places = [
-        state.pose[:3, 3].numpy()
-        for frame in capture.frames
-        for name, state in frame.state.instruments.items()
-        if name not in found_in_images
-    ]
-    if not places:
-        return []
-    sds = registration.placement_sd(np.stack(places))
-    evidence = []
-    for sd, unit, limit in zip(sds, (" mm", "°"), (HAND_EYE.placed_mm, HAND_EYE.placed_deg), strict=True):
-        fact = f"the place of instruments in the images is known to ±{sd:.1f}{unit}"
-        warning = f"{fact[0].upper()}{fact[1:]} only (hand-eye calibration): record more turns of the scope."
-        evidence.append(_Evidence(f"{fact} (usual: {limit:g} or less)", 0 if sd <= limit else 1, warning))
     return evidence
 
 
@@ -368,9 +364,7 @@ def _of_base(name: str, base: BaseRegistration, *, linked: bool) -> list[_Eviden
     for quantity, unit, limit, sds in measured:
         worst = float(np.max(sds))
         size = f"±{worst:.1f} {unit}" if np.isfinite(worst) else f"no {unit}"
-        fact = f"{quantity} is known to {size} (usual: {limit:g} or less)"
-        warning = f"{quantity[0].upper()}{quantity[1:]} is known to {size} only."
-        evidence.append(_Evidence(fact, 0 if worst <= limit else 1, warning))
+        evidence.append(_Evidence.measured(f"{quantity} is known to {size}", worst, limit, severe=np.inf))
     return evidence
 
 

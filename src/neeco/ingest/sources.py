@@ -13,10 +13,9 @@ from neeco.base.files import write_text
 from neeco.base.settings import Fault
 from neeco.ingest.cameras.still_scene import video_stands_still
 from neeco.ingest.readers import format_of, read_table
-from neeco.ingest.readers.columns import recognise_time
+from neeco.ingest.readers.names import recognise_time
 from neeco.ingest.readers.video import VIDEOS
-from neeco.ingest.recording.file import read_recording, recording_of
-from neeco.ingest.recording.model import MIN_FRAMES, Recording
+from neeco.ingest.recording.model import MIN_FRAMES, Recording, read_recording, recording_of
 from neeco.ingest.recording.template import open_questions, write_template
 from neeco.ingest.request import IngestRequest
 

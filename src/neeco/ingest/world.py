@@ -22,22 +22,15 @@ from neeco.ingest.cameras.still_scene import (
     read_right_camera,
     same_place,
     stands_still,
-    still_cameras,
 )
 from neeco.ingest.foreground.masks import ResidualFlow, find_background, moving_masks, passing_masks
 from neeco.ingest.foreground.rough_shape import PosesAt, RoughShape, best_lag, carve_shapes, observations_on
-from neeco.ingest.frames.images import ChosenImages, SfmResult, StageProgress, Views, undistort_images
-from neeco.ingest.readers.columns import CAMERA
+from neeco.ingest.frames.images import ChosenImages, SfmResult, StageProgress, Views, write_images
+from neeco.ingest.readers.names import CAMERA
 from neeco.ingest.recording.model import MIN_FRAMES, MOVING, STILL
 from neeco.ingest.registration.base import BaseRegistration
 from neeco.ingest.registration.clocks import find_instrument_clocks, register
-from neeco.ingest.registration.find_bases import (
-    check_reference_frames,
-    correct_placement,
-    find_bases,
-    follow_cameras,
-    require_no_base,
-)
+from neeco.ingest.registration.find_bases import check_reference_frames, correct_placement, find_bases, follow_cameras
 from neeco.ingest.registration.hand_eye import Registration
 from neeco.ingest.shaft.from_video import FoundShaft, find_in_video, on_masks
 from neeco.ingest.timing.episodes import Episodes, States
@@ -46,11 +39,13 @@ from neeco.ingest.timing.reading import require_lens
 
 @dataclass(frozen=True, kw_only=True)
 class WorldSettings:
-    """Thresholds between episodes and cameras of a scope that stands still."""
+    """Thresholds between episodes and cameras of a scope that stands still, and of points of tissue."""
 
     same_place: float = 0.4  # minimum share of features of one episode's background in place in another's
     mostly_similar: float = 0.7  # share of these features, below which the change is noted
     same_moment_s: float = 1e-3  # maximum time between two cameras' images of one moment
+    min_point_images: int = 4  # minimum number of images that observe a point that is tissue
+    max_point_error_px: float = 1.2  # maximum misfit of such a point
 
 
 WORLD = WorldSettings()
@@ -156,7 +151,8 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
             f"intrinsics were estimated by structure from motion (focal length {sfm.lens.fl_x:.1f} px, radial "
             f"distortion {sfm.lens.distortion[0]:.3f}); a calibration is better"
         )
-        images = undistort_images(images, sfm.lens, data.video, progress)
+        images = replace(images, lens=sfm.lens)
+        write_images(images, data.video, progress)
 
     views = images.views(data, sfm.indices, sfm.world_from_camera)
     flow = ResidualFlow(sfm, views)
@@ -173,7 +169,11 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
     masks = None
     on_instruments = np.zeros(len(sfm.observations), dtype=bool)
     if registration is None:
-        require_no_base(data)
+        for item in (item for item in data.recording.instruments if item.base is not None):
+            raise NeecoError(
+                f"{data.recording.path}: world_from_base: where the base of {item.name} stands can be found only for a "
+                "scope whose own poses are recorded (laparoscope) and move enough to register it; leave it out"
+            )
     else:
         before, first_points = _in_mm(sfm, views, registration, settings.scene_distance_mm)
         data, bases = find_bases(data, before, foreground, progress, registration)
@@ -207,7 +207,7 @@ def find_moving_world(data: Episodes, images: ChosenImages, folder: Path, progre
         rows = np.flatnonzero(np.isin(views.frames, list(evidence)))
         moved = np.stack([evidence[frame] for frame in views.frames[rows].tolist()])
         compare_motion(data, tracked_in(data, data.parts[0].poses, placed, rows), shapes, moved, flow.pinhole)
-    reliable = sfm.reliable_points()
+    reliable = (sfm.lengths >= WORLD.min_point_images) & (sfm.errors < WORLD.max_point_error_px)
     if not reliable.any():
         reliable = np.ones(len(points), dtype=bool)
         data.notes.add("no tissue point is observed by several frames and fits well: all of them are kept")
@@ -300,7 +300,17 @@ def find_still_world(data: Episodes, images: ChosenImages, folder: Path, progres
     _check_one_place(data, images, progress)
     right = _right_camera(data, images, folder, progress)
     count = len(images.selected)
-    cameras = still_cameras(count)
+    cameras = SfmResult(  # a reconstruction without points: all cameras in one place
+        indices=np.arange(count),
+        world_from_camera=np.tile(np.eye(4), (count, 1, 1)),
+        points=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
+        errors=np.zeros(0),
+        lengths=np.zeros(0),
+        observations=np.zeros((0, 5)),
+        lens=None,
+        reprojection_px=0.0,
+    )
     views = images.views(data, cameras.indices, cameras.world_from_camera)
 
     def moving(rows: np.ndarray) -> np.ndarray:

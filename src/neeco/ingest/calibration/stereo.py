@@ -1,6 +1,6 @@
 """Calibrations of stereo scopes: both lenses, and the right camera's pose relative to the left one.
 
-Every dialect becomes a document in the keys that `camera_fields.py` knows."""
+Every dialect becomes a document in the keys that `lens.py` knows."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from neeco.capture.documents import printable
 from neeco.geometry.camera import COEFFICIENT_COUNTS
 from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid, rotation_error
-from neeco.ingest.calibration.camera_fields import (
+from neeco.ingest.calibration.lens import (
     CameraNumbers,
     cameras_in,
     first_of,
+    lens_of,
     matrix_numbers,
     read_calibration,
     word,
 )
-from neeco.ingest.calibration.lens import lens_of
 
 EXPECTED = (
     "OpenCV's stereo YAML (M1, D1, M2, D2, R, T), a camchain of Kalibr, settings of ORB-SLAM, a StereoCalibration.ini, "

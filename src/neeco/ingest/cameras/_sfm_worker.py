@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +114,7 @@ def map_keyframes(job: dict[str, Any], database: Path) -> None:
             camera.has_prior_focal_length = True
             opened.update_camera(camera)
     say("mapping", done=0, total=len(job["names"]))
-    models = global_mapping(job, database, folder) if job["global"] else incremental_mapping(job, database, folder)
+    models = (global_mapping if job["global_mapping"] else incremental_mapping)(job, database, folder)
     stats: dict[str, Any] = {"models": [], "focal": 0.0, "distortion": 0.0, "points": 0, "error": 0.0, "parallax": 0.0}
     if models:
         model = max(models.values(), key=lambda model: model.num_reg_images())
@@ -140,19 +141,13 @@ def incremental_mapping(
     options.image_names = job["keyframes"]
     if job["focal"] and not job["free_lens"]:
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    count = 2
-
-    def on_image() -> None:
-        nonlocal count
-        count += 1
-        say("mapping", done=count, total=len(job["names"]))
-
+    images = count(3)  # the first two make the initial pair
     models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
         str(database),
         job["images"],
         str(folder),
         options=options,
-        next_image_callback=on_image,
+        next_image_callback=lambda: say("mapping", done=next(images), total=len(job["names"])),
         input_path=str(start) if start else "",
     )
     return models
@@ -201,19 +196,6 @@ def parallax(model: pycolmap.Reconstruction) -> float:
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
         angles.append(np.degrees(np.arccos(np.clip(rays @ rays[0], -1, 1).min())))
     return float(np.median(angles)) if angles else 0.0
-
-
-def save_matches(job: dict[str, Any], database: Path, path: Path) -> None:
-    """Matched features of pairs of images: rows of pair, x, y, x', y' px."""
-    opened = pycolmap.Database.open(str(database))
-    number = {image.name: image.image_id for image in opened.read_all_images()}
-    rows = []
-    for pair, (a, b) in enumerate(job["pairs"]):
-        matches = opened.read_matches(number[a], number[b])
-        first, second = opened.read_keypoints(number[a]), opened.read_keypoints(number[b])
-        places = np.hstack([first[matches[:, 0], :2], second[matches[:, 1], :2]])
-        rows.append(np.column_stack([np.full(len(places), pair), places]))
-    np.savez(path, matches=np.concatenate(rows) if rows else np.zeros((0, 5)))
 
 
 def register_others(job: dict[str, Any], database: Path, model: pycolmap.Reconstruction) -> None:
@@ -300,7 +282,15 @@ def main(job_file: str) -> int:
         case "map":
             map_keyframes(job, database)
         case "matches":
-            save_matches(job, database, work / "matches.npz")
+            opened = pycolmap.Database.open(str(database))
+            ids = {image.name: image.image_id for image in opened.read_all_images()}
+            rows = [np.zeros((0, 5))]  # pair, x, y, x', y' px of matched features
+            for pair, (a, b) in enumerate(job["pairs"]):
+                matches = opened.read_matches(ids[a], ids[b])
+                first, second = opened.read_keypoints(ids[a]), opened.read_keypoints(ids[b])
+                places = np.hstack([first[matches[:, 0], :2], second[matches[:, 1], :2]])
+                rows.append(np.column_stack([np.full(len(places), pair), places]))
+            np.savez(work / "matches.npz", matches=np.concatenate(rows))
         case "register":
             model = pycolmap.Reconstruction(job["model"])
             register_others(job, database, model)
@@ -322,14 +312,10 @@ def main(job_file: str) -> int:
 
 def end_with_parent() -> None:
     """End this process when its parent has ended in any way, which closes our stdin."""
-
-    def wait() -> None:
-        os.read(sys.stdin.fileno(), 1)
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)
 
 
 if __name__ == "__main__":
-    end_with_parent()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     raise SystemExit(main(sys.argv[1]))

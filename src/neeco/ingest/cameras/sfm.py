@@ -333,11 +333,7 @@ class StructureFromMotion:
         """The worker's job for a strategy, without its task."""
         tried = [attempt.strategy for attempt in self.attempts]
         return self.job | {
-            "focal": strategy.focal,
-            "free_lens": strategy.free_lens,
-            "first_angle": strategy.first_angle,
-            "several_models": strategy.several_models,
-            "global": strategy.global_mapping,
+            **vars(strategy),
             "database": str(self.work / ("dense.db" if strategy.dense else "database.db")),
             "model": str(self.work / f"attempt{[*tried, strategy].index(strategy)}"),
             "keyframes": [self.names[index] for index in self.keys],

@@ -21,10 +21,10 @@ from neeco.capture.images import encoded_rgb, open_image, write_labels
 from neeco.capture.model import PointCloud, evenly_spaced
 from neeco.geometry.lens import Lens
 from neeco.ingest.calibration.lens import BORDERS, find_border, visible_mask
-from neeco.ingest.cameras.tissue_surface import TissueSurface, epipolar_error, surface_behind, surface_from_stereo
-from neeco.ingest.foreground.masks import FLOW, Background, find_background, moving_masks
+from neeco.ingest.cameras.tissue_surface import epipolar_error, surface_behind, surface_from_stereo
+from neeco.ingest.foreground.masks import FLOW, find_background, moving_masks
 from neeco.ingest.foreground.rough_shape import RoughShape, project_mask
-from neeco.ingest.frames.images import SfmResult, StageProgress, Views, reduced
+from neeco.ingest.frames.images import StageProgress, Views, reduced
 from neeco.ingest.readers import VideoSource
 from neeco.ingest.recording.model import IngestSettings, Recording, VideoFile
 from neeco.ingest.timing.episodes import Notes
@@ -188,21 +188,6 @@ def _pairs(right: np.ndarray, left: np.ndarray, selected: np.ndarray, one_clock:
     return pairs
 
 
-def still_cameras(count: int) -> SfmResult:
-    """Return a reconstruction without points: all `count` cameras in one place."""
-    return SfmResult(
-        indices=np.arange(count),
-        world_from_camera=np.tile(np.eye(4), (count, 1, 1)),
-        points=np.zeros((0, 3)),
-        colors=np.zeros((0, 3), np.uint8),
-        errors=np.zeros(0),
-        lengths=np.zeros(0),
-        observations=np.zeros((0, 5)),
-        lens=None,
-        reprojection_px=0.0,
-    )
-
-
 def look_behind(
     notes: Notes,
     views: Views,
@@ -238,7 +223,21 @@ def look_behind(
         rows = sorted(right.names)
         hidden = hidden_from(right.pinhole, right.world_from_camera, rows)
         other = find_background(lambda place: right.load(rows[place]), len(rows), hidden)
-        surface = _by_stereo(notes, background, other, views, right)
+        if background.colors.shape == other.colors.shape:
+            left_colors, lenses = background.colors, (pinhole, right.pinhole)
+            right_from_left = np.linalg.inv(right.world_from_camera)
+            error = epipolar_error(left_colors, other.colors, lenses, right_from_left)
+            limit = STILL_SCOPE.max_epipolar * left_colors.shape[1]
+            if error is not None and error > limit:
+                doubt = (
+                    f"what the second camera shows lies {error:.1f} px off where its calibration puts it (median; up "
+                    f"to {limit:.1f} px is usual): check that the calibration is this scope's and of these images"
+                )
+                notes.contradict("stereo", doubt, severe=True)
+            shown = background.seen > 0 if visible is None else (background.seen > 0) & visible
+            size = views.reduced_pinhole.size
+            assert size is not None
+            surface = surface_from_stereo(left_colors, other.colors, lenses, right_from_left, shown, size)
         if surface is None:
             notes.add("the stereo partner's images match too little for depth; check its calibration")
     if surface is None:
@@ -248,28 +247,6 @@ def look_behind(
         surface = surface_behind(swept, small, max(deepest, default=None), settings.scene_distance_mm)
     points, colors = surface.points(background.colors, pinhole, visible)
     return PointCloud(points.astype(np.float32), (colors / 255).astype(np.float32)), surface.how
-
-
-def _by_stereo(
-    notes: Notes, left: Background, right: Background, views: Views, other: RightCamera
-) -> TissueSurface | None:
-    """Return the surface from two backgrounds; None with too few matches. Note doubts about the calibration."""
-    visible = left.seen > 0 if views.visible is None else (left.seen > 0) & views.visible
-    if right.colors.shape != left.colors.shape:
-        return None
-    size = views.reduced_pinhole.size
-    assert size is not None
-    right_from_left = np.linalg.inv(other.world_from_camera)
-    lenses = (views.pinhole, other.pinhole)
-    error = epipolar_error(left.colors, right.colors, lenses, right_from_left)
-    limit = STILL_SCOPE.max_epipolar * left.colors.shape[1]
-    if error is not None and error > limit:
-        doubt = (
-            f"what the second camera shows lies {error:.1f} px off where its calibration puts it (median; up to "
-            f"{limit:.1f} px is usual): check that the calibration is this scope's and of these images"
-        )
-        notes.contradict("stereo", doubt, severe=True)
-    return surface_from_stereo(left.colors, right.colors, lenses, right_from_left, visible, size)
 
 
 def moving_shares(views: Views, rows: np.ndarray) -> np.ndarray:

@@ -99,17 +99,13 @@ class Background:
         even = (image / exposure(image, self.colors)).astype(np.float32)
         low, high = cv2.erode(self.colors, NEIGHBOURS), cv2.dilate(self.colors, NEIGHBOURS)
         off = np.maximum(even - high, low - even).max(-1)
-        return (off > np.maximum(BACKGROUND.noise_floor, BACKGROUND.max_deviations * self.spread)) & ~self._shadows(
-            even
-        )
-
-    def _shadows(self, even: np.ndarray) -> np.ndarray:
-        """Pixels bool [H, W] at which all colours are darker by one share, where the background has colour."""
+        # a shadow: all colours are darker by one share, where the background has colour
         shares = even / np.maximum(self.colors, 1)
         share = even.sum(-1) / np.maximum(self.colors.sum(-1), 1)
         saturation = 1 - self.colors.min(-1) / np.maximum(self.colors.max(-1), 1)
-        similar = (np.ptp(shares, axis=-1) < 2 * BACKGROUND.shadow_tint) & (saturation > BACKGROUND.min_saturation)
-        return np.asarray(similar & (share > BACKGROUND.shadow_share[0]) & (share < BACKGROUND.shadow_share[1]))
+        shadow = (np.ptp(shares, axis=-1) < 2 * BACKGROUND.shadow_tint) & (saturation > BACKGROUND.min_saturation)
+        shadow &= (share > BACKGROUND.shadow_share[0]) & (share < BACKGROUND.shadow_share[1])
+        return (off > np.maximum(BACKGROUND.noise_floor, BACKGROUND.max_deviations * self.spread)) & ~shadow
 
 
 def find_background(

@@ -157,30 +157,23 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
         sign = -1.0 if np.median(along[touching]) > 0 else 1.0
         direction, along = sign * vectors[:, 1], sign * along
         points[row], directions[row] = center, direction
-        entries[row], courses[row] = _entering_line(places, border, center, direction)
         end = along > along.max() - 2.0
         if not touching[end].any():
             tips[row] = places[end].mean(0)
-    return ShaftLines(points, directions, tips, entries, courses)
-
-
-def _entering_line(
-    places: np.ndarray, border: np.ndarray, point: np.ndarray, direction: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return a point [2] on the middle line of a piece's pixels [N, 2], and its unit direction, by the share of it
-    where it enters: what lies beyond may be a wrist that bends, or jaws. border: bool [h, w]; point and direction: of
-    the whole piece, from there."""
-    for _ in range(SHAFT_LINES.line_rounds):
-        slices, middles, _ = slices_across(places, border, point, direction)
-        if len(slices):
-            middles = middles[slices <= slices[0] + SHAFT_LINES.entering * (slices[-1] - slices[0])]
-        if len(middles) < SHAFT_LINES.min_slices:
-            break
-        weights = np.ones(len(middles))
+        # the middle line of the share of the piece where it enters: what lies beyond may be a wrist that bends, or jaws
+        point = center
         for _ in range(SHAFT_LINES.line_rounds):
-            point = np.average(middles, 0, weights)
-            off = middles - point
-            vector = np.linalg.eigh((off * weights[:, None]).T @ off)[1][:, 1]
-            direction = vector if vector @ direction >= 0 else -vector
-            weights = 1 / (1 + np.square(off @ (-direction[1], direction[0])))
-    return point, direction
+            slices, middles, _ = slices_across(places, border, point, direction)
+            if len(slices):
+                middles = middles[slices <= slices[0] + SHAFT_LINES.entering * (slices[-1] - slices[0])]
+            if len(middles) < SHAFT_LINES.min_slices:
+                break
+            weights = np.ones(len(middles))
+            for _ in range(SHAFT_LINES.line_rounds):
+                point = np.average(middles, 0, weights)
+                off = middles - point
+                vector = np.linalg.eigh((off * weights[:, None]).T @ off)[1][:, 1]
+                direction = vector if vector @ direction >= 0 else -vector
+                weights = 1 / (1 + np.square(off @ (-direction[1], direction[0])))
+        entries[row], courses[row] = point, direction
+    return ShaftLines(points, directions, tips, entries, courses)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -42,10 +42,6 @@ class SfmResult:
     lens: Lens | None  # estimated; None where it was given
     reprojection_px: float
 
-    def reliable_points(self) -> np.ndarray:
-        """Return [P] bool: observed by enough images and well fitted."""
-        return (self.lengths >= SETTINGS.min_point_images) & (self.errors < SETTINGS.max_point_error_px)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Views:
@@ -64,11 +60,6 @@ class Views:
     def reduced_pinhole(self) -> Lens:
         """The lens of the images `reduced`."""
         return Lens.of(self.pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
-
-    @property
-    def reduced_border(self) -> np.ndarray | None:
-        """Pixels of the images `reduced`, bool [h, w], at least in part beyond the field of view."""
-        return None if self.visible is None else reduced(self.visible.astype(np.uint8) * 255) < 255
 
 
 def reduced(image: np.ndarray) -> np.ndarray:
@@ -93,8 +84,6 @@ class ChoiceSettings:
     thumbnail_px: int = 64  # width of thumbnails
     min_repeated: int = 5  # minimum number of repeated pictures for a note where no state contradicts them
     aspect_tolerance: float = 0.02  # tolerance of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
-    min_point_images: int = 4  # minimum number of images that observe a point that is tissue
-    max_point_error_px: float = 1.2  # maximum misfit of such a point
 
 
 SETTINGS = ChoiceSettings()
@@ -334,18 +323,12 @@ def choose_images(data: Episodes, folder: Path, progress: StageProgress) -> Chos
     images = ChosenImages(
         folder=folder, size=size, lens=lens, selected=selected, dropped=dropped, border=border, overlay=overlay
     )
-    _write(images, data.video, progress)
+    write_images(images, data.video, progress)
     return images
 
 
-def undistort_images(images: ChosenImages, lens: Lens, video: VideoSource, progress: StageProgress) -> ChosenImages:
-    """Rewrite images and masks, undistorted by an estimated lens."""
-    images = replace(images, lens=lens)
-    _write(images, video, progress)
-    return images
-
-
-def _write(images: ChosenImages, video: VideoSource, progress: StageProgress) -> None:
+def write_images(images: ChosenImages, video: VideoSource, progress: StageProgress) -> None:
+    """Write images and masks, undistorted where the lens is known."""
     folder, names = images.folder / "raw", images.names
     folder.mkdir(exist_ok=True)
     for done, (name, (_, image)) in enumerate(zip(names, video.read(images.selected.tolist()), strict=True), 1):

@@ -189,22 +189,6 @@ def unrolled_textures(shafts: Shafts, load: Load) -> tuple[np.ndarray, np.ndarra
     return textures, visible
 
 
-def _correlations(textures: np.ndarray, rows: slice) -> np.ndarray:
-    """Return the normalised cross-correlation [R, F, 2 M + 1] of some textures with all of [F, A, B, C]; at [i, j, M +
-    q] for a shift by q columns, and the best shift within `max_rows` rows."""
-    height, width = textures.shape[1:3]
-    chosen = textures[rows]
-    scores = np.full((len(chosen), len(textures), 2 * SETTINGS.max_columns + 1), -1.0, np.float32)
-    for down in range(-SETTINGS.max_rows, SETTINGS.max_rows + 1, SETTINGS.row_step):
-        upper, lower = slice(max(-down, 0), height - max(down, 0)), slice(max(down, 0), height - max(-down, 0))
-        for shift in range(-SETTINGS.max_columns, SETTINGS.max_columns + 1):
-            left, right = slice(max(-shift, 0), width - max(shift, 0)), slice(max(shift, 0), width - max(-shift, 0))
-            correlation = _normalised(chosen[:, upper, left]) @ _normalised(textures[:, lower, right]).T
-            best = scores[:, :, SETTINGS.max_columns + shift]
-            np.maximum(best, correlation, out=best)
-    return scores
-
-
 def _normalised(textures: np.ndarray) -> np.ndarray:
     flat = textures.reshape(len(textures), -1)
     flat = flat - flat.mean(1, keepdims=True)
@@ -214,9 +198,19 @@ def _normalised(textures: np.ndarray) -> np.ndarray:
 def roll_pairs(textures: np.ndarray, visible: np.ndarray) -> RollPairs:
     """Compare frames close in time, and every frame with the most similar distant ones; only `visible` ones."""
     blocks = []
+    height, width = textures.shape[1:3]
     for start in range(0, len(textures), SETTINGS.block):
-        # pairs are counted once: the second comes later
-        scores = _correlations(textures[start:], slice(0, SETTINGS.block))
+        # the normalised cross-correlation [R, F, 2 M + 1] with this frame and those after it, as pairs are counted
+        # once; at [i, j, M + q] for a shift by q columns, and the best shift within `max_rows` rows
+        others, some = textures[start:], textures[start : start + SETTINGS.block]
+        scores = np.full((len(some), len(others), 2 * SETTINGS.max_columns + 1), -1.0, np.float32)
+        for down in range(-SETTINGS.max_rows, SETTINGS.max_rows + 1, SETTINGS.row_step):
+            upper, lower = slice(max(-down, 0), height - max(down, 0)), slice(max(down, 0), height - max(-down, 0))
+            for shift in range(-SETTINGS.max_columns, SETTINGS.max_columns + 1):
+                left, right = slice(max(-shift, 0), width - max(shift, 0)), slice(max(shift, 0), width - max(-shift, 0))
+                correlation = _normalised(some[:, upper, left]) @ _normalised(others[:, lower, right]).T
+                best = scores[:, :, SETTINGS.max_columns + shift]
+                np.maximum(best, correlation, out=best)
         best, later = scores.max(-1), visible[start:]
         apart = np.arange(best.shape[1]) - np.arange(best.shape[0])[:, None]
         both = later & later[: len(best), None]

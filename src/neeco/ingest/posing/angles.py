@@ -66,12 +66,6 @@ class AnglePosterior:
         """Standard deviations [F] degrees, at most those of an unknown angle."""
         return np.minimum(np.degrees(self.deviations), UNKNOWN_DEG)
 
-    def with_answer(self, frame: int) -> AnglePosterior:
-        """Return the posterior with one more hand-posed frame; the values stay."""
-        column = self.covariance[:, frame]
-        gained = np.outer(column, column) / (column[frame] + np.radians(SETTINGS.hand_sd_deg) ** 2)
-        return AnglePosterior(self.values, self.covariance - gained)
-
 
 def solve_rolls(
     pairs: RollPairs, carried: np.ndarray, times: np.ndarray, frames: np.ndarray, angles: np.ndarray
@@ -104,10 +98,22 @@ def _chained(
     rolls = np.linalg.solve(precision, pull)
     noise_precision = np.eye(len(times)) * np.radians(SETTINGS.texture_sd_deg) ** -2
     texture_rolls, information, share = rolls, precision, 1.0
+    deviation = np.radians(SETTINGS.pair_sd_deg + SETTINGS.uncorrelated_sd_deg * (1 - pairs.scores))
+    right = (pairs.scores > 0) / (1 + np.exp(-(pairs.scores - SETTINGS.even_score) / SETTINGS.score_scale))
+    # of several hypotheses one at most is right
+    right = right / np.maximum(right.sum(1, keepdims=True), 1e-9) * right.max(1, keepdims=True)
+    wrong = (1 - right.sum(1, keepdims=True)) / np.sqrt(2 * np.pi)
     for sharpness in np.linspace(0.0, 1.6, SETTINGS.n_rounds).clip(max=1.0):
         widened = SETTINGS.first_widening + (1 - SETTINGS.first_widening) * sharpness
-        weights, turns = _likely(pairs, texture_rolls, view, share, widened)
         first, second = pairs.first, pairs.second
+        # weight [P] of each pair, 1/rad^2, and the turn [P] that it then stands for
+        hypotheses = pairs.turns / share - (view[second] - view[first])[:, None]
+        apart = (texture_rolls[second] - texture_rolls[first])[:, None] - hypotheses
+        hypotheses = hypotheses + 2 * np.pi * np.round(apart / (2 * np.pi))
+        fits = right * np.exp(-0.5 * (_wrapped(apart) / (deviation * widened)) ** 2) / (deviation * widened)
+        each = SETTINGS.pair_weight * fits / (fits.sum(1, keepdims=True) + wrong) / deviation**2
+        weights = each.sum(1)
+        turns = (each * hypotheses).sum(1) / np.maximum(weights, 1e-12)
         between, toward = np.zeros((len(times), len(times))), np.zeros(len(times))  # normal equations of the pairs
         np.add.at(between, (first, first), weights)
         np.add.at(between, (second, second), weights)
@@ -182,22 +188,3 @@ def _correlation(times: np.ndarray, scale: float) -> np.ndarray:
 
 def _wrapped(angles: np.ndarray) -> np.ndarray:
     return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi)
-
-
-def _likely(
-    pairs: RollPairs, rolls: np.ndarray, view: np.ndarray, share: float, widened: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Weight [P] of each pair, 1/rad^2, and the turn [P] that it then stands for, given rolls less the view's part."""
-    measured = pairs.turns / share - (view[pairs.second] - view[pairs.first])[:, None]
-    apart = (rolls[pairs.second] - rolls[pairs.first])[:, None] - measured
-    turns = measured + 2 * np.pi * np.round(apart / (2 * np.pi))
-    apart = _wrapped(apart)
-    deviation = np.radians(SETTINGS.pair_sd_deg + SETTINGS.uncorrelated_sd_deg * (1 - pairs.scores))
-    right = (pairs.scores > 0) / (1 + np.exp(-(pairs.scores - SETTINGS.even_score) / SETTINGS.score_scale))
-    # of several hypotheses one at most is right
-    right = right / np.maximum(right.sum(1, keepdims=True), 1e-9) * right.max(1, keepdims=True)
-    fits = right * np.exp(-0.5 * (apart / (deviation * widened)) ** 2) / (deviation * widened)
-    wrong = (1 - right.sum(1, keepdims=True)) / np.sqrt(2 * np.pi)
-    weights = SETTINGS.pair_weight * fits / (fits.sum(1, keepdims=True) + wrong) / deviation**2
-    total = weights.sum(1)
-    return total, (weights * turns).sum(1) / np.maximum(total, 1e-12)

@@ -68,8 +68,7 @@ def _joints(node: Node) -> dict[str, float]:
     return {str(name): _degrees(Node(value, node.file, str(name))) for name, value in node.value.items()}
 
 
-def _remark(node: Node) -> str:
-    return str(node.value)  # YAML reads some as dates
+Remark = Annotated[str, lambda node: str(node.value)]  # YAML reads some as dates
 
 
 @dataclass(frozen=True)
@@ -80,8 +79,8 @@ class HandPose:
     instrument: Name
     roll_deg: Annotated[float, _degrees]
     joints_deg: Annotated[dict[str, float], _joints] = field(default_factory=dict)
-    when: Annotated[str, _remark] | None = None
-    who: Annotated[str, _remark] | None = None
+    when: Remark | None = None
+    who: Remark | None = None
 
     @property
     def degrees(self) -> dict[str, float]:
@@ -173,7 +172,10 @@ class SolvedPosing:
                     reason = "jaws at their narrowest"
             chosen.append(Suggestion(frame, reason))
             usable[frame] = False
-            solved = [some.with_answer(frame) for some in solved]
+            for number, some in enumerate(solved):  # with one more hand-posed frame; the values stay
+                column = some.covariance[:, frame]
+                gained = np.outer(column, column) / (column[frame] + np.radians(SETTINGS.hand_sd_deg) ** 2)
+                solved[number] = AnglePosterior(some.values, some.covariance - gained)
         return chosen
 
     def outliers(self) -> list[OutlierAnswer]:

@@ -3,7 +3,7 @@
 A format is a subclass of `RecordingFormat`; `format_of` chooses it by the file's name and content, and nothing else
 names it. Whatever holds several streams (a bag, an episode, a sequence of images with transforms) lists them, and
 gives each as what the rest of the program takes: poses and readings as a table, images with their times, a lens. What a
-table's columns mean is the same for all formats (`columns.py`, `logs.py`).
+table's columns mean is the same for all formats (`names.py`, `logs.py`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import importlib.util
 from abc import ABC
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from enum import StrEnum
 from functools import cache, lru_cache, wraps
 from pathlib import Path
@@ -24,7 +24,7 @@ from neeco.base.errors import NeecoError, install_hint, visible
 from neeco.base.registry import plugins
 from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
-from neeco.ingest.readers.frame_names import NamedFrame
+from neeco.ingest.readers.names import NamedFrame
 
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
 HUGE = 1e20
@@ -58,7 +58,7 @@ class Table:
 
     @property
     def frame(self) -> str | None:
-        """Frame of the poses, BASE or a camera's frame (`frame_names.CAMERA_FRAMES`); None if the file names none."""
+        """Frame of the poses, BASE or a camera's frame (`names.CAMERA_FRAMES`); None if the file names none."""
         return None if self.meaning is None else self.meaning.frame
 
     @property
@@ -110,25 +110,28 @@ class Stream:
     problem: str | None = None
 
 
+Images = Callable[[list[int]], Iterator[tuple[int, np.ndarray]]]
+
+
 @dataclass(frozen=True)
 class VideoSource:
     """Frames with their times. size: (width, height) px, as stored; notes: unreadable parts, as text; times [N]
-    s, increasing, of a video from its first frame; pixel_aspect: width of a stored pixel by its height."""
+    s, increasing, of a video from its first frame; pixel_aspect: width of a stored pixel by its height; own_fps: frame
+    rate stated by the file if it differs from the requested one; images: reader of some frames, given in increasing
+    order, as (index, uint8 [H, W, 3] RGB)."""
 
     path: Path
     size: tuple[int, int]
     notes: tuple[str, ...]
     times: np.ndarray
-    pixel_aspect: float = field(default=1.0, kw_only=True)
-
-    @property
-    def own_fps(self) -> float | None:
-        """Frame rate stated by the file if it differs from the requested one, else None."""
-        return None
+    _: KW_ONLY
+    images: Images
+    pixel_aspect: float = 1.0
+    own_fps: float | None = None
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield (index, uint8 [H, W, 3] RGB) of the requested frames, in increasing order. Raises NeecoError."""
-        raise NotImplementedError
+        return self.images(sorted({int(index) for index in indices}))
 
 
 class RecordingFormat(ABC):
@@ -236,11 +239,11 @@ def file_state(*files: Path) -> tuple[tuple[str, int, int], ...]:
         raise NeecoError(f"{error.filename}: cannot read: {error.strerror or error}; correct the path") from None
 
 
-def read_once(read: _Read) -> _Read:
-    """Cache a function's result per file, its first argument, until the file changes. Raises NeecoError if it does not
-    exist."""
+def read_once(read: _Read, files: Callable[[Path], Sequence[Path]] = lambda path: [path]) -> _Read:
+    """Cache a function's result per path, its first argument, until the path's `files` change. Raises NeecoError if
+    one does not exist."""
     cached = lru_cache(maxsize=4)(lambda state, *arguments: read(*arguments))
-    return cast(_Read, wraps(read)(lambda path, *arguments: cached(file_state(path), path, *arguments)))
+    return cast(_Read, wraps(read)(lambda path, *arguments: cached(file_state(*files(path)), path, *arguments)))
 
 
 def reason_of(error: BaseException) -> str:

@@ -12,10 +12,10 @@ import re
 import sys
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import KW_ONLY, dataclass, field
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from neeco.base.files import require_content, visible_entries
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.capture.images import FORMATS
-from neeco.ingest.readers import Kind, Stream, Table, VideoSource, one_line, rate_of
+from neeco.ingest.readers import Kind, Stream, Table, VideoSource, one_line, rate_of, read_once
 from neeco.ingest.readers.rows import restarts
 
 if sys.version_info >= (3, 14):
@@ -199,8 +199,19 @@ def open_bag(path: Path) -> Iterator[Bag]:
             reader.open()
             stack.callback(reader.close)
             sources = reader.storages if path.is_dir() else [reader]
-            for source in sources:
-                _limit_chunks(source)
+            for source in sources:  # an index states the unpacked size of MCAP's chunks
+                if isinstance(source, McapReader):
+                    if not source.chunks and source.metadata.message_count:
+                        raise ReaderError("its messages are not in chunks")
+                    for listed in source.chunks:
+                        _check_size(max(listed.uncompressed_size, listed.compressed_size), LIMITS.chunk_bytes)
+                elif isinstance(source, Ros1Reader):  # none does, so these are unpacked up to the limit
+                    names = {decompress: name for name, decompress in decompressors.items()}
+                    for place, chunk in source.chunks.items():
+                        _check_size(chunk.datasize, LIMITS.chunk_bytes)
+                        compression = names[chunk.decompressor]
+                        limited = partial(unpack, compression=compression, max_bytes=LIMITS.chunk_bytes)
+                        source.chunks[place] = chunk._replace(decompressor=limited)
         yield Bag(path, reader, sources)
 
 
@@ -214,24 +225,6 @@ def unpack(data: bytes, compression: str, max_bytes: int) -> bytes:
     if not decompressor.eof:
         raise ReaderError("a chunk of its messages is truncated")
     return unpacked
-
-
-def _limit_chunks(reader: Any) -> None:
-    """Make an open ROS 1 or MCAP reader reject chunks above the memory limit. Raises ReaderError.
-
-    An index states the unpacked size of MCAP's chunks; ROS 1 bags state none, so these are unpacked up to the limit.
-    """
-    if isinstance(reader, McapReader):
-        if not reader.chunks and reader.metadata.message_count:
-            raise ReaderError("its messages are not in chunks")
-        for listed in reader.chunks:
-            _check_size(max(listed.uncompressed_size, listed.compressed_size), LIMITS.chunk_bytes)
-    elif isinstance(reader, Ros1Reader):
-        names = {decompress: name for name, decompress in decompressors.items()}
-        for place, chunk in reader.chunks.items():
-            _check_size(chunk.datasize, LIMITS.chunk_bytes)
-            limited = partial(unpack, compression=names[chunk.decompressor], max_bytes=LIMITS.chunk_bytes)
-            reader.chunks[place] = chunk._replace(decompressor=limited)
 
 
 def _check_size(size: int, max_bytes: int) -> None:
@@ -290,7 +283,25 @@ class Samples:
         if message is None:
             raise _UnusableError("is damaged")
         if self.type in IMAGE:
-            encoding, size = _inspect(message)
+            if hasattr(message, "encoding"):
+                encoding, size = message.encoding, (message.width, message.height)
+                if encoding not in ENCODINGS:
+                    raise _UnusableError(f"has the unsupported encoding {printable(encoding, 24)}")
+                if message.step < size[0] * ENCODINGS[encoding][0] or len(message.data) < message.step * size[1]:
+                    raise _UnusableError("has fewer pixels than its size states")
+            else:
+                try:
+                    with Image.open(BytesIO(message.data), formats=FORMATS) as image:
+                        encoding, size, mode = str(image.format), image.size, image.mode
+                        if encoding == "PNG":
+                            image.verify()
+                        elif b"\xff\xd9" not in message.data[-4096:].tobytes():
+                            raise ValueError("cut short")
+                except Exception:  # Pillow's readers raise many types
+                    name = printable(message.format, 24)
+                    raise _UnusableError(f"is not a complete JPEG or PNG ({name})") from None
+                if mode[0] in "IF":
+                    raise _UnusableError("has 16 bits per channel, which is not supported")
             if not 0 < size[0] * size[1] <= LIMITS.pixels:
                 raise _UnusableError(f"has {size[0]}x{size[1]} pixels")
             self.sizes[size] = self.encodings[encoding] = None
@@ -328,29 +339,6 @@ class Samples:
         """The type; for images as `sensor_msgs/Image (rgb8, 640x480)`."""
         details = [*self.encodings, *(f"{width}x{height}" for width, height in self.sizes)][:6]
         return f"{self.type} ({', '.join(details)})" if details else self.type
-
-
-def _inspect(message: Any) -> tuple[str, tuple[int, int]]:
-    """Return the encoding and size of an Image or CompressedImage. Raises _UnusableError."""
-    if hasattr(message, "encoding"):
-        encoding, size = message.encoding, (message.width, message.height)
-        if encoding not in ENCODINGS:
-            raise _UnusableError(f"has the unsupported encoding {printable(encoding, 24)}")
-        if message.step < size[0] * ENCODINGS[encoding][0] or len(message.data) < message.step * size[1]:
-            raise _UnusableError("has fewer pixels than its size states")
-        return encoding, size
-    try:
-        with Image.open(BytesIO(message.data), formats=FORMATS) as image:
-            kind, size, mode = str(image.format), image.size, image.mode
-            if kind == "PNG":
-                image.verify()
-            elif b"\xff\xd9" not in message.data[-4096:].tobytes():
-                raise ValueError("cut short")
-    except Exception:  # Pillow's readers raise many types
-        raise _UnusableError(f"is not a complete JPEG or PNG ({printable(message.format, 24)})") from None
-    if mode[0] in "IF":
-        raise _UnusableError("has 16 bits per channel, which is not supported")
-    return kind, size
 
 
 def decode(message: Any) -> np.ndarray:
@@ -425,9 +413,9 @@ class Survey:
         return tuple(f"{self.path.name}: {name}: {note}" for note in notes)
 
 
-@lru_cache(maxsize=4)
-def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
-    """Read a bag once; `state` (`file_state`) is part of the cache key."""
+@partial(read_once, files=lambda path: visible_entries(path) if path.is_dir() else [path])
+def survey_of(path: Path) -> Survey:
+    """Read a bag. Raises NeecoError."""
     survey = Survey(path=path)
     with open_bag(path) as bag:
         kinds: dict[str, str] = {}
@@ -455,38 +443,7 @@ def survey_of(path: Path, state: tuple[object, ...]) -> Survey:
     return survey
 
 
-@dataclass(frozen=True, kw_only=True)
-class BagImages(VideoSource):
-    """Images of a topic. arrived: receipt time of each of its messages, ns; numbers: message index of each frame."""
-
-    topic: str
-    arrived: np.ndarray
-    numbers: np.ndarray
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        requested = np.array(sorted({int(index) for index in indices}), np.int64)
-        steps = np.diff(self.numbers[requested])
-        cuts = np.flatnonzero((steps <= 0) | (steps > LIMITS.skipped_images)) + 1
-        with open_bag(self.path) as bag:
-            for stretch in np.split(requested, cuts):
-                numbers = {int(self.numbers[index]): int(index) for index in stretch}
-                times = self.arrived[list(numbers)]
-                start, stop = int(times.min(initial=2**62)), int(times.max(initial=-1)) + 1
-                passed = np.flatnonzero((self.arrived >= start) & (self.arrived < stop)).tolist()
-                messages = bag.messages([self.topic], start, stop)
-                for number, (_, _, message) in zip(passed, messages, strict=False):
-                    if number in numbers:
-                        where = f"{self.path}: {self.topic}: message {number + 1}"
-                        with one_line(where, "cannot be decoded", "remove it with `rosbag filter`"):
-                            pixels = decode(message)
-                        if pixels.shape[1::-1] != self.size:
-                            raise NeecoError(f"{where}: changed its size; do not modify the bag during a run")
-                        yield numbers.pop(number), pixels
-                if numbers:
-                    raise NeecoError(f"{self.path}: {self.topic}: became shorter; do not modify the bag during a run")
-
-
-def open_topic(survey: Survey, topic: str) -> BagImages:
+def open_topic(survey: Survey, topic: str) -> VideoSource:
     """Return the images of a topic, sorted by time. Raises NeecoError."""
     log, where = survey.images[topic], f"{survey.path}: {topic}"
     seconds, notes = survey.seconds(log), survey.notes(topic, log, "image")
@@ -505,5 +462,30 @@ def open_topic(survey: Survey, topic: str) -> BagImages:
     if doubled := len(seconds) - len(times):
         left_out = f"{counted(doubled, 'image')} left out: duplicate time"
         notes = (*notes, f"{survey.path.name}: {topic}: {left_out}")
-    numbers, arrived = np.array(log.numbers, np.int64)[order], np.array(log.arrived, np.int64)
-    return BagImages(survey.path, next(iter(log.sizes)), notes, times, topic=topic, arrived=arrived, numbers=numbers)
+    # message of each frame, and receipt time of each message, ns
+    number_of, arrived = np.array(log.numbers, np.int64)[order], np.array(log.arrived, np.int64)
+    size = next(iter(log.sizes))
+
+    def images(indices: list[int]) -> Iterator[tuple[int, np.ndarray]]:
+        requested = np.array(indices, np.int64)
+        steps = np.diff(number_of[requested])
+        cuts = np.flatnonzero((steps <= 0) | (steps > LIMITS.skipped_images)) + 1
+        with open_bag(survey.path) as bag:
+            for stretch in np.split(requested, cuts):
+                numbers = {int(number_of[index]): int(index) for index in stretch}
+                received = arrived[list(numbers)]
+                start, stop = int(received.min(initial=2**62)), int(received.max(initial=-1)) + 1
+                passed = np.flatnonzero((arrived >= start) & (arrived < stop)).tolist()
+                messages = bag.messages([topic], start, stop)
+                for number, (_, _, message) in zip(passed, messages, strict=False):
+                    if number in numbers:
+                        place = f"{where}: message {number + 1}"
+                        with one_line(place, "cannot be decoded", "remove it with `rosbag filter`"):
+                            pixels = decode(message)
+                        if pixels.shape[1::-1] != size:
+                            raise NeecoError(f"{place}: changed its size; do not modify the bag during a run")
+                        yield numbers.pop(number), pixels
+                if numbers:
+                    raise NeecoError(f"{where}: became shorter; do not modify the bag during a run")
+
+    return VideoSource(survey.path, size, notes, times, images=images)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -19,7 +18,7 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes
 from neeco.capture.documents import printable
 from neeco.ingest.readers import DELIMITED, Kind, RecordingFormat, Stream, Table, read_once, to_numbers
-from neeco.ingest.readers.columns import TRACKER_CLOCK, UNITS, canonical_unit
+from neeco.ingest.readers.names import TRACKER_CLOCK, UNITS, canonical_unit
 
 EXPECTED = "CSV with a header line"
 _COMMENT = re.compile(r"^\s*(?:#+|//|%\s)\s*")
@@ -91,7 +90,26 @@ def _parsed(path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, tuple[
     repeats = [names[:index].count(name) for index, name in enumerate(names)]
     unique = (f"{name}#{count + 1}" if name and count else name for name, count in zip(names, repeats, strict=True))
     header, rows = tuple(unique), text.cells[used, : len(names)]
-    return header, rows, text.lines[used], _find_tools(header, rows)
+    # NDI's tools: the columns of each from its `Port` to its markers, named by the first unique one of name, serial
+    # number and port
+    plain = [_NUMBERED.sub("", name).strip() for name in header]
+    starts = [index for index, name in enumerate(plain) if _PORT.match(name)]
+    tools: list[tuple[range, list[str]]] = []
+    for first, end in pairwise([*starts, len(plain)]):
+        lower = [name.lower() for name in plain[first:end]]
+        length = next((n for n, name in enumerate(lower) if name == MARKERS or name in lower[:n]), len(lower))
+        if {"q0", "tx"} <= set(lower[:length]):
+            match, cell = _PORT.match(plain[first]), next(filter(None, rows[:, first]), "")
+            port, name = (match["port"], match["name"] or "") if match else ("", "")
+            words = [word for word in (name, port or cell, plain[first], cell) if word]
+            tools.append((range(first, first + length), words))
+    counts = Counter(word for _, words in tools for word in {_canonical(word) for word in words})
+    distinct = [[word for word in words if counts[_canonical(word)] == 1] for _, words in tools]
+    found = tuple(
+        _Tool((words or [f"tool {number}"])[0], columns, frozenset(map(_canonical, words)))
+        for number, ((columns, _), words) in enumerate(zip(tools, distinct, strict=True), 1)
+    )
+    return header, rows, text.lines[used], found
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,28 +219,6 @@ class _Tool:
     name: str
     columns: range
     aliases: frozenset[str]
-
-
-def _find_tools(header: Sequence[str], rows: np.ndarray) -> tuple[_Tool, ...]:
-    """Return NDI's tools: the columns of each from its `Port` to its markers, named by the first unique one of name,
-    serial number and port."""
-    plain = [_NUMBERED.sub("", name).strip() for name in header]
-    starts = [index for index, name in enumerate(plain) if _PORT.match(name)]
-    tools: list[tuple[range, list[str]]] = []
-    for start, end in pairwise([*starts, len(plain)]):
-        names = [name.lower() for name in plain[start:end]]
-        length = next((n for n, name in enumerate(names) if name == MARKERS or name in names[:n]), len(names))
-        if {"q0", "tx"} <= set(names[:length]):
-            match, cell = _PORT.match(plain[start]), next(filter(None, rows[:, start]), "")
-            port, name = (match["port"], match["name"] or "") if match else ("", "")
-            words = [word for word in (name, port or cell, plain[start], cell) if word]
-            tools.append((range(start, start + length), words))
-    counts = Counter(word for _, words in tools for word in {_canonical(word) for word in words})
-    unique = [[word for word in words if counts[_canonical(word)] == 1] for _, words in tools]
-    return tuple(
-        _Tool((words or [f"tool {number}"])[0], columns, frozenset(map(_canonical, words)))
-        for number, ((columns, _), words) in enumerate(zip(tools, unique, strict=True), 1)
-    )
 
 
 def _canonical(name: str) -> str:

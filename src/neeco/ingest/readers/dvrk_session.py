@@ -18,9 +18,9 @@ from neeco.base.files import read_json
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, compare_counts, rate_of
-from neeco.ingest.readers.frame_names import camera_order
+from neeco.ingest.readers.names import camera_order
 from neeco.ingest.readers.rosbag import RosBag
-from neeco.ingest.readers.video import ChosenFrames, open_video
+from neeco.ingest.readers.video import chosen_frames, open_video
 
 INDEX, TYPES = "index.json", ("dc_index_v1", "dc::index@", "dvrk_data:index@")
 UNLIKE = 0.02  # relative tolerance between the numbers of a video's frames and of their times
@@ -82,16 +82,10 @@ class DvrkSession(RecordingFormat):
         keep = np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0
         early = f"{name}: {int((~keep).sum())} frames left out: their times do not increase"
         video = open_video(film.file)
-        notes = (() if keep.all() else (early,)) + compare_counts(
-            film.file, len(video.times), len(times), "times", UNLIKE
-        )
+        unlike = compare_counts(film.file, len(video.times), len(times), "times", UNLIKE)
+        notes = (*video.notes, *(() if keep.all() else (early,)), *unlike)
         usable = np.flatnonzero(keep[: len(video.times)])
-        width, height = video.size
-        size, frames = (width if film.half is None else width // 2, height), tuple(usable.tolist())
-        notes, aspect = (*video.notes, *notes), video.pixel_aspect
-        return ChosenFrames(
-            path, size, notes, times[usable], video=video, frames=frames, half=film.half, pixel_aspect=aspect
-        )
+        return replace(chosen_frames(video, usable.tolist(), times[usable], notes, film.half), path=path)
 
 
 def _films(path: Path) -> tuple[dict[str, _Film], dict[str, str]]:

@@ -9,7 +9,6 @@ SciPy's smoothing splines with robust weights are as accurate on positions, but 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -37,61 +36,63 @@ class SmoothingSettings:
 SETTINGS = SmoothingSettings()
 
 
-@dataclass(frozen=True)
-class Smoothing:
-    """Half widths s of the windows for positions (or readings) and rotations; 0: interpolation."""
-
-    position_s: float
-    rotation_s: float
-
-
 def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return poses [N, 4, 4] (mm) at times [N] on the log's clock, and bool [N] whether the log covers them.
 
-    smooth_s: half width of the window, s; None: by the log's own noise (`pose_smoothing`); 0: interpolation.
+    smooth_s: half width of the window, s; None: by the log's own noise (`smoothing`); 0: interpolation.
     Outside the log and inside its gaps poses are NaN.
     """
     times = np.asarray(times, dtype=np.float64)
-    widths = pose_smoothing(log) if smooth_s is None else Smoothing(smooth_s, smooth_s)
-    positions, quats = _Series(log, log.positions), _Series(log, log.quats)
-    valid = positions.covers(times)
+    valid = _Series(log, "positions").covers(times)
+    positions, quats = (
+        _Series(log, name).fit(times[valid], smoothing(log, name) if smooth_s is None else smooth_s)
+        for name in ("positions", "quats")
+    )
     poses = np.full((len(times), 4, 4), np.nan)
     poses[valid] = np.eye(4)
-    poses[valid, :3, 3] = positions.fit(times[valid], widths.position_s)
+    poses[valid, :3, 3] = positions
     if valid.any():
-        turns = Rotation.from_quat(quats.fit(times[valid], widths.rotation_s), scalar_first=True)
-        poses[valid, :3, :3] = turns.as_matrix()
+        poses[valid, :3, :3] = Rotation.from_quat(quats, scalar_first=True).as_matrix()
     return poses, valid
 
 
 def readings_at(log: ReadingLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return readings [N] rad at times [N] on the log's clock, and bool [N] whether it covers them; see `poses_at`."""
     times = np.asarray(times, dtype=np.float64)
-    width = reading_smoothing(log) if smooth_s is None else smooth_s
-    series = _Series(log, log.values[:, None])
+    width = smoothing(log, "values") if smooth_s is None else smooth_s
+    series = _Series(log, "values")
     valid = series.covers(times)
     values = np.full(len(times), np.nan)
     values[valid] = series.fit(times[valid], width)[:, 0]
     return values, valid
 
 
-@lru_cache(maxsize=32)
-def pose_smoothing(log: PoseLog) -> Smoothing:
-    """Choose the windows that best predict each sample of this log from its neighbours (leave-one-out validation)."""
-    return Smoothing(_Series(log, log.positions).best_width(), _Series(log, log.quats).best_width())
-
-
-@lru_cache(maxsize=32)
-def reading_smoothing(log: ReadingLog) -> float:
-    """Half width s of the window of readings, as `pose_smoothing` chooses it."""
-    return _Series(log, log.values[:, None]).best_width()
+@lru_cache(maxsize=96)
+def smoothing(log: SampleLog, name: str) -> float:
+    """Return the half width s of the window that best predicts each sample from its neighbours (leave-one-out
+    validation); 0: interpolation. name: `positions` or `quats` of a log of poses, `values` of readings."""
+    series = _Series(log, name)
+    inner = np.arange(len(series.times))
+    inner = inner[(inner > series.first) & (inner < series.last - 1)]  # without the ends of segments
+    if not len(inner):
+        return 0.0
+    chosen = inner[evenly_spaced(len(inner), SETTINGS.validated, floor=True)]
+    first, *wider = (steps * series.step for steps in SETTINGS.widths)
+    widths = [0.0, first, *(width for width in wider if width <= SETTINGS.max_width_s)]
+    fitted = [series.fit(series.times[chosen], width, chosen) for width in widths]
+    errors = [np.linalg.norm(values - series.values[chosen], axis=1) for values in fitted]
+    # errors are capped, so that outliers do not affect the choice
+    limit = 5 * max(float(np.median(errors[0])), 1e-12)
+    scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in errors]
+    return widths[int(np.argmin(scores))]
 
 
 class _Series:
-    """Samples [T, D] of a log, split into segments without gaps."""
+    """Samples [T, D] of a log, by the name of their field, split into segments without gaps."""
 
-    def __init__(self, log: SampleLog, values: np.ndarray) -> None:
-        self.times, self.values = log.times, values
+    def __init__(self, log: SampleLog, name: str) -> None:
+        self.times = log.times
+        self.values = getattr(log, name).reshape(len(self.times), -1)
         starts = np.searchsorted(self.times, [end for _, end in log.gaps])
         stretch = np.zeros(len(self.times), dtype=np.int64)
         stretch[starts] = 1
@@ -132,48 +133,25 @@ class _Series:
             # robust standard deviation of a sample about the line through its neighbours, per axis
             bend = self.values[1:-1] - (self.values[:-2] + self.values[2:]) / 2
             noise = max(1.48 * float(np.median(np.abs(bend))) / np.sqrt(1.5), 1e-9)
-            for rows, index, used, offsets in self._windows(times, width, leave_out):
-                around = self.values[index] - start[rows, None]
-                result[rows] = start[rows] + _local_polynomial(offsets, used, around, noise)
+            size = max(int(SETTINGS.chunk / max(2 * width / self.step, 8)), 1)
+            for first in range(0, len(times), size):  # times with enough samples [N, K] within `width`, in chunks
+                rows = np.arange(first, min(first + size, len(times)))
+                centers = times[rows]
+                left, right = self._around(centers)
+                nearest = np.where(self.times[right] == centers, right, left)
+                low = np.maximum(np.searchsorted(self.times, centers - width), self.first[nearest])
+                high = np.minimum(np.searchsorted(self.times, centers + width, side="right"), self.last[nearest])
+                index = low[:, None] + np.arange(max(int((high - low).max(initial=0)), 1))
+                index, used = np.minimum(index, len(self.times) - 1), index < high[:, None]
+                if leave_out is not None:
+                    used &= index != leave_out[rows, None]
+                enough = used.sum(axis=1) >= SETTINGS.min_samples
+                if enough.any():
+                    rows, index, used = rows[enough], index[enough], used[enough]
+                    offsets = (self.times[index] - times[rows, None]) / width
+                    around = self.values[index] - start[rows, None]
+                    result[rows] = start[rows] + _local_polynomial(offsets, used, around, noise)
         return result
-
-    def best_width(self) -> float:
-        """Return the half width s with the smallest prediction errors."""
-        inner = np.arange(len(self.times))
-        inner = inner[(inner > self.first) & (inner < self.last - 1)]  # without the ends of segments
-        if not len(inner):
-            return 0.0
-        chosen = inner[evenly_spaced(len(inner), SETTINGS.validated, floor=True)]
-        first, *wider = (steps * self.step for steps in SETTINGS.widths)
-        widths = [0.0, first, *(width for width in wider if width <= SETTINGS.max_width_s)]
-        fitted = [self.fit(self.times[chosen], width, chosen) for width in widths]
-        errors = [np.linalg.norm(values - self.values[chosen], axis=1) for values in fitted]
-        # errors are capped, so that outliers do not affect the choice
-        limit = 5 * max(float(np.median(errors[0])), 1e-12)
-        scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in errors]
-        return widths[int(np.argmin(scores))]
-
-    def _windows(
-        self, times: np.ndarray, width: float, leave_out: np.ndarray | None
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield times with enough samples within `width`, in chunks: rows [N], their samples [N, K], bool [N, K]
-        whether a sample is used, and offsets [N, K] in half widths."""
-        size = max(int(SETTINGS.chunk / max(2 * width / self.step, 8)), 1)
-        for start in range(0, len(times), size):
-            rows = np.arange(start, min(start + size, len(times)))
-            centers = times[rows]
-            left, right = self._around(centers)
-            nearest = np.where(self.times[right] == centers, right, left)
-            low = np.maximum(np.searchsorted(self.times, centers - width), self.first[nearest])
-            high = np.minimum(np.searchsorted(self.times, centers + width, side="right"), self.last[nearest])
-            index = low[:, None] + np.arange(max(int((high - low).max(initial=0)), 1))
-            index, used = np.minimum(index, len(self.times) - 1), index < high[:, None]
-            if leave_out is not None:
-                used &= index != leave_out[rows, None]
-            enough = used.sum(axis=1) >= SETTINGS.min_samples
-            if enough.any():
-                rows, index, used = rows[enough], index[enough], used[enough]
-                yield rows, index, used, (self.times[index] - times[rows, None]) / width
 
     def _around(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples before and after each time [N] (the same sample twice at its own time)."""

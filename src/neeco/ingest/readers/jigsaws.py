@@ -16,9 +16,8 @@ import numpy as np
 from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, read_once, to_numbers
-from neeco.ingest.readers.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.readers.delimited import read_cells
-from neeco.ingest.readers.frame_names import NamedFrame
+from neeco.ingest.readers.names import BASE, VIDEO_CLOCK, NamedFrame
 
 ARMS = ("master left", "master right", "slave left", "slave right")  # in the order of their columns
 COLUMNS = 19  # of an arm

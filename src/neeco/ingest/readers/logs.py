@@ -19,13 +19,11 @@ from neeco.base.errors import NeecoError, counted
 from neeco.geometry.conventions import OPENCV
 from neeco.geometry.rotations import rotation_error
 from neeco.ingest.readers import Table, column_index, numbers, read_table, to_numbers
-from neeco.ingest.readers import columns as named
-from neeco.ingest.readers.columns import EULER, MATRIX, ROTATION_VECTOR, RecognisedColumns
-from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_in, meaning_of, of_dvrk
+from neeco.ingest.readers import names as named
 from neeco.ingest.readers.rows import Rows, drop_stuck, find_gaps, in_order, keep_measured, read_cells, read_times
 from neeco.ingest.readers.sections import JointColumns, PoseColumns
 
-_FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
+_FORMS = ", ".join(f"{form} (with euler_convention)" if form == named.EULER else form for form in named.FORMS)
 _FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?id)?")
 
 
@@ -87,7 +85,7 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     frame = source.frame or table.frame or named.BASE
     if source.frame is None and table.meaning is not None and table.frame is None:
         raise NeecoError(f"{table.where}: frame: {table.meaning.question}")
-    axes = CAMERA_FRAMES.get(table.frame or "")
+    axes = named.CAMERA_FRAMES.get(table.frame or "")
     if source.frame == named.CAMERA and axes is not None and axes.words != OPENCV.words:
         raise NeecoError(
             f"{table.where}: frame: {named.CAMERA} means OpenCV's axes ({OPENCV.words}), but the file's frame is "
@@ -109,7 +107,7 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     if frame != named.BASE and source.frame is None and table.meaning is not None:
         rows.repairs.append(f"poses are expressed in {table.meaning.why}")
     positions = positions[order]
-    turn = CAMERA_FRAMES[frame].opencv_from_own[:3, :3] if frame != named.BASE else np.eye(3)
+    turn = named.CAMERA_FRAMES[frame].opencv_from_own[:3, :3] if frame != named.BASE else np.eye(3)
     if not np.array_equal(turn, np.eye(3)):  # from the camera's own axes to OpenCV's
         turned = Rotation.from_matrix(turn) * Rotation.from_quat(quats, scalar_first=True)
         positions, quats = positions @ turn.T, continuous(turned.as_quat(scalar_first=True))[0]
@@ -130,20 +128,20 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
 def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
     """Return the table with the meaning of its poses' frame: by the column names, else by the file, else by a column of
     frame names, else by the file's name. Raises NeecoError if that column holds several."""
-    dvrk = of_dvrk(table.path.stem, *columns)
-    meaning = meaning_in(columns, dvrk=dvrk)
+    dvrk = named.of_dvrk(table.path.stem, *columns)
+    meaning = named.meaning_in(columns, dvrk=dvrk)
     if meaning is None and (table.meaning is not None or table.stream is not None):
         return table
     for index, name in enumerate(table.header if meaning is None and table.rows.dtype == object else ()):
         if not _FRAME_COLUMN.fullmatch(name.strip().lower()):
             continue
         names = sorted({cell.strip("/\"' ") for cell in table.rows[:, index]} - {""})
-        if len(names) > 1 and any(meaning_of(cell).frame != named.BASE for cell in names):
+        if len(names) > 1 and any(named.meaning_of(cell).frame != named.BASE for cell in names):
             listed = ", ".join(names[:4])
             raise NeecoError(f"{table.where}: {name}: poses are in several frames ({listed}); export one only")
         if len(names) == 1 and np.isnan(to_numbers(np.array(names, object))[0]):  # else it numbers or names images
-            return replace(table, stated_in=names[0], meaning=meaning_of(names[0], dvrk=dvrk))
-    return replace(table, meaning=meaning or meaning_in([table.path.stem], dvrk=dvrk))
+            return replace(table, stated_in=names[0], meaning=named.meaning_of(names[0], dvrk=dvrk))
+    return replace(table, meaning=meaning or named.meaning_in([table.path.stem], dvrk=dvrk))
 
 
 def read_reading_log(source: JointColumns) -> ReadingLog:
@@ -199,7 +197,7 @@ def _stated_columns(table: Table, **columns: tuple[str, ...] | None) -> dict[str
     return stated
 
 
-def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
+def _poses(rows: Rows, source: PoseColumns, recognised: named.RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
     """Return positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
     table = rows.table
     rotation, form = source.columns.rotation
@@ -208,7 +206,7 @@ def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tu
     if rotation is None or form is None:
         raise _unclear(table, recognised, "rotation", "qw, qx, qy, qz columns")
     position = source.columns.position or recognised.position
-    if form == MATRIX:
+    if form == named.MATRIX:
         position, read = tuple(rotation[i] for i in (3, 7, 11)), rotation
     elif position is None:
         raise _unclear(table, recognised, "position", "x, y, z columns")
@@ -218,19 +216,34 @@ def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tu
     implied = next((kind.length_unit for kind in readings if kind.position == position), None)
     scale = named.scale_of(table.where, position, "length", source.units.length, implied, "")
     angle = 1.0
-    if form in (EULER, ROTATION_VECTOR):
+    if form in (named.EULER, named.ROTATION_VECTOR):
         angle = named.scale_of(table.where, rotation, "angle", source.units.angle, None, "")
     cells = read_cells(rows, read)
     positions, turns = cells[:, :3] * scale, cells[:, 3:]
-    if form == MATRIX:
+    if form == named.MATRIX:
         top = cells[:, :12].reshape(-1, 3, 4)
         positions, turns = top[:, :, 3] * scale, top[:, :, :3].reshape(-1, 9)
         last, column = cells[:, 12:], cells[:, 3::4][:, :3]
         if cells.shape[1] == 16 and np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
             raise NeecoError(f"{table.where}: matrix: is in column-major order; list its columns row by row")
-    if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
+    if form not in (named.EULER, named.ROTATION_VECTOR):  # trackers write zeros where they have no rotation
         rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
-    quats, good = to_quaternions(form, turns, source.columns.euler_convention, angle)
+    # unit quaternions; rows that are not rotations are NaN, while scipy would accept any numbers
+    quats, good = np.full((len(turns), 4), np.nan), np.isfinite(turns).all(axis=1)
+    if form in (named.QUATERNION_WXYZ, named.QUATERNION_XYZW):
+        good &= np.abs(np.linalg.norm(turns, axis=1) - 1) <= SETTINGS.norm_tolerance
+        rotations = Rotation.from_quat(turns[good], scalar_first=form == named.QUATERNION_WXYZ)
+    elif form in (named.EULER, named.ROTATION_VECTOR):
+        good &= (np.abs(turns * angle) < 1e4).all(axis=1)  # larger values are not angles, or their sine is noise
+        angles, convention = turns[good] * angle, source.columns.euler_convention or ""
+        is_euler = form == named.EULER
+        rotations = Rotation.from_euler(convention, angles) if is_euler else Rotation.from_rotvec(angles)
+    else:
+        matrices = np.where(good[:, None], turns, 0).reshape(-1, 3, 3)
+        with np.errstate(all="ignore"):
+            good &= (rotation_error(matrices) <= SETTINGS.rounded_tolerance) & (np.linalg.det(matrices) > 0)
+        rotations = Rotation.from_matrix(matrices[good])
+    quats[good] = rotations.as_quat(scalar_first=True)
     expected = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
     rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {expected}; name the right columns")
     distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
@@ -242,29 +255,6 @@ def _poses(rows: Rows, source: PoseColumns, recognised: RecognisedColumns) -> tu
     return positions, quats
 
 
-def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit quaternions wxyz [R, 4] of rotation columns [R, C], and bool [R] whether they are rotations.
-
-    form: see `columns.FORMS`; matrices by rows, 4x4 ones as their 9 rotation cells; convention: of Euler angles;
-    scale: of angles, to rad. Rows that are not rotations are NaN; scipy would accept any numbers.
-    """
-    quats, good = np.full((len(cells), 4), np.nan), np.isfinite(cells).all(axis=1)
-    if form in (named.QUATERNION_WXYZ, named.QUATERNION_XYZW):
-        good &= np.abs(np.linalg.norm(cells, axis=1) - 1) <= SETTINGS.norm_tolerance
-        turns = Rotation.from_quat(cells[good], scalar_first=form == named.QUATERNION_WXYZ)
-    elif form in (EULER, ROTATION_VECTOR):
-        good &= (np.abs(cells * scale) < 1e4).all(axis=1)  # larger values are not angles, or their sine is noise
-        angles = cells[good] * scale
-        turns = Rotation.from_euler(convention or "", angles) if form == EULER else Rotation.from_rotvec(angles)
-    else:
-        matrices = np.where(good[:, None], cells, 0).reshape(-1, 3, 3)
-        with np.errstate(all="ignore"):
-            good &= (rotation_error(matrices) <= SETTINGS.rounded_tolerance) & (np.linalg.det(matrices) > 0)
-        turns = Rotation.from_matrix(matrices[good])
-    quats[good] = turns.as_quat(scalar_first=True)
-    return quats, good
-
-
 def continuous(quats: np.ndarray) -> tuple[np.ndarray, int]:
     """Return quaternions [T, 4] with continuous signs, and the number of sign flips removed."""
     flips = np.concatenate([[False], (quats[1:] * quats[:-1]).sum(axis=1) < 0])
@@ -272,7 +262,7 @@ def continuous(quats: np.ndarray) -> tuple[np.ndarray, int]:
     return quats * signs[:, None], int(flips.sum())
 
 
-def _unclear(table: Table, recognised: RecognisedColumns, what: str, expected: str) -> NeecoError:
+def _unclear(table: Table, recognised: named.RecognisedColumns, what: str, expected: str) -> NeecoError:
     reason = recognised.unclear.get(what) or (recognised.unclear.get("quaternion") if what == "rotation" else None)
     names = "position" if what == "position" else _FORMS
     listed = repr(", ".join(table.header[:12])[:120])

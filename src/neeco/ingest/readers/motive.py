@@ -14,8 +14,8 @@ from neeco.base.errors import NeecoError
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, to_numbers
-from neeco.ingest.readers.columns import UNITS, canonical_unit
 from neeco.ingest.readers.delimited import read_cells, tool_stream
+from neeco.ingest.readers.names import UNITS, canonical_unit
 
 FIRST = b"Format Version"  # words of a file
 BODY_TYPE = "rigid body"

@@ -7,7 +7,7 @@ memory is allocated by them.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -19,8 +19,7 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import open_file, require_content
 from neeco.capture.documents import printable
 from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, one_line, read_once, to_numbers
-from neeco.ingest.readers.columns import BASE, CAMERA
-from neeco.ingest.readers.frame_names import NamedFrame, meaning_of, of_dvrk
+from neeco.ingest.readers.names import BASE, CAMERA, NamedFrame, meaning_of, of_dvrk
 
 IMAGE_STREAM = "images"
 HEADER = (
@@ -202,27 +201,6 @@ def _read_header(path: Path, stream: BinaryIO, is_nrrd: bool) -> tuple[dict[str,
     return plain, frames, stream.tell()
 
 
-@dataclass(frozen=True, kw_only=True)
-class SequenceImages(VideoSource):
-    """Images of a sequence; frames: frame number of each in the file."""
-
-    sequence: FrameSequence
-    frames: tuple[int, ...]
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        file, start = self.sequence.data
-        shape = self.sequence.shape
-        length = int(np.prod(shape))
-        with (
-            one_line(file, "its images are damaged", "copy or export the sequence again"),
-            open_file(file, "images") as stream,
-        ):
-            for index in sorted({int(index) for index in indices}):
-                stream.seek(start + self.frames[index] * length)
-                pixels = np.frombuffer(stream.read(length), np.uint8).reshape(shape)
-                yield index, np.broadcast_to(pixels, (*shape[:2], 3)).copy()
-
-
 class PlusSequence(RecordingFormat):
     """A stream is a transform, `StylusToTracker` for StylusToTrackerTransform (which maps stylus coordinates to tracker
     coordinates, mm), or `images`. Times are PLUS's timestamps, from the first image if there are images."""
@@ -274,9 +252,19 @@ class PlusSequence(RecordingFormat):
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         sequence = read_sequence(path)
         self.choose(path, stream, Kind.IMAGES)
-        (frames, notes), (height, width, _) = sequence.images, sequence.shape
+        (frames, notes), (height, width, _), (file, start) = sequence.images, sequence.shape, sequence.data
+        length = int(np.prod(sequence.shape))
+
+        def images(indices: list[int]) -> Iterator[tuple[int, np.ndarray]]:
+            again = "copy or export the sequence again"
+            with one_line(file, "its images are damaged", again), open_file(file, "images") as content:
+                for index in indices:
+                    content.seek(start + frames[index] * length)
+                    pixels = np.frombuffer(content.read(length), np.uint8).reshape(sequence.shape)
+                    yield index, np.broadcast_to(pixels, (height, width, 3)).copy()
+
         seconds = np.array([sequence.times[frame] for frame in frames])
-        return SequenceImages(path, (width, height), notes, seconds, sequence=sequence, frames=tuple(frames))
+        return VideoSource(path, (width, height), notes, seconds, images=images)
 
 
 def _rate(count: int, span: float) -> float | None:

@@ -17,19 +17,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.base.errors import NeecoError
-from neeco.base.files import visible_entries
 from neeco.base.placeholders import read_head
 from neeco.capture.documents import printable
 from neeco.geometry.lens import Lens
 from neeco.geometry.rotations import rigid
-from neeco.ingest.calibration.camera_fields import cameras_in
+from neeco.ingest.calibration.lens import cameras_in
 from neeco.ingest.calibration.stereo import RosCamera, from_projections
-from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource, file_state
-from neeco.ingest.readers.columns import BASE
-from neeco.ingest.readers.frame_names import CAMERA_FRAMES, NamedFrame, camera_order, meaning_of, of_dvrk
+from neeco.ingest.readers import Kind, RecordingFormat, Stream, Table, VideoSource
 from neeco.ingest.readers.interpolate import poses_at
 from neeco.ingest.readers.logs import SETTINGS as LOGS
 from neeco.ingest.readers.logs import read_pose_log
+from neeco.ingest.readers.names import BASE, CAMERA_FRAMES, NamedFrame, camera_order, meaning_of, of_dvrk
 from neeco.ingest.readers.sections import PoseColumns
 
 if TYPE_CHECKING:
@@ -114,8 +112,7 @@ class RosBag(RecordingFormat):
         self.require_package(path)
         from neeco.ingest.readers._bagfile import survey_of
 
-        files = visible_entries(path) if path.is_dir() else [path]
-        return survey_of(path, file_state(*files))
+        return survey_of(path)
 
 
 @lru_cache(maxsize=4)

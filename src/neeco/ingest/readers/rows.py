@@ -10,8 +10,8 @@ import numpy as np
 from neeco.base.errors import NeecoError, counted
 from neeco.capture.documents import printable
 from neeco.ingest.readers import Table, column_index, numbers
-from neeco.ingest.readers import columns as named
-from neeco.ingest.readers.columns import RecognisedColumns
+from neeco.ingest.readers import names as named
+from neeco.ingest.readers.names import RecognisedColumns
 from neeco.ingest.readers.sections import JointColumns, PoseColumns
 
 DAY_S = 86400.0  # period of a time-of-day clock, s

@@ -11,8 +11,7 @@ from typing import Annotated, Any, ClassVar
 
 from neeco.base.settings import Fault, printable
 from neeco.capture.documents import Node
-from neeco.ingest.readers.columns import FORMS, UNITS, canonical_unit, quaternion_form
-from neeco.ingest.readers.frame_names import FRAMES
+from neeco.ingest.readers.names import FORMS, FRAMES, UNITS, canonical_unit, quaternion_form
 
 Parser = Callable[[Node], Any]
 _EULER = re.compile(r"(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})")  # no axis twice in a row
@@ -181,7 +180,7 @@ class LogColumns:
 @dataclass(frozen=True)
 class PoseColumns(LogColumns):
     """A log of poses (tracker_from_sensor). columns: those that are None are recognised from the header; tool: another
-    word for `stream`; frame: of the poses, one of `frame_names.FRAMES` (CAMERA, BASE: a robot's base or a tracker's
+    word for `stream`; frame: of the poses, one of `names.FRAMES` (CAMERA, BASE: a robot's base or a tracker's
     frame); None: as stated by the file, else BASE."""
 
     _: KW_ONLY

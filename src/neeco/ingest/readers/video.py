@@ -21,7 +21,7 @@ from neeco.base.placeholders import read_head
 from neeco.capture.images import FORMATS, open_image
 from neeco.capture.readers.parsed import natural_order
 from neeco.ingest.readers import VideoSource, numbers, one_line, read_table, reason_of
-from neeco.ingest.readers.columns import recognise_time, scale_of
+from neeco.ingest.readers.names import recognise_time, scale_of
 
 FURTHER_FORMATS = {".bmp": "BMP", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}  # opened only with these suffixes
 IMAGES = (".png", ".jpg", ".jpeg", *FURTHER_FORMATS)
@@ -104,7 +104,19 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     bad = [file for file, each in zip(files, sizes, strict=True) if each is None]
     notes += _left_out(folder, "cannot be read", bad) + _left_out(folder, "differ in size", other)
     usable = [index for index, each in enumerate(sizes) if each == size]
-    return ImageFiles(folder, size, tuple(notes), stamps[usable], files=tuple(files[i] for i in usable))
+
+    def images(indices: list[int]) -> Iterator[tuple[int, np.ndarray]]:
+        for index in indices:
+            file = files[usable[index]]
+            try:
+                pixels = np.array(_open(file).convert("RGB"))
+            except NeecoError as error:
+                raise NeecoError(f"{file}: can no longer be read; do not modify the images during a run") from error
+            if pixels.shape[1::-1] != size:
+                raise NeecoError(f"{file}: differs in size from the first; give images of one size")
+            yield index, pixels
+
+    return VideoSource(folder, size, tuple(notes), stamps[usable], images=images)
 
 
 def _open(file: Path) -> Image.Image:
@@ -142,65 +154,25 @@ def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarr
     return places
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImageFiles(VideoSource):
-    """Images in separate files."""
+def chosen_frames(
+    video: VideoSource,
+    frames: Sequence[int],
+    times: np.ndarray,
+    notes: Sequence[str] = (),
+    half: int | None = None,
+) -> VideoSource:
+    """Return frames of a video, by their increasing numbers, with other times and further notes. half: half of the
+    image, for a video of two cameras side by side (0: left, 1: right, None: the whole image)."""
+    width = video.size[0] // (1 if half is None else 2)
+    start = (half or 0) * width
 
-    files: tuple[Path, ...]
+    def images(indices: list[int]) -> Iterator[tuple[int, np.ndarray]]:
+        places = {frames[index]: index for index in indices}
+        for frame, pixels in video.read([*places]):
+            yield places[frame], np.ascontiguousarray(pixels[:, start : start + width])
 
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        for index in sorted({int(i) for i in indices}):
-            try:
-                pixels = np.array(_open(self.files[index]).convert("RGB"))
-            except NeecoError as error:
-                problem = "can no longer be read; do not modify the images during a run"
-                raise NeecoError(f"{self.files[index]}: {problem}") from error
-            if pixels.shape[1::-1] != self.size:
-                raise NeecoError(f"{self.files[index]}: differs in size from the first; give images of one size")
-            yield index, pixels
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChosenFrames(VideoSource):
-    """Selected frames of a video, with other times. frames: their numbers in it; half: half of the image, for a video
-    of two cameras side by side (0: left, 1: right, None: the whole image)."""
-
-    video: VideoSource
-    frames: tuple[int, ...]
-    half: int | None = None
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        places = {self.frames[int(index)]: int(index) for index in indices}
-        start = (self.half or 0) * self.size[0]
-        for frame, pixels in self.video.read(sorted(places)):
-            yield places[frame], np.ascontiguousarray(pixels[:, start : start + self.size[0]])
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Video(VideoSource):
-    stamps: tuple[int, ...]  # of each frame, in the stream's time base; its number if the stream has no stamps
-    numbered: bool
-    threads: str
-    part: tuple[float, float] | None = None
-    own_fps: float | None = None
-    buffered: tuple[Any, ...] = ()  # all frames, decoded; empty where they are too large
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        from av.video.reformatter import Interpolation as Way
-
-        exact = Way.BICUBIC | Way.ACCURATE_RND | Way.FULL_CHR_H_INT | Way.BITEXACT
-        remaining = {self.stamps[int(index)]: int(index) for index in indices}
-        frames = self.buffered or _Scan(self.path, threads=self.threads, part=self.part).decoded()
-        for number, frame in enumerate(frames):
-            if not remaining:
-                return
-            index = remaining.pop(number if self.numbered else frame.pts, None)
-            if index is not None:
-                # the converter's fast default is more than one level too dark, hence exact rounding
-                yield index, frame.to_ndarray(format="rgb24", interpolation=exact)
-        if remaining:
-            problem = f"frame {min(remaining.values())} can no longer be read; do not modify the file during a run"
-            raise NeecoError(f"{self.path}: {problem}")
+    size, aspect = (width, video.size[1]), video.pixel_aspect
+    return VideoSource(video.path, size, tuple(notes), times, pixel_aspect=aspect, images=images)
 
 
 @dataclass
@@ -300,7 +272,7 @@ class _Scan:
                 self.buffered.clear()
         return self
 
-    def finish(self, fps: float | None) -> _Video:
+    def finish(self, fps: float | None) -> VideoSource:
         if self.size is None or len(self.stamps) < SETTINGS.min_images:
             why = f" ({self.failure})" if self.failure else ""
             raise NeecoError(f"{self.path}: {len(self.stamps)} frames can be decoded{why}; give an intact video file")
@@ -350,11 +322,28 @@ class _Scan:
             if fps is None:
                 notes.append(f"its frames have no times; {stated:g} Hz is assumed")
             times = np.array(order) / stated
-        return _Video(
-            self.path, self.size, tuple(f"{self.path.name}: {note}" for note in notes), times, stamps=tuple(order),
-            numbered=numbered, threads=self.threads, part=self.part, own_fps=own_rate, pixel_aspect=self.pixel_aspect,
-            buffered=tuple(self.buffered) if len(self.buffered) == len(self.stamps) else (),
-        )  # fmt: skip
+        buffered = self.buffered if len(self.buffered) == len(self.stamps) else []
+
+        def images(indices: list[int]) -> Iterator[tuple[int, np.ndarray]]:
+            from av.video.reformatter import Interpolation as Way
+
+            exact = Way.BICUBIC | Way.ACCURATE_RND | Way.FULL_CHR_H_INT | Way.BITEXACT
+            remaining = {order[index]: index for index in indices}
+            frames = buffered or _Scan(self.path, threads=self.threads, part=self.part).decoded()
+            for number, frame in enumerate(frames):
+                if not remaining:
+                    return
+                index = remaining.pop(number if numbered else frame.pts, None)
+                if index is not None:
+                    # the converter's fast default is more than one level too dark, hence exact rounding
+                    yield index, frame.to_ndarray(format="rgb24", interpolation=exact)
+            if remaining:
+                problem = f"frame {min(remaining.values())} can no longer be read; do not modify the file during a run"
+                raise NeecoError(f"{self.path}: {problem}")
+
+        named = tuple(f"{self.path.name}: {note}" for note in notes)
+        aspect = self.pixel_aspect
+        return VideoSource(self.path, self.size, named, times, images=images, own_fps=own_rate, pixel_aspect=aspect)
 
 
 def _image_times(folder: Path, files: list[Path], table_path: Path, notes: list[str]) -> tuple[list[Path], np.ndarray]:

@@ -17,8 +17,7 @@ from neeco.base.settings import Fault, faults_in, join_places, printable, read
 from neeco.capture.documents import Node
 from neeco.geometry.conventions import DVRK_ECM
 from neeco.geometry.rotations import rigid
-from neeco.ingest.readers.columns import CAMERA
-from neeco.ingest.readers.frame_names import CAMERA_FRAMES, meaning_of
+from neeco.ingest.readers.names import CAMERA, CAMERA_FRAMES, meaning_of
 from neeco.ingest.readers.sections import Positive, existing_file, word
 
 BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera; to the laparoscope's tracker

@@ -23,19 +23,7 @@ from neeco.base.placeholders import placeholder
 from neeco.ingest.calibration.lens import read_lens
 from neeco.ingest.calibration.stereo import read_stereo
 from neeco.ingest.readers import DELIMITED, Kind, Stream, VideoSource, format_of, read_table
-from neeco.ingest.readers.columns import (
-    BASE,
-    MATRIX,
-    TRACKER_CLOCK,
-    RecognisedColumns,
-    joint_columns,
-    pose_bodies,
-    recognise_pose,
-    recognise_time,
-    recognise_value,
-    split_unit,
-)
-from neeco.ingest.readers.frame_names import NamedFrame, without_frame
+from neeco.ingest.readers import names as named
 from neeco.ingest.readers.logs import with_named_frame
 from neeco.ingest.readers.rosbag import DVRK_WRIST
 from neeco.ingest.readers.video import IMAGES, VIDEOS
@@ -58,7 +46,7 @@ class DraftLimits:
     tracker_rate: float = 40.0
 
 
-LIMITS, IN_BASE = DraftLimits(), NamedFrame(BASE)
+LIMITS, IN_BASE = DraftLimits(), named.NamedFrame(named.BASE)
 
 # Lines of a draft that leave something open: what marks the first of them, and what to write there
 _QUESTIONS = (
@@ -98,7 +86,7 @@ class _Log:
     a robot's base?"""
 
     file: str
-    says: Stream | NamedFrame = IN_BASE
+    says: Stream | named.NamedFrame = IN_BASE
     in_base: bool = False
 
     @property
@@ -109,8 +97,8 @@ class _Log:
     def stem(self) -> str:
         """A name for the log's body."""
         if self.stream is None:
-            return without_frame(Path(self.file).stem)
-        return without_frame(self.stream.body or re.sub(r"[^A-Za-z0-9]+", "_", self.stream.name).strip("_"))
+            return named.without_frame(Path(self.file).stem)
+        return named.without_frame(self.stream.body or re.sub(r"[^A-Za-z0-9]+", "_", self.stream.name).strip("_"))
 
     def lines(self) -> list[str]:
         stream = [] if self.stream is None else [f"stream: {_scalar(self.stream.name)}"]
@@ -126,8 +114,8 @@ class _FolderFiles:
     frames: list[_Frames] = field(default_factory=list)
     lenses: list[str] = field(default_factory=list)
     syncs: list[str] = field(default_factory=list)
-    poses: list[tuple[_Log, RecognisedColumns]] = field(default_factory=list)
-    joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
+    poses: list[tuple[_Log, named.RecognisedColumns]] = field(default_factory=list)
+    joints: list[tuple[_Log, named.RecognisedColumns, str, str | None]] = field(default_factory=list)
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
     problems: list[tuple[str, bool]] = field(default_factory=list)
@@ -209,16 +197,20 @@ def _find_files(source: Path) -> _FolderFiles:
         elif format_of(file) is not None and not _add_streams(files, file, name):
             try:
                 table = read_table(file)
-                meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
+                meaning = with_named_frame(table, named.recognise_pose(table.header).position or ()).meaning
             except NeecoError as error:
                 files.leave_out(name, error, file)
                 continue
-            log, pose, (value, when) = _Log(name), recognise_pose(table.header), recognise_value(table.header)
+            log, pose, (value, when) = (
+                _Log(name),
+                named.recognise_pose(table.header),
+                named.recognise_value(table.header),
+            )
             columns = [column for column in table.header if column]
-            angles = [one for one in columns if split_unit(one, "angle")[1] or one.lower().startswith("angle")]
+            angles = [one for one in columns if named.split_unit(one, "angle")[1] or one.lower().startswith("angle")]
             if pose.rotation or "rotation" in pose.unclear:
                 files.poses.append((replace(log, says=meaning or log.says), pose))
-                joints = joint_columns(columns, pose_bodies(columns))
+                joints = named.joint_columns(columns, named.pose_bodies(columns))
                 files.joints += [(log, when, column, _joint_of(column)) for column in joints]
             elif value and when.time:
                 files.joints.append((log, when, value, None))
@@ -265,14 +257,14 @@ def _add_streams(files: _FolderFiles, path: Path, name: str) -> bool:
             except NeecoError as error:
                 files.leave_out(title, error, path)
                 continue
-            when = recognise_time(table.header)
+            when = named.recognise_time(table.header)
             joints: Sequence[tuple[str | None, str]] = stream.joints or ()
             if stream.kind == Kind.POSES:
                 header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
-                in_base = table.frame in (None, BASE) and not stream.asks and stream.clock != TRACKER_CLOCK
-                files.poses.append((replace(log, in_base=in_base), recognise_pose(header)))
+                in_base = table.frame in (None, named.BASE) and not stream.asks and stream.clock != named.TRACKER_CLOCK
+                files.poses.append((replace(log, in_base=in_base), named.recognise_pose(header)))
             elif stream.joints is None:  # every angle is one
-                joints = [(None, column) for column in table.header if split_unit(column, "angle")[1]]
+                joints = [(None, column) for column in table.header if named.split_unit(column, "angle")[1]]
             files.joints += [(log, when, column, joint) for joint, column in joints]
         elif stream.problem is not None:
             files.leave_out(title, stream.problem, path, stream.kind == Kind.IMAGES)
@@ -377,9 +369,9 @@ def _instrument_lines(files: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
         if all(joint in DVRK_WRIST for *_, joint in logs):
             logs.sort(key=lambda log: DVRK_WRIST.index(str(log[3])))
         yield from ["    joints:"] if logs else []
-        for joint, (log, when, value, named) in zip(_unique([_joint_name(*log) for log in logs]), logs, strict=True):
+        for joint, (log, when, value, stated) in zip(_unique([_joint_name(*log) for log in logs]), logs, strict=True):
             lines, stem = log.lines(), log.stem.lower()
-            if log.stream is None and named:  # a table of several joints is a robot's, as its poses are
+            if log.stream is None and stated:  # a table of several joints is a robot's, as its poses are
                 lines.append("clock: em   # that of the poses: correct it where another computer logged it")
             elif log.stream is None and not files.syncs:
                 lines.append("# clock: em   # left out, it is its own, whose offset nothing states")
@@ -393,9 +385,9 @@ def _instrument_lines(files: _FolderFiles, *, in_camera: bool) -> Iterator[str]:
             yield from [f"      {_scalar(joint)}:", *(f"        {line}" for line in lines)]
 
 
-def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
-    of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
-    clock = TRACKER_CLOCK if log.stream is None else log.stream.clock
+def _pose_lines(log: _Log, columns: named.RecognisedColumns) -> list[str]:
+    of_length = (columns.rotation or ())[3:4] if columns.form == named.MATRIX else columns.position
+    clock = named.TRACKER_CLOCK if log.stream is None else log.stream.clock
     lines = [*log.lines(), *([f"clock: {clock}"] if clock else []), *(f"# {ask}" for ask in log.says.asks)]
     if log.stream is not None and log.stream.columns is not None:  # others are recognised again when read
         stated = (("position", columns.position), (columns.form, columns.rotation))
@@ -404,7 +396,7 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     return lines + _unit_lines(columns, {"length": of_length})
 
 
-def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | None]) -> list[str]:
+def _unit_lines(columns: named.RecognisedColumns, wanted: dict[str, tuple[str, ...] | None]) -> list[str]:
     """A line asking for the units that neither the columns' names nor their format say."""
     lines, time = [], columns.time or ()
     if columns.counts_frames or not time:
@@ -416,22 +408,22 @@ def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | 
     unsaid = [
         f"{kind}: {units[kind]}"
         for kind, names in wanted.items()
-        if names and not split_unit(names[0], kind)[1] and not (kind == "length" and columns.length_unit)
+        if names and not named.split_unit(names[0], kind)[1] and not (kind == "length" and columns.length_unit)
     ]
     if unsaid:
         lines.append(f"# units: {{{', '.join(unsaid)}}}   # nothing says them: correct, and remove the #")
     return lines
 
 
-def _joint_name(log: _Log, when: RecognisedColumns, value: str, named: str | None) -> str:
-    if named or log.stream is not None:
-        return named or _joint_of(value)
+def _joint_name(log: _Log, when: named.RecognisedColumns, value: str, stated: str | None) -> str:
+    if stated or log.stream is not None:
+        return stated or _joint_of(value)
     stem = _NO_NAME.sub("_", log.stem)
     return stem if stem.endswith("angle") else f"{stem}_angle"
 
 
 def _joint_of(column: str) -> str:
-    return _NO_NAME.sub("_", split_unit(column, "angle")[0]).strip("_")
+    return _NO_NAME.sub("_", named.split_unit(column, "angle")[0]).strip("_")
 
 
 def _unique(names: list[str]) -> list[str]:

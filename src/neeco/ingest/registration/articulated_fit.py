@@ -18,14 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.ingest.foreground.silhouettes import SHAFT_LINES, Silhouettes, border_of
-from neeco.ingest.registration.base import (
-    BASE,
-    CLOCK_SHIFTS_S,
-    MIDDLE,
-    BasePrior,
-    moved_base,
-    poses_at_clock,
-)
+from neeco.ingest.registration.base import BASE, CLOCK_SHIFTS_S, MIDDLE, BasePrior, moved_base, poses_at_clock
 from neeco.states.outline_model import ArticulatedModel, Outlines
 
 
@@ -169,15 +162,6 @@ def contours_of(masks: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
     return contours
 
 
-@dataclass(frozen=True, eq=False)
-class _Points:
-    """Outline points that count in a linearisation: [F, N] of the model, and [F, M] of the masks."""
-
-    model: np.ndarray
-    masks: np.ndarray
-    contours: np.ndarray  # [F, M, 2] px, without NaN
-
-
 def outlines(problem: ArticulatedProblem, fit: ArticulatedFit) -> Outlines:
     """Project the fit's cones."""
     root = fit.world_from_base @ poses_at_clock(problem.poses, fit.clock)
@@ -193,7 +177,8 @@ def outlines(problem: ArticulatedProblem, fit: ArticulatedFit) -> Outlines:
     return fit.model.outlines(fit.parameters, values, root, problem.silhouettes.intrinsics)
 
 
-def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
+def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> np.ndarray:
+    """Points of the model's outline, then of the masks', that count in a linearisation: bool [F, N + M]."""
     projected, owner = outlines(problem, fit), fit.model.owner
     points = fit.model.outline_points(projected)
     others = projected.distances(points)[0]
@@ -201,16 +186,15 @@ def _points(problem: ArticulatedProblem, fit: ArticulatedFit) -> _Points:
     others[:, 1, owner == 0] = others[:, 0, owner == 1] = -1e3  # the tube continues in its end
     valid = projected.valid[:, owner] & (others.max(1) < LINKED_FIT.inside_px)
     valid &= problem.silhouettes.inside(points, margin=1.0 + SHAFT_LINES.edge_px)
-    on_masks = np.isfinite(problem.contours[..., 0])
-    return _Points(valid, on_masks, np.nan_to_num(problem.contours))
+    return np.concatenate([valid, np.isfinite(problem.contours[..., 0])], 1)
 
 
-def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points) -> np.ndarray:
-    """Residuals [F, N + M] px: positive where the model is too small."""
+def _residuals(problem: ArticulatedProblem, fit: ArticulatedFit, use: np.ndarray) -> np.ndarray:
+    """Residuals [F, N + M] px: positive where the model is too small; 0 of points that are not in `use`."""
     projected = outlines(problem, fit)
     ahead, _ = problem.silhouettes.look_up(fit.model.outline_points(projected))
-    back = -projected.distances(use.contours)[0].max(1)
-    return np.concatenate([np.where(use.model, ahead, 0.0), np.where(use.masks, back, 0.0)], 1)
+    back = -projected.distances(np.nan_to_num(problem.contours))[0].max(1)
+    return np.where(use, np.concatenate([ahead, back], 1), 0.0)
 
 
 def moved(problem: ArticulatedProblem, fit: ArticulatedFit, step: np.ndarray) -> ArticulatedFit:
@@ -226,12 +210,12 @@ def moved(problem: ArticulatedProblem, fit: ArticulatedFit, step: np.ndarray) ->
     )
 
 
-def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, free: np.ndarray) -> np.ndarray:
+def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Derivatives [F, N + M, free + K] of the residuals, through those of the cones' images: by the free parameters,
     then by the unknowns of the frame itself."""
     projected, model = outlines(problem, fit), fit.model
     _, slope = problem.silhouettes.look_up(model.outline_points(projected))
-    distances, places, ways = projected.distances(use.contours)
+    distances, places, ways = projected.distances(np.nan_to_num(problem.contours))
     nearest = distances.argmax(1)
     frame, point = np.indices(nearest.shape)
     place, way = places[frame, nearest, point], ways[frame, nearest, point]
@@ -250,8 +234,7 @@ def _jacobian(problem: ArticulatedProblem, fit: ArticulatedFit, use: _Points, fr
         ahead = (slope * (model.outline_points(plus) - model.outline_points(minus))).sum(-1)
         ends, widths = plus.ends - minus.ends, plus.widths - minus.widths
         shifted = (ends[frame, nearest] * way[:, :, None]).sum(-1) + widths[frame, nearest]
-        both = [np.where(use.model, ahead, 0.0), np.where(use.masks, -(share * shifted).sum(-1), 0.0)]
-        return np.concatenate(both, 1) / (2 * size)
+        return np.where(use, np.concatenate([ahead, -(share * shifted).sum(-1)], 1), 0.0) / (2 * size)
 
     columns = []
     for index in free:
@@ -357,9 +340,8 @@ def minimise(
     )
     use = _points(problem, fit)
     px = _residuals(problem, fit, use)
-    counted = np.concatenate([use.model, use.masks], 1)
     cost = _loss(px, width, noise) + float(np.square(prior_residuals(problem, fit)[0]).sum())
-    return replace(fit, cost=cost, residual_px=float(np.median(np.abs(px[counted]))) / problem.px_scale)
+    return replace(fit, cost=cost, residual_px=float(np.median(np.abs(px[use]))) / problem.px_scale)
 
 
 def fit_articulated(

@@ -13,10 +13,10 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import evenly_spaced
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid
-from neeco.ingest.frames.images import StageProgress, Views
-from neeco.ingest.readers.columns import CAMERA
+from neeco.ingest.frames.images import StageProgress, Views, reduced
 from neeco.ingest.readers.interpolate import poses_at, readings_at
 from neeco.ingest.readers.logs import ReadingLog
+from neeco.ingest.readers.names import CAMERA
 from neeco.ingest.recording.base import StatedBase
 from neeco.ingest.recording.model import InstrumentLogs
 from neeco.ingest.registration.articulated import LoggedMotion, find_base
@@ -66,16 +66,6 @@ def check_reference_frames(data: Episodes, *, moving: bool) -> None:
             f"{path}: world_from_base: the scope stands still; state the base of {item.name} to its camera, as "
             "camera_from_base, or write unknown"
         )
-
-
-def require_no_base(data: Episodes) -> None:
-    """Raise NeecoError for a base in front of a scope that moves and is not registered."""
-    for item in data.recording.instruments:
-        if item.base is not None:
-            raise NeecoError(
-                f"{data.recording.path}: world_from_base: where the base of {item.name} stands can be found only for a "
-                "scope whose own poses are recorded (laparoscope) and move enough to register it; leave it out"
-            )
 
 
 def find_bases(
@@ -215,7 +205,8 @@ class _Observed:
     def __init__(self, views: Views, moving: Callable[[np.ndarray], np.ndarray]) -> None:
         rows = np.array(evenly_spaced(len(views.times), PLACING.n_frames))
         self.times, self.cameras, self.masks = views.times[rows], views.world_from_camera[rows], moving(rows)
-        self.hidden = views.reduced_border  # pixels beyond a round border, bool [h, w]
+        # pixels at least in part beyond the field of view, bool [h, w]
+        self.hidden = None if views.visible is None else reduced(views.visible.astype(np.uint8) * 255) < 255
         self.intrinsics = views.reduced_pinhole.intrinsics  # of the reduced images
 
 

@@ -151,7 +151,8 @@ def register_with_laparoscope(
 
 
 class _HandEye:
-    """The least-squares problem: unknowns [U] about the closed form, the last of them the drift at its knots."""
+    """The least-squares problem: unknowns [U] about a closed form, the last of them the drift at its knots. Raises
+    NeecoError where the scope moved too little."""
 
     def __init__(
         self,
@@ -161,16 +162,49 @@ class _HandEye:
         clock: ClockOffset,
         settings: IngestSettings,
     ) -> None:
-        first_scale, first_rotation, first_translation, *_ = self.first = _closed_form(
-            world_from_camera, times, log, clock
-        )
         self.times, self.settings = times, settings
+        poses, self.valid = poses_at(log, clock.at(times))
+        if self.valid.sum() < HAND_EYE.min_frames:
+            raise NeecoError(
+                f"{log.path}: only {int(self.valid.sum())} video frames fall on its samples (at least "
+                f"{HAND_EYE.min_frames} are needed); check the clock offset in `sync` and that log and video "
+                "are of the same recording"
+            )
+        # in closed form: the hand-eye rotation from relative turns (rotation vectors differ by it alone), the rest
+        # linearly
+        cameras, sensors = world_from_camera[self.valid], poses[self.valid]
+        camera_turns, sensor_turns = (Rotation.from_matrix(part[:, :3, :3]) for part in (cameras, sensors))
+        middle = len(cameras) // 2
+        steps = [(0, slice(None)), (middle, slice(None)), (len(cameras) - 1, slice(None))]
+        # relative turns [3N, 3] in the camera's and in the sensor's frame
+        a, b = (
+            np.concatenate([(turns[i].inv() * turns[j]).as_rotvec() for i, j in steps])
+            for turns in (camera_turns, sensor_turns)
+        )
+        spread = np.linalg.svd(b, compute_uv=False) / np.sqrt(len(b))
+        if spread[1] < HAND_EYE.min_turn_rad:
+            raise NeecoError(
+                f"{log.path}: the laparoscope turned about hardly more than one axis ({np.degrees(spread[1]):.1f} deg "
+                "across the others), so its hand-eye calibration cannot be found; record the scope turning about two "
+                "axes by 10 deg or more"
+            )
+        hand, _ = Rotation.align_vectors(a, b)
+        world_from_sfm = (sensor_turns * hand.inv() * camera_turns.inv()).mean()
+        turned = world_from_sfm.as_matrix() @ cameras[:, :3, :3]  # [N, 3, 3] world_from_camera rotations
+        travel = cameras[:, :3, 3] @ world_from_sfm.as_matrix().T  # [N, 3]
+        system = [travel[:, :, None], np.tile(np.eye(3), (len(cameras), 1, 1)), turned]
+        solution = np.linalg.lstsq(np.concatenate(system, -1).reshape(-1, 7), sensors[:, :3, 3].ravel(), rcond=None)[0]
+        if solution[0] <= 0 or np.linalg.norm(travel.std(0)) * solution[0] < HAND_EYE.min_travel_mm:
+            raise NeecoError(
+                f"{log.path}: the laparoscope travelled too little to tell the scale; move it by 20 mm or more"
+            )
+        # scale, world_from_sfm, camera_from_sensor, and the sensor's origin in the camera's frame [3] mm
+        self.first = float(solution[0]), world_from_sfm, hand, solution[4:]
         # centred, so that scale and translation decouple, as lag and stretch do
         self.centre, self.now = world_from_camera[:, :3, 3].mean(0), float(times.mean())
         self.arms = world_from_camera[:, :3, 3] - self.centre
         self.turns = Rotation.from_matrix(world_from_camera[:, :3, :3])
-        self.middle = first_scale * first_rotation.apply(self.centre) + first_translation
-        _, self.valid = _sensor_poses(times, log, clock)
+        self.middle = float(solution[0]) * world_from_sfm.apply(self.centre) + solution[1:4]
         # on the video's clock: seconds since 1970 leave too few digits for derivatives
         gaps = tuple((float(start), float(end)) for start, end in clock.video_times(np.reshape(log.gaps, (-1, 2))))
         near = replace(log, times=clock.video_times(log.times), gaps=gaps)
@@ -187,7 +221,7 @@ class _HandEye:
 
     def unpack(self, x: np.ndarray) -> tuple[float, Rotation, np.ndarray, Rotation, np.ndarray, float, float]:
         """Scale, rotation, translation of the centre, camera_from_sensor's rotation and lever mm, lag s and stretch."""
-        first_scale, first_rotation, _, first_hand, first_lever = self.first
+        first_scale, first_rotation, first_hand, first_lever = self.first
         rotation = Rotation.from_rotvec(x[1:4]) * first_rotation
         hand = first_hand * Rotation.from_rotvec(x[7:10])
         origin, lever = self.middle + x[4:7], first_lever + x[10:13]
@@ -275,51 +309,3 @@ def _clock_deviations(covariances: np.ndarray) -> np.ndarray:
     """Standard deviations [2] of LAG, s, and STRETCH."""
     clock = [LAG, STRETCH]
     return np.asarray(np.sqrt(np.maximum(covariances[:, clock, clock].max(0), 0.0)))
-
-
-def _sensor_poses(times: np.ndarray, log: PoseLog, clock: ClockOffset) -> tuple[np.ndarray, np.ndarray]:
-    poses, valid = poses_at(log, clock.at(times))
-    if valid.sum() < HAND_EYE.min_frames:
-        raise NeecoError(
-            f"{log.path}: only {int(valid.sum())} video frames fall on its samples (at least "
-            f"{HAND_EYE.min_frames} are needed); check the clock offset in `sync` and that log and video "
-            "are of the same recording"
-        )
-    return poses, valid
-
-
-def _closed_form(
-    world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog, clock: ClockOffset
-) -> tuple[float, Rotation, np.ndarray, Rotation, np.ndarray]:
-    """Solve the hand-eye rotation from relative turns (rotation vectors differ by it alone), the rest linearly.
-
-    Return scale, world_from_sfm, translation, camera_from_sensor, and the sensor's origin in the camera's frame [3] mm.
-    """
-    poses, valid = _sensor_poses(times, log, clock)
-    cameras, sensors = world_from_camera[valid], poses[valid]
-    camera_turns, sensor_turns = Rotation.from_matrix(cameras[:, :3, :3]), Rotation.from_matrix(sensors[:, :3, :3])
-    middle = len(cameras) // 2
-    steps = [(0, slice(None)), (middle, slice(None)), (len(cameras) - 1, slice(None))]
-    # relative turns [3N, 3] in the camera's and in the sensor's frame
-    a, b = (
-        np.concatenate([(turns[i].inv() * turns[j]).as_rotvec() for i, j in steps])
-        for turns in (camera_turns, sensor_turns)
-    )
-    spread = np.linalg.svd(b, compute_uv=False) / np.sqrt(len(b))
-    if spread[1] < HAND_EYE.min_turn_rad:
-        raise NeecoError(
-            f"{log.path}: the laparoscope turned about hardly more than one axis ({np.degrees(spread[1]):.1f} deg "
-            "across the others), so its hand-eye calibration cannot be found; record the scope turning about two axes "
-            "by 10 deg or more"
-        )
-    camera_from_sensor, _ = Rotation.align_vectors(a, b)
-    world_from_sfm = (sensor_turns * camera_from_sensor.inv() * camera_turns.inv()).mean()
-    turned = world_from_sfm.as_matrix() @ cameras[:, :3, :3]  # [N, 3, 3] world_from_camera rotations
-    travel = cameras[:, :3, 3] @ world_from_sfm.as_matrix().T  # [N, 3]
-    system = np.concatenate([travel[:, :, None], np.tile(np.eye(3), (len(cameras), 1, 1)), turned], -1).reshape(-1, 7)
-    solution = np.linalg.lstsq(system, sensors[:, :3, 3].ravel(), rcond=None)[0]
-    if solution[0] <= 0 or np.linalg.norm(travel.std(0)) * solution[0] < HAND_EYE.min_travel_mm:
-        raise NeecoError(
-            f"{log.path}: the laparoscope travelled too little to tell the scale; move it by 20 mm or more"
-        )
-    return float(solution[0]), world_from_sfm, solution[1:4], camera_from_sensor, solution[4:]

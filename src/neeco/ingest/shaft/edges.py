@@ -223,19 +223,6 @@ def axis_coordinates(axes: ShaftAxes, frame: int, pixels: np.ndarray, intrinsics
     return places_nearest_to_rays(axes.points[frame], axes.directions[frame], rays)
 
 
-def tips_along(masks: np.ndarray, axes: ShaftAxes, intrinsics: Intrinsics) -> np.ndarray:
-    """Coordinates [F] mm along each axis, from its point, of the tip of its mask [F, h, w]; NaN where that is not in
-    the image."""
-    tips = np.full(len(masks), np.nan)
-    for frame, mask in enumerate(masks):
-        if len(places := largest_piece(mask)):
-            hull = cv2.convexHull(places.astype(np.float32))[:, 0]
-            along = axis_coordinates(axes, frame, hull, intrinsics)
-            margin = np.minimum(hull, np.array(mask.shape[::-1]) - hull)[along.argmax()].min()
-            tips[frame] = along.max() if margin > EDGE.border_px else np.nan
-    return tips
-
-
 def shaft_ends(images: np.ndarray, masks: np.ndarray, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Coordinates [F] px along lines, through `points` [F, 2] px along unit `directions` [F, 2] towards the tip, where
     the shaft ends in the masks [F, h, w] of images uint8 [F, h, w, 3]. NaN where it does not end within the mask, or

@@ -13,18 +13,11 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import UNKNOWN_DEG, Uncertainty, evenly_spaced
 from neeco.geometry.lines import distances_to_lines, unit
 from neeco.geometry.rotations import rigid
-from neeco.ingest.foreground.silhouettes import shaft_lines
+from neeco.ingest.foreground.silhouettes import largest_piece, shaft_lines
 from neeco.ingest.frames.images import SfmResult, Views, reduced
 from neeco.ingest.recording.model import InstrumentLogs
 from neeco.ingest.shaft.axis import ShaftAxes, ShaftEdges, ShaftVideo, across_axes, edge_distances, solve_axes
-from neeco.ingest.shaft.edges import (
-    EDGE,
-    axis_coordinates,
-    outline_edges,
-    shaded_edges,
-    shaft_ends,
-    tips_along,
-)
+from neeco.ingest.shaft.edges import EDGE, axis_coordinates, outline_edges, shaded_edges, shaft_ends
 from neeco.ingest.timing.episodes import Episodes
 
 
@@ -261,7 +254,13 @@ def _at_end(
     direction = (second - first) / np.linalg.norm(second - first, axis=1, keepdims=True)
     ends = first + shaft_ends(images, masks, first, direction)[:, None] * direction
     shift = np.array([axis_coordinates(axes, row, end[None], video.intrinsics)[0] for row, end in enumerate(ends)])
-    tips = tips_along(masks, axes, video.intrinsics)
+    tips = np.full(len(masks), np.nan)  # mm along each axis, from its point; NaN where the tip is not in the image
+    for frame, mask in enumerate(masks):
+        if len(places := largest_piece(mask)):
+            hull = cv2.convexHull(places.astype(np.float32))[:, 0]
+            along = axis_coordinates(axes, frame, hull, video.intrinsics)
+            margin = np.minimum(hull, np.array(mask.shape[::-1]) - hull)[along.argmax()].min()
+            tips[frame] = along.max() if margin > EDGE.border_px else np.nan
     heads = None
     if np.isfinite(shift).any():
         heads = tips - shift + offset

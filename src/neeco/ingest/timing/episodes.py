@@ -105,13 +105,11 @@ class Episode:
         """Times [V] s of every frame."""
         return self.video.times
 
-    def logged_poses(self, log: PoseLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return poses [N, 4, 4] in the tracker's frame at video times [N] s, and whether they are known."""
-        return poses_at(log, self.clocks[log.clock].at(times))
-
-    def logged_readings(self, log: ReadingLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings [N] at video times [N] s, and whether they are known."""
-        return readings_at(log, self.clocks[log.clock].at(times))
+    def logged(self, log: PoseLog | ReadingLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return poses [N, 4, 4] in the tracker's frame, or readings [N], at video times [N] s, and whether they are
+        known."""
+        at = self.clocks[log.clock].at(times)
+        return poses_at(log, at) if isinstance(log, PoseLog) else readings_at(log, at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +252,7 @@ class Episodes:
 
         def of(part: Episode, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             assert part.scope is not None
-            return part.logged_poses(part.scope, local)
+            return part.logged(part.scope, local)
 
         return self._gathered(times, of, (4, 4))[0]
 
@@ -272,10 +270,10 @@ class Episodes:
             valid = np.abs(times - video_times[row]) < EPISODES.same_instant
             resampled = np.where(valid[:, None, None], poses[row], np.nan)
             if name in self.parts[0].rolls:
-                roll, logged = self._gathered(times, lambda part, t: part.logged_readings(part.rolls[name], t), ())
+                roll, logged = self._gathered(times, lambda part, t: part.logged(part.rolls[name], t), ())
                 resampled, valid = with_roll(resampled, np.nan_to_num(roll)), valid & logged
             return resampled, valid
-        poses, valid = self._gathered(times, lambda part, t: part.logged_poses(part.poses[name], t + lag), (4, 4))
+        poses, valid = self._gathered(times, lambda part, t: part.logged(part.poses[name], t + lag), (4, 4))
         return (self.world_from_base[name] @ poses if name in self.world_from_base else poses), valid
 
     def states_at(self, times: np.ndarray) -> tuple[States, np.ndarray]:
@@ -295,7 +293,7 @@ class Episodes:
                 def of(part: Episode, local: np.ndarray, name: str = name, joint: str = joint) -> Any:
                     log = part.joints[name][joint]
                     span = limits[name][joint]
-                    values, valid = part.logged_readings(log, local)
+                    values, valid = part.logged(log, local)
                     if span is None:
                         return values, valid
                     clipped = np.clip(values, *span)
@@ -360,31 +358,22 @@ def with_roll(poses: np.ndarray, roll: np.ndarray) -> np.ndarray:
 def _coverage(part: Episode) -> tuple[np.ndarray, np.ndarray]:
     """`Episodes.coverage_states` of one episode, [V] its frames."""
     columns, usable = [], np.ones(len(part.times), dtype=bool)
-    for log in part.poses.values():
-        if log.clock in part.clocks:
-            poses, valid = part.logged_poses(log, part.times)
-            usable &= valid
-            columns.append(np.where(valid[:, None], poses[:, :3, 3], 0.0))
-            columns.append(np.where(valid[:, None], poses[:, :3, :3].reshape(-1, 9)[:, :3], 0.0))
-            _check_overlap(part, log, valid)
     placed = [item.name for item in part.recording.instruments if item.placed]
-    for reading in (log for name in placed for log in part.joints[name].values()):
-        if reading.clock in part.clocks:
-            values, valid = part.logged_readings(reading, part.times)
-            usable &= valid
-            columns.append(np.where(valid, values, 0.0)[:, None])
-            _check_overlap(part, reading, valid)
+    logs: list[PoseLog | ReadingLog] = [*part.poses.values()]
+    logs += [log for name in placed for log in part.joints[name].values()]
+    for log in (log for log in logs if log.clock in part.clocks):
+        values, valid = part.logged(log, part.times)
+        usable &= valid
+        state = [values[:, :3, 3], values[:, 0, :3]] if isinstance(log, PoseLog) else [values[:, None]]
+        columns += [np.where(valid[:, None], each, 0.0) for each in state]
+        if not valid.any():
+            first, last = part.clocks[log.clock].video_times(log.times[[0, -1]])
+            raise NeecoError(
+                f"{log.path}: has no sample for any video frame: by the video's clock it covers {first:g} to {last:g} "
+                f"s, the video {part.times[0]:g} to {part.times[-1]:g} s; correct the offset of its clock, sync: "
+                f"{log.clock}"
+            )
     return np.concatenate(columns or [np.zeros((len(part.times), 6))], 1), usable
-
-
-def _check_overlap(part: Episode, log: PoseLog | ReadingLog, valid: np.ndarray) -> None:
-    if not valid.any():
-        first, last = part.clocks[log.clock].video_times(log.times[[0, -1]])
-        raise NeecoError(
-            f"{log.path}: has no sample for any video frame: by the video's clock it covers {first:g} to {last:g} "
-            f"s, the video {part.times[0]:g} to {part.times[-1]:g} s; correct the offset of its clock, sync: "
-            f"{log.clock}"
-        )
 
 
 def assumed_clock(log: PoseLog | ReadingLog, times: np.ndarray) -> ClockOffset:
