@@ -406,12 +406,6 @@ def test_the_right_cameras_camera_info_gives_its_pose_to_the_left_one(tmp_path, 
     np.testing.assert_allclose(seen, of_left @ point - [5.5, 0, 0], atol=1e-9)
 
 
-def test_cameras_calibrated_one_by_one_are_no_stereo_scope(tmp_path: Path) -> None:
-    path = write_stereo(tmp_path, baseline=0.0)
-    said = refusal(lambda: known(path).stereo(path, "/stereo/left/image_raw", "/stereo/right/image_raw"))
-    assert "/stereo/right/camera_info: projection_matrix: has no baseline (its 4th number is 0)" in said
-
-
 def test_a_bag_without_the_right_cameras_camera_info_says_what_to_give(tmp_path: Path) -> None:
     path = whole(tmp_path)
     assert "has no /stereo/right/camera_info; give a calibration of both cameras" in refusal(

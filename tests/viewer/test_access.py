@@ -105,7 +105,7 @@ def test_a_port_that_is_taken_gives_the_next() -> None:
     [
         ("127.0.0.1", 0, "--port"),
         ("127.0.0.1", 65536, "--port"),
-        ("no.such.host.invalid", 80, "--host"),
+        ("no such host", 80, "--host"),  # which no name server is asked for
         ("203.0.113.1", 8080, "--host"),
     ],
 )
