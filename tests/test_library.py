@@ -8,12 +8,10 @@ import inspect
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -21,10 +19,10 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from documented_world import SAMPLE, names, write_small
 from PIL import Image
 
 import neeco
-from neeco.capture import write_capture
 from neeco.capture.model import InstrumentState
 from neeco.cli import main
 from neeco.synthesis.dataset import synthesize
@@ -32,35 +30,31 @@ from neeco.synthesis.settings import Settings
 from neeco.training.run import load_run
 
 ROOT = Path(__file__).resolve().parents[1]
-SAMPLE = ROOT / "samples" / "liver-mini"
-
 
 STRICT = "# mypy: disallow-untyped-defs, disallow-any-generics, disallow-untyped-calls, warn-return-any"
 
 
-def example(name: str) -> ModuleType:
-    """A program of examples/ as a module."""
+def example(name: str, sample: Path = SAMPLE) -> ModuleType:
+    """A program of examples/ as a module, which reads `sample` in place of the whole sample capture."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    vars(module).update(SAMPLE=sample)
     return module
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder as the docstrings' examples expect it, with a run that the first program trained on a third of the
-    sample's frames."""
+    sample's frames, at a third of their size."""
     folder = tmp_path_factory.mktemp("library")
-    capture, sample = neeco.read_capture(SAMPLE), folder / "samples" / "liver-mini"
-    third = {frame.name for split in ("train", "test", "unseen") for frame in capture.split(split)[::3]}
-    write_capture(replace(capture, frames=tuple(frame for frame in capture.frames if frame.name in third)), sample)
-    shutil.copytree(SAMPLE / "truth", sample / "truth")
+    sample = folder / "samples" / "liver-mini"
+    write_small(sample, {name for split in ("train", "test", "unseen") for name in names(split)[::3]})
     (folder / "my-capture").symlink_to(sample)
-    write_capture(replace(capture, frames=capture.frames[:1]), folder / "footage")
-    program = example("01_train_and_draw")
-    program.SAMPLE = sample
+    write_small(folder / "footage", {names("train")[0]})
+    program = example("01_train_and_draw", sample)
     quick = {"train": partial(neeco.train, deformation__carving__tissue_steps=150)}
     program.neeco = SimpleNamespace(**{name: getattr(neeco, name) for name in neeco.__all__} | quick)
     program.main(folder / "runs" / "sample", iterations=60)
@@ -169,20 +163,20 @@ def test_what_a_notebook_shows_of_an_object_is_one_short_line(folder: Path) -> N
         assert "array" not in shown
     counts = "32 frames (24 train, 4 test, 4 unseen)"
     assert repr(capture) == f"Capture('{folder / 'samples' / 'liver-mini'}', {counts}, maryland)"
-    assert re.fullmatch(r"Camera\(240x192 px, fx=217.5, fy=217.5, at \(.*\) mm\)", repr(camera))
+    assert re.fullmatch(r"Camera\(80x64 px, fx=72.5, fy=72.5, at \(.*\) mm\)", repr(camera))
     assert repr(neeco.State({}, 1.5)) == "State(time=1.5 s)"
 
 
 def test_errors_name_arguments_in_python_and_options_on_the_command_line(folder, capsys):
-    run, output = folder / "runs" / "sample", folder / "refused"
+    run, sample, output = folder / "runs" / "sample", folder / "samples" / "liver-mini", folder / "refused"
     wrong: list[tuple[Callable[[], object], str]] = [
-        (lambda: neeco.train(SAMPLE, output, iterations=0), "iterations: 0 is not a positive number"),
-        (lambda: neeco.train(SAMPLE, output, iteration=9), "iteration: unknown field; see config.yaml of any run for"),
-        (lambda: neeco.train(SAMPLE, output, iteration=9), "; did you mean iterations?"),
-        (lambda: neeco.train(SAMPLE, output, density__prune_stp=1), "; did you mean density__prune_stop?"),
+        (lambda: neeco.train(sample, output, iterations=0), "iterations: 0 is not a positive number"),
+        (lambda: neeco.train(sample, output, iteration=9), "iteration: unknown field; see config.yaml of any run for"),
+        (lambda: neeco.train(sample, output, iteration=9), "; did you mean iterations?"),
+        (lambda: neeco.train(sample, output, density__prune_stp=1), "; did you mean density__prune_stop?"),
         (lambda: neeco.synthesize(run, output, 1, sed=1), "; did you mean seed?"),
-        (lambda: neeco.train(SAMPLE, output, density__prune_interval="x"), "density__prune_interval: 'x' is not a"),
-        (lambda: neeco.train(SAMPLE, output, batch_size=2, method="nerfies"), "use deformation__rays=NUMBER"),
+        (lambda: neeco.train(sample, output, density__prune_interval="x"), "density__prune_interval: 'x' is not a"),
+        (lambda: neeco.train(sample, output, batch_size=2, method="nerfies"), "use deformation__rays=NUMBER"),
         (lambda: neeco.synthesize(run, output, 1, max_attempts=0), "max_attempts: 0 is out of range"),
         (lambda: neeco.synthesize(run, output, 1, tries=1), "tries: synthesize has no such field; it has size, scale"),
         (lambda: neeco.ingest(output=output), "video: give the video"),
@@ -204,10 +198,7 @@ def test_the_recipe_for_the_next_operation_runs_as_the_page_says(folder, inside)
     train, synthesize_set, downstream = (
         line.split() for line in re.findall(r"^    (neeco .*)$", page, re.MULTILINE)[:3]
     )
-    capture = neeco.read_capture(SAMPLE)
-    frames = [*capture.split("train")[::6], *capture.split("test")[:2]]
-    write_capture(replace(capture, frames=frames), Path("FIRST"))
-    shutil.copytree(SAMPLE / "truth", "FIRST/truth", dirs_exist_ok=True)
+    write_small(Path("FIRST"), {*names("train")[::6], *names("test")[:2]})
     Path("SECOND").symlink_to("FIRST")
     Path("RUN").symlink_to(folder / "runs" / "sample")
     Path("PLATES").mkdir()
@@ -287,23 +278,23 @@ def test_a_run_evaluates_as_the_command_does(folder: Path) -> None:
         neeco.load(folder / "runs" / "sample").evaluate(["nowhere"])
 
 
-def test_a_setting_that_is_not_there_is_refused_by_name(tmp_path: Path) -> None:
+def test_a_setting_that_is_not_there_is_refused_by_name(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(neeco.NeecoError, match="deformation"):
-        neeco.train(SAMPLE, tmp_path / "run", deformation__nothing=3)
+        neeco.train(folder / "samples" / "liver-mini", tmp_path / "run", deformation__nothing=3)
 
 
 def test_the_programs_in_examples_run(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = folder / "runs" / "sample"
+    run, sample = folder / "runs" / "sample", folder / "samples" / "liver-mini"
     example("02_train_on_the_fly").main(run, steps=2, workers=0)
     example("03_own_states").main(run, size=2)
     assert (run / "states.png").exists()
-    example("04_own_method").main(tmp_path / "sway", iterations=5)
-    example("05_own_capture").main(tmp_path / "capture", iterations=5, method="3dgs")
+    example("04_own_method", sample).main(tmp_path / "sway", iterations=5)
+    example("05_own_capture", sample).main(tmp_path / "capture", iterations=5, method="3dgs")
     example("06_other_formats").main(run, tmp_path / "dataset", count=2)
     logged: dict[int, dict[str, float]] = {}
     example("08_jaw_sweep").main(run, tmp_path / "sweep.gif", count=3, width=60)
     assert Image.open(tmp_path / "sweep.gif").n_frames == 3  # type: ignore[attr-defined]
-    example("07_log_training").main(
+    example("07_log_training", sample).main(
         tmp_path / "watched", log=logged.__setitem__, iterations=50, method="3dgs", scale=0.5
     )
     assert logged[50]["loss"] > 0
