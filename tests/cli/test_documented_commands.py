@@ -127,7 +127,7 @@ SMALLER = (
 )
 TRAINING = {"train": "--iterations 40", "demo": "--minutes 0.05"}  # `refine` trains as its run was
 SMALL_SWEEP = ("--iterations 40", "--set max_tissue_gaussians=1500", "--set initial_points=400")
-SMALL_ADAPT = {"--frames": 4, "--count": 4, "--steps": 30, "--rounds": 1, "--min-overlap": 0}
+SMALL_ADAPT = {"--frames": 4, "--count": 16, "--steps": 120, "--rounds": 1, "--min-overlap": 0}
 SMALL_STUDY = {"--folds": 1, "--steps": 1, "--size": 48, "--batch": 2, "--num-real": 2, "--device": "cpu"}
 
 
