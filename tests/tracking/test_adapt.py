@@ -99,6 +99,12 @@ def test_poor_proposals_become_labels_of_the_whole_instrument(adapted: Adapted, 
         assert (read_image_bytes(adapted.output / "images" / image.name) == read_image_bytes(image)).all()
 
 
+def test_the_card_says_where_images_and_masks_are_from(adapted: Adapted, operation: Path) -> None:
+    card = (adapted.output / "README.md").read_text()
+    assert "recorded in another operation" in card
+    assert f"{operation / 'images'} --masks {operation / 'masks'} --model unet" in card
+
+
 def test_the_hinge_is_found_wherever_it_is_in_the_image(adapted: Adapted) -> None:
     """A shaft's tilt towards the camera is hardly visible in silhouettes."""
     for state, entry in zip(states(), adapted.records, strict=True):
@@ -176,6 +182,19 @@ def test_options_that_nothing_can_be_made_of_are_named(run, operation, tmp_path,
     with pytest.raises(NeecoError) as error:
         adapt_footage(run, request_of(operation, tmp_path / "out", **{name: value}), silent)
     assert str(error.value).startswith(message)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"backgrounds": Path("nowhere")}, "--backgrounds: nowhere: no such folder"),
+        ({"model": "dfine"}, "--model: dfine"),
+    ],
+)
+def test_what_a_segmenter_cannot_learn_with_is_refused_at_once(run, operation, tmp_path, options, message) -> None:
+    with pytest.raises(NeecoError, match=message):
+        adapt_footage(run, request_of(operation, tmp_path / "out", masks=None, **options), silent)
     assert not (tmp_path / "out").exists()
 
 

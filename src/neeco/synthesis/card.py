@@ -47,8 +47,8 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
     path = root / CARD
     if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
         return
-    annotated = "annotates" in info["settings"]
-    title = f"{'Recorded' if annotated else 'Synthetic'} images of surgical instruments, labelled"
+    annotated, adapted = "annotates" in info["settings"], "footage" in info["settings"]
+    title = f"{'Recorded' if annotated or adapted else 'Synthetic'} images of surgical instruments, labelled"
     suffix = "png" if info["settings"].get("quality") is None else "jpg"
     digits = {k: "".join(str(digit) for digit in range(10) if split_of(digit) == k) for k in info["splits"]}
     paths = {k: f"images/*[{last}].{suffix}" for k, last in digits.items()}  # the index's last digit decides
@@ -66,7 +66,7 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
         "license": "unknown",
         "pretty_name": title,
         "task_categories": tasks,
-        "tags": TAGS if annotated else [*TAGS, "synthetic"],
+        "tags": TAGS if annotated or adapted else [*TAGS, "synthetic"],
         "size_categories": [next((name for name, limit in SIZES.items() if info["images"] < limit), "n>10M")],
         "configs": [config],
     }
@@ -79,6 +79,7 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
         mark=MARK,
         title=title,
         annotated=annotated,
+        adapted=adapted,
         info=info,
         splits=", ".join(f"{count} {split}" for split, count in info["splits"].items()),
         classes=[(item["id"], word, item["part"]) for item, word in zip(info["ids"], words, strict=True)],
@@ -91,6 +92,13 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
 def _command(info: Mapping[str, Any]) -> str:
     """Return the command that makes the set again."""
     settings = info["settings"]
+    formats = ["--formats", *info["formats"]] if info["formats"] else []
+    if "footage" in settings:
+        words = ["adapt", info["scene"], settings["footage"]]
+        for name, value in settings.items():
+            if name != "footage" and value is not None:
+                words += [f"--{name.replace('_', '-')}", *(value if isinstance(value, list) else [value])]
+        return shlex.join(map(str, ["neeco", *words, *formats, "--output", "DATASET"]))
     if "annotates" in settings:
         words = ["annotate", info["scene"], "--capture", settings["annotates"], "--min-trust", settings["min_trust"]]
     elif "instruments" in info:
@@ -108,7 +116,6 @@ def _command(info: Mapping[str, Any]) -> str:
             words += [flag, *(value if isinstance(value, list) else ["FILE"] if isinstance(value, dict) else [value])]
     if "annotates" in settings and settings.get("class_names"):
         words += ["--class-names", *settings["class_names"]]
-    formats = ["--formats", *info["formats"]] if info["formats"] else []
     return shlex.join(map(str, ["neeco", *words, *formats, "--output", "DATASET"]))
 
 

@@ -31,12 +31,13 @@ from neeco.labels.labellers import CompositedLabels
 from neeco.labels.settings import LABELS
 from neeco.studies.adaptation import AdaptRequest
 from neeco.studies.adaptation.footage import adapted_frames
-from neeco.studies.downstream.model import TrainingTask, input_size, model_class
+from neeco.studies.downstream.model import TorchModel, TrainingTask, input_size, model_class
 from neeco.studies.downstream.samples import Example, ImageSet, Sample, class_table
 from neeco.studies.downstream.samples import SyntheticSample as LabelledFile
 from neeco.studies.downstream.training_data import BatchSampler
 from neeco.synthesis.dataset import DataSetFolder, description, synthesize
 from neeco.synthesis.settings import Settings
+from neeco.synthesis.tissue_replacement import ImageFolder
 from neeco.synthesis.writers import encoded_sample, skipped_sample
 from neeco.tracking.from_labels import LabelFitter
 from neeco.training.run import GaussianRun
@@ -92,6 +93,10 @@ def adapt_footage(run: GaussianRun, request: AdaptRequest, progress: Progress) -
     hardly any frame is accepted: the footage shows another instrument, or the proposals are too poor.
     """
     request.check()
+    if request.masks is None:
+        _segmenter(request.model)
+        if request.backgrounds is not None:
+            ImageFolder.of(request.backgrounds, "backgrounds")
     output, scene = Path(request.output), run.scene
     names = ("footage", "backgrounds", "masks")
     paths = {name: value and os.path.abspath(value) for name in names for value in [getattr(request, name)]}
@@ -179,11 +184,7 @@ def _taught(
 ) -> list[Record]:
     """Return the records of the last round: the segmenter learns from rendered images, then from accepted frames,
     too."""
-    kind, classes = model_class(request.model), verifier.fitter.classes
-    if kind.predicts != "masks":
-        raise NeecoError(f"--model: {request.model} predicts boxes; give a model that predicts masks, such as unet")
-    if missing := kind.missing_requirement():
-        raise NeecoError(f"--model: {request.model}: {missing}")
+    kind, classes = _segmenter(request.model), verifier.fitter.classes
     backgrounds = None if request.backgrounds is None else str(request.backgrounds)
     settings = Settings(
         count=request.count,
@@ -236,6 +237,16 @@ def _taught(
         proposals = [read_labels(file).numpy() for file in files]
         records = verifier.verify(proposals, place, words)
     return records
+
+
+def _segmenter(name: str) -> type[TorchModel]:
+    """Return the model of that name. Raises NeecoError for one that predicts boxes or cannot be trained here."""
+    kind = model_class(name, "--model")
+    if kind.predicts != "masks":
+        raise NeecoError(f"--model: {name} predicts boxes; give a model that predicts masks, such as unet")
+    if missing := kind.missing_requirement():
+        raise NeecoError(f"--model: {name}: {missing}")
+    return kind
 
 
 def _report(progress: Progress, words: str, share: float, text: str) -> None:

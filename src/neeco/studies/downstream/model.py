@@ -150,12 +150,12 @@ def find_models() -> dict[str, type[TorchModel]]:
     return plugins(TorchModel, "model", "neeco.studies.downstream.models", "neeco.models")  # type: ignore[type-abstract]
 
 
-def model_class(name: str) -> type[TorchModel]:
-    """Return the model of that name. Raises NeecoError if there is none."""
+def model_class(name: str, option: str = "--models") -> type[TorchModel]:
+    """Return the model of that name, given by an option. Raises NeecoError if there is none."""
     models = find_models()
     if name not in models:
         available = ", ".join(models)
-        raise NeecoError(f"--models: {name!r} is unknown; choose one of: {available}, or install its package")
+        raise NeecoError(f"{option}: {name!r} is unknown; choose one of: {available}, or install its package")
     return models[name]
 
 
