@@ -83,6 +83,13 @@ class ViewerPage:
         """The number beside a slider."""
         return float(self._row(label).locator("input").last.input_value())
 
+    def comes_to(self, label: str, value: float) -> bool:
+        """Whether the number beside a slider becomes `value`."""
+        until = time.monotonic() + PATIENCE_S
+        while self.value(label) != value and time.monotonic() < until:
+            self.page.wait_for_timeout(20)
+        return self.value(label) == value
+
     def tick(self, label: str) -> None:
         """Click a checkbox."""
         self._row(label).locator("input[type=checkbox]").first.click()

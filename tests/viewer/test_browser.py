@@ -182,7 +182,7 @@ def test_the_gizmo_takes_the_instrument_along(page: ViewerPage, scene) -> None:
     page.tick("drag it in the scene")
     held = page.settled()
     assert alike(held, scene, slide=5.0) > ALIKE_DB
-    assert page.value("along shaft (mm)") == 0.0
+    assert page.comes_to("along shaft (mm)", 0.0)
     page.set("frame", 6.0)  # held where it is
     page.press("go to this frame's camera")
     pose = to_numpy(
