@@ -89,16 +89,16 @@ class Renderer:
         """Render a frame and write its image, its masks of parts and of the shadow, and its depth."""
         view, gain = view_of(shot.moment), self.gains.get(shot.number)
         drawing = draw(self.place, view, gain)
-        pixels = self._stored(drawing.color, np.random.default_rng((self.spec.seed, shot.number)))
+        pixels = self.stored(drawing.color, np.random.default_rng((self.spec.seed, shot.number)))
         _write_jpeg(self.path / image_name(shot), pixels)
         self._write_truth(shot, drawing, shadowed(self.place, view, drawing))
         if self.settings.stereo:
             color = draw(seen_from_right(self.place), view_of(beside(shot).moment), gain).color
-            right = self._stored(color, np.random.default_rng((self.spec.seed, shot.number, 2)))
+            right = self.stored(color, np.random.default_rng((self.spec.seed, shot.number, 2)))
             _write_jpeg(self.path / right_name(shot), right)
         return Rendered(pixels, drawing)
 
-    def _stored(self, color: Tensor, generator: np.random.Generator) -> Array:
+    def stored(self, color: Tensor, generator: np.random.Generator) -> Array:
         processor = self.settings.processor
         return _add_noise(processor.develop(color) if processor != Processor() else color, processor.noise, generator)
 

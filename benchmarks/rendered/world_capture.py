@@ -49,7 +49,7 @@ def write_world(world: World, path: Path) -> Capture:
     if (path / "transforms.json").exists():
         raise NeecoError(f"{path}: already holds a capture; choose another folder")
     place = world.place()
-    spec, shots, trajectory = _visible(world, place)
+    spec, shots, trajectory = visible_scene(world, place)
     moved: dict[int, Displaced] = {}
     if world.touch is not None:
         splits = ("train", "test", "unseen")
@@ -97,7 +97,7 @@ def write_world(world: World, path: Path) -> Capture:
     return capture
 
 
-def _visible(world: World, place: Place) -> tuple[SceneSpec, list[Shot], Trajectory]:
+def visible_scene(world: World, place: Place) -> tuple[SceneSpec, list[Shot], Trajectory]:
     """The scene with its instrument off the tissue and covering a plausible share of the image, and its frames."""
     spec = world.scene()
     if world.scope != "moving":
