@@ -415,15 +415,14 @@ def adapt(
         adapted = neeco.adapt("runs/sample", "footage", "labelled", min_overlap=0.8)
         print(adapted.verdict, adapted.accepted)
     """
+    from neeco.base.settings import structure
     from neeco.studies.adaptation import AdaptRequest
     from neeco.studies.adaptation.adapt import adapt_footage
 
     opened = _opened(run, device, force).gaussians("adapt")
     opened.require_trusted("adapt")
-    for name in ("backgrounds", "masks"):
-        options[name] = None if options.get(name) is None else Path(options[name])
-    place = {"run": Path(opened.path), "footage": Path(footage), "output": Path(output)}
-    request = AdaptRequest(**{**place, **options, "device": device, "force": force})
+    place = {"run": opened.path, "footage": footage, "output": output, "device": device, "force": force}
+    request = structure(AdaptRequest, {**options, **place}, owner="adapt")
     with opened.scene.torch_threads():
         return adapt_footage(opened, request, progress or _silent)
 

@@ -17,11 +17,12 @@ from neeco.base.errors import NeecoError
 from neeco.capture.images import read_image_bytes, read_labels, write_image, write_labels
 from neeco.capture.model import State
 from neeco.cli import main
+from neeco.evaluation.masks import iou
 from neeco.evidence.image_cut import cut_out
 from neeco.scene import GaussianScene
 from neeco.states.crop_rendering import InstrumentRenderer
 from neeco.studies.adaptation import AdaptRequest
-from neeco.studies.adaptation.adapt import Adapted, adapt_footage, overlap, state_of
+from neeco.studies.adaptation.adapt import Adapted, adapt_footage, state_of
 
 COUNT = 4
 LARGE = CAMERA.scaled(2)
@@ -91,12 +92,19 @@ def test_poor_proposals_become_labels_of_the_whole_instrument(adapted: Adapted, 
     for k, state in enumerate(states()):
         true, proposed = silhouette(state), read_labels(operation / "masks" / f"{k:06d}.png").numpy() > 0
         mask = read_labels(adapted.output / "masks" / f"{k:06d}.png").numpy() > 0
-        assert overlap(mask, true) > max(0.85, overlap(proposed, true) + 0.2)
+        assert iou(mask, true) > max(0.85, iou(proposed, true) + 0.2)
         parts = read_labels(adapted.output / "parts" / f"{k:06d}.png").numpy()
         assert (parts[mask] > 0).all()
         assert not parts[~mask].any()
         image = operation / "images" / f"{k:06d}.png"
         assert (read_image_bytes(adapted.output / "images" / image.name) == read_image_bytes(image)).all()
+
+
+def test_few_accepted_frames_are_doubtful(adapted: Adapted) -> None:
+    """Another instrument's shaft may fit where little else is in view."""
+    assert adapted.verdict.startswith("usable: 100% of the frames accepted")
+    some = [entry | {"accepted": index == 0} for index, entry in enumerate(adapted.records)]
+    assert replace(adapted, records=some).verdict.startswith("DOUBTFUL: 25% of the frames accepted")
 
 
 def test_the_card_says_where_images_and_masks_are_from(adapted: Adapted, operation: Path) -> None:
@@ -164,7 +172,7 @@ def test_a_cut_follows_the_image_beyond_a_proposal() -> None:
     true[20:40] = True
     cut = cut_out(image, proposed, 0.15)
     assert cut is not None
-    assert overlap(cut, true) > 0.95
+    assert iou(cut, true) > 0.95
     assert cut_out(image, np.zeros((60, 80), bool), 0.15) is None
 
 

@@ -7,24 +7,26 @@ centre and direction in the image are those of the proposal.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neeco.base.errors import NeecoError
-from neeco.capture.model import InstrumentState, State
+from neeco.capture.model import State
 from neeco.geometry.camera import Camera
 from neeco.scene import GaussianScene
 from neeco.states.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer, working_size
 from neeco.states.fitter import Fitter, StateFit, loose_prior
 from neeco.tracking.parameters import TrackedParameters, TrackingFitter
-from neeco.tracking.search import Search, by_gain, distinct
+from neeco.tracking.search import Search, by_gain, carried, distinct
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,8 +82,10 @@ class LabelFitter:
         """Return the fitter. channels [N, C]: the share of each of the scene's Gaussians in each class. Raises
         NeecoError for a scene of several instruments or classes, and as `TrackedParameters.of`."""
         parameters = TrackedParameters.of(scene)
-        if len(scene.instruments) > 1 or len(classes) > LABEL_FIT.n_channels:
+        if len(scene.instruments) > 1:
             raise NeecoError("adapt: the run has several instruments; use one that learned a single instrument")
+        if len(classes) > LABEL_FIT.n_channels:
+            raise NeecoError(f"adapt: the run tells more than {LABEL_FIT.n_channels} parts apart; give --masks")
         colors = torch.from_numpy(_as_channels(channels.detach().cpu().numpy().T).T)
         renderer = InstrumentRenderer(scene, colors[scene.canonical.counts[0] :].to(scene.center.device))
         return cls(Search.of(Fitter(renderer, parameters, _NoTissue())), tuple(classes))
@@ -93,8 +97,6 @@ class LabelFitter:
 
     def view(self, proposal: np.ndarray, camera: Camera) -> FrameView:
         """Return the view of a proposal, float32 [C, H, W], of a frame taken by `camera`."""
-        import cv2
-
         small = working_size(camera, self.search.recorded)
         factor = small.fx / camera.fx
         size = max(small.width, round(camera.width * factor)), max(small.height, round(camera.height * factor))
@@ -116,9 +118,8 @@ class LabelFitter:
         """Return the best fit to a view's proposal, from recorded states and `nearby` ones (of neighbouring frames);
         None where no state explains it better than no instrument."""
         fitter, prior = self.fitter, loose_prior(self.fitter.parameters, *LABEL_FIT.prior)
-        starts = distinct(
-            fitter.parameters, fitter.ranked(view, [*self._starts(view), *nearby], 0.25), LABEL_FIT.n_starts
-        )
+        candidates = fitter.ranked(view, [*self._starts(view), *nearby], 0.25)
+        starts = distinct(fitter.parameters, candidates, LABEL_FIT.n_starts)
         fits = by_gain(fitter.fit(view, start, prior, levels=(0.25,), steps=(8,)) for start in starts)
         if fits:
             turned = fitter.ranked(view, self.search.turned(fits[0].state), 0.25)
@@ -160,10 +161,8 @@ class LabelFitter:
             moved = [self._moved(state, view.camera, center, direction) for state in recorded]
             ranked = self.fitter.ranked(view, [state for state in moved if state is not None], 0.25)
             for state in distinct(self.fitter.parameters, ranked, LABEL_FIT.n_varied):
-                for factor in LABEL_FIT.depths:
-                    for share in LABEL_FIT.shifts:
-                        shift = share * length * direction
-                        states.append(self._carried(state, view.camera, factor, shift))
+                variants = itertools.product(LABEL_FIT.depths, LABEL_FIT.shifts)
+                states += [self._carried(state, view.camera, f, share * length * direction) for f, share in variants]
         return states
 
     def _moved(self, state: State, camera: Camera, center: np.ndarray, direction: np.ndarray) -> State | None:
@@ -231,8 +230,4 @@ def _moments(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 def _before_camera(state: State, camera: Camera, motion: np.ndarray) -> State:
     """Return `state` with all instruments moved by `motion` [4, 4] in the camera's frame."""
     world = camera.world_from_camera.double().cpu().numpy()
-    carry = torch.from_numpy(world @ motion @ np.linalg.inv(world))
-    moved = {
-        name: InstrumentState(carry @ item.pose.double().cpu(), item.joints) for name, item in state.instruments.items()
-    }
-    return State(moved, state.time)
+    return carried(state, torch.from_numpy(world @ motion @ np.linalg.inv(world)))

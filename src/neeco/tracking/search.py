@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from neeco.capture.model import InstrumentState, State, evenly_spaced
 from neeco.geometry.camera import Camera
@@ -118,11 +119,7 @@ class Search:
         states = []
         for k in evenly_spaced(len(recorded.states), STARTS.n_recorded):
             carry = world @ torch.linalg.inv(recorded.cameras[k].world_from_camera.double().cpu())
-            instruments = {
-                name: InstrumentState(carry @ item.pose.double().cpu(), item.joints)
-                for name, item in recorded.states[k].instruments.items()
-            }
-            states.append(State(instruments, 0.0))
+            states.append(carried(recorded.states[k], carry))
         return states
 
     def turned(self, state: State) -> list[State]:
@@ -140,6 +137,15 @@ class Search:
                         moved[j] += change * (STARTS.mm_per_deg if slides else DEG)
                         variants.append(parameters.with_joints(rolled, k, moved))
         return variants
+
+
+def carried(state: State, motion: Tensor) -> State:
+    """Return `state` at time 0 with all instruments moved by `motion` [4, 4] float64, world frame."""
+    moved = {
+        name: InstrumentState(motion @ item.pose.double().cpu(), item.joints)
+        for name, item in state.instruments.items()
+    }
+    return State(moved, 0.0)
 
 
 def distinct(parameters: TrackedParameters, states: Sequence[State], count: int) -> list[State]:

@@ -21,7 +21,7 @@ class AdaptRequest:
     A segmenter learns from rendered images and proposes masks for the frames; each proposal is cut out along the
     image's own edges, a state of the instrument is fitted to it, and the frame is accepted where image and rendering
     agree. Accepted frames are written as a data set of real images; the segmenter learns from them, too, and proposes
-    again. adapt.json lists all frames, with the reasons of rejection. Needs the extra `downstream`.
+    again. adapt.json lists all frames, with the reasons of rejection.
     """
 
     run: Annotated[Path, tyro.conf.Positional]

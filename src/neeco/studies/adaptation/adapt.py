@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from neeco.base.errors import NeecoError
 from neeco.base.files import own_folder, read_begun, read_json, require_same, write_json, write_unsynced
 from neeco.capture.images import encoded_png, read_labels
 from neeco.capture.model import Frame, InstrumentState, State
-from neeco.evaluation.masks import open_masks
+from neeco.evaluation.masks import iou, open_masks
 from neeco.evidence.image_cut import cut_out
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers
@@ -32,7 +32,7 @@ from neeco.labels.settings import LABELS
 from neeco.studies.adaptation import AdaptRequest
 from neeco.studies.adaptation.footage import adapted_frames
 from neeco.studies.downstream.model import TorchModel, TrainingTask, input_size, model_class
-from neeco.studies.downstream.samples import Example, ImageSet, Sample, class_table
+from neeco.studies.downstream.samples import Example, ImageSet, Sample, class_table, paired_parts
 from neeco.studies.downstream.samples import SyntheticSample as LabelledFile
 from neeco.studies.downstream.training_data import BatchSampler
 from neeco.synthesis.dataset import DataSetFolder, description, synthesize
@@ -59,6 +59,7 @@ class AdaptSettings:
     # of the instrument was taken for all of it
     distance_range: tuple[float, float] = (0.5, 1.4)
     min_accepted: float = 0.05  # minimum share of accepted frames
+    usual_accepted: float = 0.8  # share of accepted frames, below which the result is DOUBTFUL
     min_taught: int = 4  # minimum number of accepted frames from which a segmenter learns
 
 
@@ -79,10 +80,14 @@ class Adapted:
 
     @property
     def verdict(self) -> str:
-        """One sentence on the agreement of image and rendering."""
+        """One sentence on the agreement of image and rendering; the verdict DOUBTFUL is in capitals."""
         overlaps = [record["overlap"] for record in self.records if record["accepted"]]
         share = self.accepted / len(self.records)
-        return f"{share:.0%} of the frames accepted; median overlap of image and rendering {median(overlaps):.2f}"
+        agreement = f"{share:.0%} of the frames accepted; median overlap of image and rendering {median(overlaps):.2f}"
+        if share < ADAPT.usual_accepted:
+            usual = f"(usual: {ADAPT.usual_accepted:.0%} or more)"
+            return f"DOUBTFUL: {agreement} {usual}; check that it shows the run's instrument, and preview.png"
+        return f"usable: {agreement}"
 
 
 def adapt_footage(run: GaussianRun, request: AdaptRequest, progress: Progress) -> Adapted:
@@ -126,13 +131,20 @@ def adapt_footage(run: GaussianRun, request: AdaptRequest, progress: Progress) -
                 shutil.rmtree(rounds, ignore_errors=True)
                 (output / INFO).unlink()
             raise
+        content = {"footage": rounds / "frames"} | ({} if request.masks is None else {"masks": request.masks})
+        digests = {f"{name}_sha256": ImageFolder.of(folder, name).digest() for name, folder in content.items()}
+        if begun is not None:
+            require_same(str(output / INFO), [(key, begun.get(key, value), value) for key, value in digests.items()])
+        write_json(output / INFO, (info := info | digests) | {"complete": False})
         verifier = Verifier(LabelFitter.of(scene, classes, channels), frames, request.min_overlap, progress)
         if request.masks is not None:
             records = verifier.verify(_given(request.masks, frames, classes), rounds / "1")
         else:
             records = _taught(run, request, verifier, rounds, progress)
-        write_json(output / INFO, info | {"complete": True, "frames": [_public(record) for record in records]})
-    _write_set(run, request, verifier, records, info, progress)
+        listed = {"frames": [_public(record) for record in records]}
+        write_json(output / INFO, info | {"complete": False} | listed)
+    _write_set(request, verifier, records, info, progress)
+    write_json(output / INFO, info | {"complete": True} | listed)
     return Adapted(output, records)
 
 
@@ -144,16 +156,13 @@ def _classes(scene: Any, request: AdaptRequest) -> tuple[tuple[str, ...], torch.
         raise NeecoError(f"{request.run}: the scene learned no instrument; train on a capture that records one")
     if request.masks is not None and open_masks(request.masks).names is None:
         return ("instrument",), channels.sum(1, keepdim=True)
-    table = class_table(dict(enumerate(parts)), classes := tuple(dict.fromkeys(map(_class_of, parts))))
+    by_column = dict(enumerate(parts))
+    classes = tuple(dict.fromkeys(paired_parts(by_column).values()))
+    table = class_table(by_column, classes)
     shares = channels.new_zeros(len(channels), len(classes))
     for column in range(len(parts)):
         shares[:, table[column] - 1] += channels[:, column]
     return classes, shares
-
-
-def _class_of(part: str) -> str:
-    """Return the class of a part: both jaws are one, as images do not show which is left."""
-    return "jaws" if part in ("jaw_left", "jaw_right") else part
 
 
 def _given(masks: Path, frames: Sequence[Frame], classes: Sequence[str]) -> list[np.ndarray]:
@@ -161,8 +170,8 @@ def _given(masks: Path, frames: Sequence[Frame], classes: Sequence[str]) -> list
     opened = open_masks(masks)
     table = np.ones(256, np.uint8)  # masks without parts, and parts that the scene does not tell apart
     table[0] = 0
-    for number, part in (opened.names or {}).items():
-        if number and (name := _class_of(part)) in classes:
+    for number, name in paired_parts(opened.names or {}).items():
+        if number and name in classes:
             table[number] = classes.index(name) + 1
     proposals = []
     for frame in frames:
@@ -210,7 +219,6 @@ def _taught(
     ]
     camera = verifier.frames[0].camera
     size = input_size((camera.width, camera.height), kind.image_size, kind.multiple)
-    images = [frame.load_image_bytes().numpy() for frame in verifier.frames]
     records: list[Record] = []
     for number in range(1, request.rounds + 1):
         place, words = rounds / str(number), f"round {number} of {request.rounds}"
@@ -232,10 +240,13 @@ def _taught(
                 folder=place,
                 progress=partial(_report, progress, f"{words}: segmenter"),
             )
-            for file, prediction in zip(files, kind().fit(task)(images), strict=True):
-                write_unsynced(file, encoded_png(np.asarray(prediction, np.uint8)))
-        proposals = [read_labels(file).numpy() for file in files]
-        records = verifier.verify(proposals, place, words)
+            predict = kind().fit(task)
+            for first in range(0, len(files), kind.prediction_batch):
+                some = slice(first, first + kind.prediction_batch)
+                images = [frame.load_image_bytes().numpy() for frame in verifier.frames[some]]
+                for file, prediction in zip(files[some], predict(images), strict=True):
+                    write_unsynced(file, encoded_png(np.asarray(prediction, np.uint8)))
+        records = verifier.verify((read_labels(file).numpy() for file in files), place, words)
     return records
 
 
@@ -262,7 +273,7 @@ class Verifier:
     min_overlap: float
     progress: Progress
 
-    def verify(self, proposals: Sequence[np.ndarray], folder: Path, words: str = "verification") -> list[Record]:
+    def verify(self, proposals: Iterable[np.ndarray], folder: Path, words: str = "verification") -> list[Record]:
         """Return the records of all frames, those in `folder` as they are. proposals: classes [H, W] of each frame."""
         records: list[Record] = []
         nearby: list[State] = []
@@ -276,7 +287,7 @@ class Verifier:
             record = read_json(file)
             records.append(record | {"index": index, "mask": str(file.with_suffix(".png"))})
             nearby = [state_of(record)] if record["state"] else []
-            self.progress(words, index + 1, len(proposals))
+            self.progress(words, index + 1, len(self.frames))
         return records
 
     def _verified(
@@ -288,9 +299,9 @@ class Verifier:
         first = cut_out(image, proposed, ADAPT.reach)
         if first is None or not first.any():
             return record | {"reason": "nothing is proposed"}, None
-        fit = self.fitter.fit(
-            self.fitter.view(_one_hot(first, proposal, len(self.fitter.classes)), frame.camera), nearby
-        )
+        classes = _with_nearest(first, proposal)
+        shares = np.stack([classes == k + 1 for k in range(len(self.fitter.classes))]).astype(np.float32)
+        fit = self.fitter.fit(self.fitter.view(shares, frame.camera), nearby)
         if fit is None:
             return record | {"reason": "no state of the instrument explains the proposal"}, None
         rendered = self.fitter.shares(fit.state, frame.camera)[1] > LABELS.surface_alpha
@@ -298,9 +309,9 @@ class Verifier:
         if last is None:
             return record | {"reason": "the instrument is hardly in view"}, None
         overlaps = {
-            "overlap": overlap(rendered, last),  # of image and scene
-            "overlap_first": overlap(rendered, first),  # of the scene and the cut that knows the proposal alone
-            "overlap_cuts": overlap(first, last),
+            "overlap": iou(rendered, last),  # of image and scene
+            "overlap_first": iou(rendered, first),  # of the scene and the cut that knows the proposal alone
+            "overlap_cuts": iou(first, last),
         }
         record |= {name: round(value, 4) for name, value in overlaps.items()}
         record["state"] = {
@@ -319,11 +330,6 @@ class Verifier:
         return record, last
 
 
-def overlap(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the intersection over union of two masks [H, W] bool; 0 if both are empty."""
-    return float((one & other).sum() / max((one | other).sum(), 1))
-
-
 def state_of(record: Record) -> State:
     """Return the state in the record of a frame."""
     poses = {
@@ -333,21 +339,15 @@ def state_of(record: Record) -> State:
     return State(poses, 0.0)
 
 
-def _one_hot(mask: np.ndarray, proposal: np.ndarray, count: int) -> np.ndarray:
-    """Return the classes [C, H, W] of a mask's pixels, each that of the nearest pixel of the proposal."""
-    nearest = _nearest(proposal)
-    return np.stack([mask & (nearest == k + 1) for k in range(count)]).astype(np.float32)
-
-
-def _nearest(labels: np.ndarray) -> np.ndarray:
-    """Return the label [H, W] of the nearest labelled pixel, which is not 0."""
+def _with_nearest(mask: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Return labels [H, W] uint8 of a mask's pixels [H, W] bool, each that of the nearest labelled pixel; else 0."""
     free = (labels == 0).astype(np.uint8)
     if free.all():
-        return labels
+        return np.zeros_like(labels)
     _, places = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     of_place = np.zeros(int(places.max()) + 1, labels.dtype)
     of_place[places[free == 0]] = labels[free == 0]
-    return of_place[places]
+    return np.where(mask, of_place[places], 0).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -373,12 +373,10 @@ class _AcceptedFrame:
         color, alpha = verifier.fitter.shares(state, frame.camera)
         rendered = alpha > LABELS.surface_alpha
         classes = np.where(rendered, color.argmax(0) + 1, 0).astype(np.uint8)
-        labels = np.where(mask, _nearest(classes), 0).astype(np.uint8)
-        return Example(frame.load_image_bytes().numpy(), labels, mask == rendered)
+        return Example(frame.load_image_bytes().numpy(), _with_nearest(mask, classes), mask == rendered)
 
 
 def _write_set(
-    run: GaussianRun,
     request: AdaptRequest,
     verifier: Verifier,
     records: Sequence[Record],
@@ -417,12 +415,11 @@ def _write_set(
                 drawing = draw_layers(scene, labeller, state, frame.camera, Settings.min_component)
                 mask = read_labels(Path(record["mask"])).numpy() > 0
                 rendered = drawing.parts.numpy()
-                parts = torch.from_numpy(np.where(mask, _nearest(rendered), 0).astype(np.uint8))
                 doubtful = torch.from_numpy(mask != (rendered > 0))
                 drawing = replace(
                     drawing,
                     image=frame.load_image(),
-                    parts=parts,
+                    parts=torch.from_numpy(_with_nearest(mask, rendered)),
                     share=torch.from_numpy(mask.astype(np.float32)),
                     unobserved=doubtful.float(),
                 )

@@ -53,6 +53,8 @@ def adapted_frames(
         if not files:
             raise NeecoError(f"{footage}: contains no images; give a folder of .png or .jpg files, or a video")
         chosen = [files[k] for k in evenly_spaced(len(files), most)]
+        if len({file.stem for file in chosen}) < len(chosen):
+            raise NeecoError(f"{footage}: two images differ in their suffix alone; give them different names")
         paths = []
         for file in chosen:
             link(file, folder / file.name)

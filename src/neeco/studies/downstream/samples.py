@@ -69,10 +69,10 @@ def class_names(capture: Capture, classes: ClassNames) -> tuple[str, ...]:
     """Return the classes of a model: the instrument, or the parts of the capture's ground truth. Raises NeecoError."""
     if classes == "instrument":
         return WHOLE
-    return tuple(dict.fromkeys(_paired(truth_names(capture.root)).values()))
+    return tuple(dict.fromkeys(paired_parts(truth_names(capture.root)).values()))
 
 
-def _paired(names: Mapping[int, str]) -> dict[int, str]:
+def paired_parts(names: Mapping[int, str]) -> dict[int, str]:
     """Return the part by id, with one name for both parts of a pair: images do not show which jaw is the left one."""
     pairs = {part: pair for pair, both in pairs_of(names.values()).items() for part in both}
     return {number: pairs.get(part, part) for number, part in names.items()}
@@ -81,7 +81,7 @@ def _paired(names: Mapping[int, str]) -> dict[int, str]:
 def class_table(parts: Mapping[int, str], classes: Sequence[str]) -> bytes:
     """Return the class, from 1, of each of the 256 ids of a label image with these parts; 0: none."""
     table = bytearray(256)
-    for number, part in _paired(parts).items():
+    for number, part in paired_parts(parts).items():
         name = WHOLE[0] if classes == WHOLE else part
         table[number] = classes.index(name) + 1 if name in classes else 0
     return bytes(table)
@@ -249,7 +249,7 @@ def recorded_samples(
         place = f"{capture.root}: {split or 'all frames'}" if labels is None else f"--labels {labels}"
         raise NeecoError(f"{place}: no frame has a label; give --labels FOLDER with masks named as the frames")
     class_list = class_names(capture, classes)
-    if classes == "parts" and not set(_paired(masks.names or {}).values()) & set(class_list):
+    if classes == "parts" and not set(paired_parts(masks.names or {}).values()) & set(class_list):
         raise NeecoError(f"--classes parts: the labels in {masks.path} have no parts; use --classes instrument")
     # if only some frames' ground truth has parts, every id belongs to the instrument
     table = class_table(masks.names or dict.fromkeys(range(1, 256), WHOLE[0]), class_list)
