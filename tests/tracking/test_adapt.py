@@ -20,9 +20,11 @@ from neeco.cli import main
 from neeco.evaluation.masks import iou
 from neeco.evidence.image_cut import cut_out
 from neeco.scene import GaussianScene
+from neeco.scene.io import save_scene
 from neeco.states.crop_rendering import InstrumentRenderer
-from neeco.studies.adaptation import AdaptRequest
-from neeco.studies.adaptation.adapt import Adapted, adapt_footage, state_of
+from neeco.studies.adaptation import AdaptRequest, verification
+from neeco.studies.adaptation.adapt import Adapted, adapt_footage
+from neeco.studies.adaptation.verification import state_of
 
 COUNT = 4
 LARGE = CAMERA.scaled(2)
@@ -151,6 +153,25 @@ def test_interrupted_work_continues_to_the_same_bytes(run: RecordedRun, operatio
     assert contents(output) == contents(adapted.output)
 
 
+def test_any_number_of_workers_writes_the_same_bytes(
+    run: RecordedRun, operation: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verification, "ADAPT", replace(verification.ADAPT, chunk=1))
+    save_scene(run.scene, tmp_path / "scene.safetensors")
+    told: list[tuple[int, int]] = []
+    for workers in (1, 2):
+        output = tmp_path / str(workers)
+        request = request_of(operation, output, workers=workers)
+        done = adapt_footage(
+            replace(run, path=tmp_path),
+            request,
+            lambda what, done, total: told.append((done, total)) if what == "verification" else None,
+        )
+        assert done.accepted == COUNT
+    assert told == 2 * [(k + 1, COUNT) for k in range(COUNT)]
+    assert contents(tmp_path / "1") == contents(tmp_path / "2")
+
+
 def test_a_segmenter_learns_from_renderings_and_proposes(run: RecordedRun, operation: Path, tmp_path: Path) -> None:
     """Hardly trained, its proposals are poor; the rounds, their files and the refusal are those of a long one."""
     output = tmp_path / "out"
@@ -179,6 +200,7 @@ def test_a_cut_follows_the_image_beyond_a_proposal() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["--workers", "0"], "--workers must be at least 1 (got 0)"),
         (["--rounds", "0"], "--rounds must be at least 1 (got 0)"),
         (["--min-overlap", "1.5"], "--min-overlap: 1.5 is not a share"),
         (["--intrinsics", "0", "90", "48", "32"], "--intrinsics: FX and FY must be positive"),

@@ -141,6 +141,22 @@ def run_tasks(
             pool.stop()
 
 
+def results_of(
+    function: TaskFunction, shared: Any, tasks: Sequence[Any], workers: Workers, name: Callable[[int], str]
+) -> Iterator[Any]:
+    """Yield the result of every task of `run_tasks` as soon as it is there, in any order. name: of a task, by its place
+    in `tasks`. Raises NeecoError with a worker's error, and if workers are killed repeatedly."""
+    with contextlib.closing(run_tasks(function, shared, tasks, workers)) as events:
+        for event in events:
+            if event.stage == "failed":
+                raise NeecoError(event.value)
+            if event.stage == "abandoned":
+                problem = f"workers were killed repeatedly at {name(event.index)} ({event.value})"
+                raise NeecoError(f"--workers: {problem}; if memory ran out, use fewer workers (and --resume)")
+            if event.stage == "done":
+                yield event.value
+
+
 @dataclass(frozen=True, eq=False)
 class _Worker:
     """A process, the connection to it, and the number of its GPU."""

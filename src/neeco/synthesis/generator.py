@@ -8,7 +8,6 @@ installed neeco: scene files are sent with the tasks, and image files are return
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import tempfile
 import weakref
@@ -28,7 +27,7 @@ from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_bytes, sweep_unfinished
-from neeco.base.workers import Workers, address, run_tasks
+from neeco.base.workers import Workers, address, results_of
 from neeco.capture.model import State, evenly_spaced
 from neeco.geometry.camera import Camera
 from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends_of
@@ -422,15 +421,10 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
         shared, size, each = (spec.packed(), None), TASK_SIZE, 1
     tasks = [tuple(indices[k : k + size]) for k in range(0, len(indices), size)]
     try:
-        with contextlib.closing(run_tasks(_draw, shared, tasks, Workers(count=workers, threads=each))) as events:
-            for event in events:
-                if event.stage == "failed":
-                    raise NeecoError(event.value)
-                if event.stage == "abandoned":
-                    problem = f"workers were killed repeatedly at image {tasks[event.index][0]} ({event.value})"
-                    raise NeecoError(f"--workers: {problem}; if memory ran out, use fewer workers (and --resume)")
-                for result in event.value if event.stage == "done" else ():
-                    yield result.write(output) if isinstance(result, Encoded) else result
+        pool, name = Workers(count=workers, threads=each), lambda index: f"image {tasks[index][0]}"
+        for drawn in results_of(_draw, shared, tasks, pool, name):
+            for result in drawn:
+                yield result.write(output) if isinstance(result, Encoded) else result
     finally:
         sweep_unfinished(output)  # a worker's unfinished files
 

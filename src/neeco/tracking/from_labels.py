@@ -42,9 +42,8 @@ class LabelFitSettings:
     n_alignments: int = 2  # iterations that align a start with the proposal
     min_pixels: float = 20.0  # minimum area of a class, in pixels, for its centre to count
     min_length_px: float = 3.0  # minimum distance between the centres of two classes that define a direction
-    n_starts: int = 6  # number of starts that are fitted
+    n_starts: int = 3  # number of starts that are fitted
     n_turned: int = 3  # number of variants of the best fit, with other rolls and joints, that are fitted
-    n_finalists: int = 2  # number of fits that are refined at full size
 
 
 LABEL_FIT = LabelFitSettings()
@@ -121,15 +120,13 @@ class LabelFitter:
         candidates = fitter.ranked(view, [*self._starts(view), *nearby], 0.25)
         starts = distinct(fitter.parameters, candidates, LABEL_FIT.n_starts)
         fits = by_gain(fitter.fit(view, start, prior, levels=(0.25,), steps=(8,)) for start in starts)
-        if fits:
-            turned = fitter.ranked(view, self.search.turned(fits[0].state), 0.25)
-            others = distinct(fitter.parameters, turned, LABEL_FIT.n_turned)
-            fits += by_gain(fitter.fit(view, start, prior, levels=(0.25,), steps=(8,)) for start in others)
-        best = by_gain(
-            fitter.fit(view, fit.state, prior, levels=(0.5, 1.0), steps=(4, 4))
-            for fit in by_gain(fits)[: LABEL_FIT.n_finalists]
-        )
-        return best[0] if best and best[0].gain > 0 else None
+        if not fits:
+            return None
+        turned = fitter.ranked(view, self.search.turned(fits[0].state), 0.25)
+        others = distinct(fitter.parameters, turned, LABEL_FIT.n_turned)
+        fits += by_gain(fitter.fit(view, start, prior, levels=(0.25,), steps=(8,)) for start in others)
+        best = fitter.fit(view, by_gain(fits)[0].state, prior, levels=(0.5, 1.0), steps=(4, 4))
+        return best if best is not None and best.gain > 0 else None
 
     def distance(self, state: State, camera: Camera) -> float:
         """Return the distance, mm along the optical axis, of the instrument from a camera."""

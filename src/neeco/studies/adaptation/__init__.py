@@ -51,6 +51,8 @@ class AdaptRequest:
     formats: Annotated[tuple[str, ...], tyro.conf.arg(help=formats_help())] = DEFAULT_FORMATS
     seed: int = 0
     """Of the rendered images and the segmenter."""
+    workers: int = 1
+    """Number of processes that verify frames, here or on the cluster RAY_ADDRESS; the files do not depend on it."""
     resume: bool = False
     """Continue interrupted work with the same settings."""
     force: bool = False

@@ -8,29 +8,39 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
 from neeco.base.errors import NeecoError
-from neeco.base.files import own_folder, read_begun, read_json, require_same, write_json, write_unsynced
+from neeco.base.files import own_folder, read_begun, require_same, write_json, write_unsynced
+from neeco.base.workers import check_workers
 from neeco.capture.images import encoded_png, read_labels
-from neeco.capture.model import Frame, InstrumentState, State
-from neeco.evaluation.masks import iou, open_masks
-from neeco.evidence.image_cut import cut_out
+from neeco.capture.model import Frame
+from neeco.evaluation.masks import open_masks
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.labels.settings import LABELS
 from neeco.studies.adaptation import AdaptRequest
 from neeco.studies.adaptation.footage import adapted_frames
+from neeco.studies.adaptation.verification import (
+    ADAPT,
+    PROPOSALS,
+    Progress,
+    Record,
+    Shared,
+    Verifier,
+    classes_of,
+    state_of,
+    with_nearest,
+)
 from neeco.studies.downstream.model import TorchModel, TrainingTask, input_size, model_class
 from neeco.studies.downstream.samples import Example, ImageSet, Sample, class_table, paired_parts
 from neeco.studies.downstream.samples import SyntheticSample as LabelledFile
@@ -40,30 +50,11 @@ from neeco.synthesis.settings import Settings
 from neeco.synthesis.tissue_replacement import ImageFolder
 from neeco.synthesis.writers import encoded_sample, skipped_sample
 from neeco.tracking.from_labels import LabelFitter
-from neeco.training.run import GaussianRun
+from neeco.training.run import SCENE_FILE, GaussianRun
 
 INFO = "adapt.json"
 ROUNDS = "rounds"
 REJECTED = "rejected"
-Progress = Callable[[str, int, int], None]
-Record = dict[str, Any]
-
-
-@dataclass(frozen=True, kw_only=True)
-class AdaptSettings:
-    """Thresholds of the verification."""
-
-    reach: float = 0.05  # share of the diagonal beyond a proposal, within which the image decides
-    rendered_reach: float = 0.025  # the same beyond the rendering
-    # distance of the instrument, relative to the nearest and the farthest recorded one; farther away than that, a part
-    # of the instrument was taken for all of it
-    distance_range: tuple[float, float] = (0.5, 1.4)
-    min_accepted: float = 0.05  # minimum share of accepted frames
-    usual_accepted: float = 0.8  # share of accepted frames, below which the result is DOUBTFUL
-    min_taught: int = 4  # minimum number of accepted frames from which a segmenter learns
-
-
-ADAPT = AdaptSettings()
 
 
 @dataclass(frozen=True)
@@ -98,6 +89,7 @@ def adapt_footage(run: GaussianRun, request: AdaptRequest, progress: Progress) -
     hardly any frame is accepted: the footage shows another instrument, or the proposals are too poor.
     """
     request.check()
+    check_workers(request.workers)
     if request.masks is None:
         _segmenter(request.model)
         if request.backgrounds is not None:
@@ -113,7 +105,7 @@ def adapt_footage(run: GaussianRun, request: AdaptRequest, progress: Progress) -
         pairs = [(name, begun.get(name), info[name]) for name in ("version", "scene_sha256")]
         require_same(str(output / INFO), [*pairs, *((k, stated.get(k), v) for k, v in info["settings"].items())])
     scene.visibility()
-    classes, channels = _classes(scene, request)
+    classes, channels = classes_of(scene, request)
     with own_folder(output):
         write_json(output / INFO, info | {"complete": False})
         rounds = output / ROUNDS
@@ -136,33 +128,20 @@ def adapt_footage(run: GaussianRun, request: AdaptRequest, progress: Progress) -
         if begun is not None:
             require_same(str(output / INFO), [(key, begun.get(key, value), value) for key, value in digests.items()])
         write_json(output / INFO, (info := info | digests) | {"complete": False})
-        verifier = Verifier(LabelFitter.of(scene, classes, channels), frames, request.min_overlap, progress)
+        shared = Shared(run.path / SCENE_FILE, scene.center.device, request, tuple(frames))
+        verifier = Verifier(LabelFitter.of(scene, classes, channels), shared.frames, request.min_overlap)
         if request.masks is not None:
-            records = verifier.verify(_given(request.masks, frames, classes), rounds / "1")
+            proposals = rounds / "1" / PROPOSALS
+            for frame, given in zip(frames, _given(request.masks, frames, classes), strict=True):
+                write_unsynced(proposals / f"{frame.name}.png", encoded_png(given))
+            records = verifier.verify(rounds / "1", shared, progress)
         else:
-            records = _taught(run, request, verifier, rounds, progress)
+            records = _taught(run, request, verifier, shared, rounds, progress)
         listed = {"frames": [_public(record) for record in records]}
         write_json(output / INFO, info | {"complete": False} | listed)
     _write_set(request, verifier, records, info, progress)
     write_json(output / INFO, info | {"complete": True} | listed)
     return Adapted(output, records)
-
-
-def _classes(scene: Any, request: AdaptRequest) -> tuple[tuple[str, ...], torch.Tensor]:
-    """Return the classes that proposals tell apart, and each Gaussian's share in them [N, C]."""
-    channels = scene.label_channels().detach()
-    parts = [part for _, part in scene.label_names]
-    if not parts:
-        raise NeecoError(f"{request.run}: the scene learned no instrument; train on a capture that records one")
-    if request.masks is not None and open_masks(request.masks).names is None:
-        return ("instrument",), channels.sum(1, keepdim=True)
-    by_column = dict(enumerate(parts))
-    classes = tuple(dict.fromkeys(paired_parts(by_column).values()))
-    table = class_table(by_column, classes)
-    shares = channels.new_zeros(len(channels), len(classes))
-    for column in range(len(parts)):
-        shares[:, table[column] - 1] += channels[:, column]
-    return classes, shares
 
 
 def _given(masks: Path, frames: Sequence[Frame], classes: Sequence[str]) -> list[np.ndarray]:
@@ -189,7 +168,7 @@ def _given(masks: Path, frames: Sequence[Frame], classes: Sequence[str]) -> list
 
 
 def _taught(
-    run: GaussianRun, request: AdaptRequest, verifier: Verifier, rounds: Path, progress: Progress
+    run: GaussianRun, request: AdaptRequest, verifier: Verifier, shared: Shared, rounds: Path, progress: Progress
 ) -> list[Record]:
     """Return the records of the last round: the segmenter learns from rendered images, then from accepted frames,
     too."""
@@ -210,21 +189,17 @@ def _taught(
         formats=(),
         resume=(folder / "dataset.json").exists(),
         on_progress=lambda done: progress("rendered images", done, request.count),
+        workers=request.workers,
     )
-    table = class_table({k + 1: part for k, (_, part) in enumerate(run.scene.label_names)}, classes)
-    entry = ImageSet("synthetic", folder)
-    rendered = [
-        LabelledFile(entry.file("images", file.name), entry.file("parts", f"{file.stem}.png"), table)
-        for file in sorted((folder / "images").iterdir())
-    ]
+    rendered = rendered_samples(folder, classes)
     camera = verifier.frames[0].camera
     size = input_size((camera.width, camera.height), kind.image_size, kind.multiple)
     records: list[Record] = []
     for number in range(1, request.rounds + 1):
         place, words = rounds / str(number), f"round {number} of {request.rounds}"
-        files = [place / "proposals" / f"{frame.name}.png" for frame in verifier.frames]
+        files = [place / PROPOSALS / f"{frame.name}.png" for frame in verifier.frames]
         if not all(file.exists() for file in files):
-            accepted = [_AcceptedFrame(verifier, record) for record in records if record["accepted"]]
+            accepted = [AcceptedFrame(verifier, record) for record in records if record["accepted"]]
             sources: list[Sequence[Sample]] = [rendered]
             if len(accepted) >= ADAPT.min_taught:
                 sources.append(accepted)
@@ -246,8 +221,18 @@ def _taught(
                 images = [frame.load_image_bytes().numpy() for frame in verifier.frames[some]]
                 for file, prediction in zip(files[some], predict(images), strict=True):
                     write_unsynced(file, encoded_png(np.asarray(prediction, np.uint8)))
-        records = verifier.verify((read_labels(file).numpy() for file in files), place, words)
+        records = verifier.verify(place, shared, progress, words)
     return records
+
+
+def rendered_samples(folder: Path, classes: Sequence[str]) -> list[LabelledFile]:
+    """Return the images of a data set of rendered images, with these classes."""
+    entry = ImageSet("synthetic", folder)
+    table = class_table({item["id"]: item["part"] for item in entry.info()["ids"] if item["id"]}, classes)
+    return [
+        LabelledFile(entry.file("images", file.name), entry.file("parts", f"{file.stem}.png"), table)
+        for file in sorted((folder / "images").iterdir())
+    ]
 
 
 def _segmenter(name: str) -> type[TorchModel]:
@@ -265,93 +250,7 @@ def _report(progress: Progress, words: str, share: float, text: str) -> None:
 
 
 @dataclass(frozen=True)
-class Verifier:
-    """Verifies proposals by the image and by the scene."""
-
-    fitter: LabelFitter
-    frames: Sequence[Frame]
-    min_overlap: float
-    progress: Progress
-
-    def verify(self, proposals: Iterable[np.ndarray], folder: Path, words: str = "verification") -> list[Record]:
-        """Return the records of all frames, those in `folder` as they are. proposals: classes [H, W] of each frame."""
-        records: list[Record] = []
-        nearby: list[State] = []
-        for index, (frame, proposal) in enumerate(zip(self.frames, proposals, strict=True)):
-            file = folder / "fits" / f"{frame.name}.json"
-            if not file.exists():
-                record, mask = self._verified(frame, proposal, nearby)
-                if mask is not None:
-                    write_unsynced(file.with_suffix(".png"), encoded_png(mask.astype(np.uint8) * 255))
-                write_json(file, record)
-            record = read_json(file)
-            records.append(record | {"index": index, "mask": str(file.with_suffix(".png"))})
-            nearby = [state_of(record)] if record["state"] else []
-            self.progress(words, index + 1, len(self.frames))
-        return records
-
-    def _verified(
-        self, frame: Frame, proposal: np.ndarray, nearby: Sequence[State]
-    ) -> tuple[Record, np.ndarray | None]:
-        """Return the record of a frame, and the mask [H, W] bool that its image and the rendering lead to."""
-        record: Record = {"frame": frame.name, "accepted": False, "reason": "", "overlap": 0.0, "state": None}
-        image, proposed = frame.load_image_bytes().numpy(), proposal > 0
-        first = cut_out(image, proposed, ADAPT.reach)
-        if first is None or not first.any():
-            return record | {"reason": "nothing is proposed"}, None
-        classes = _with_nearest(first, proposal)
-        shares = np.stack([classes == k + 1 for k in range(len(self.fitter.classes))]).astype(np.float32)
-        fit = self.fitter.fit(self.fitter.view(shares, frame.camera), nearby)
-        if fit is None:
-            return record | {"reason": "no state of the instrument explains the proposal"}, None
-        rendered = self.fitter.shares(fit.state, frame.camera)[1] > LABELS.surface_alpha
-        last = cut_out(image, rendered, ADAPT.rendered_reach)
-        if last is None:
-            return record | {"reason": "the instrument is hardly in view"}, None
-        overlaps = {
-            "overlap": iou(rendered, last),  # of image and scene
-            "overlap_first": iou(rendered, first),  # of the scene and the cut that knows the proposal alone
-            "overlap_cuts": iou(first, last),
-        }
-        record |= {name: round(value, 4) for name, value in overlaps.items()}
-        record["state"] = {
-            name: {"pose": item.pose.tolist(), "joints": dict(item.joints)}
-            for name, item in fit.state.instruments.items()
-        }
-        record["misfit"] = round(fit.misfit, 4)
-        distance, (nearest, farthest) = self.fitter.distance(fit.state, frame.camera), self.fitter.recorded_distances
-        low, high = nearest * ADAPT.distance_range[0], farthest * ADAPT.distance_range[1]
-        if min(overlaps.values()) < self.min_overlap:
-            record["reason"] = f"image and rendering overlap by {min(overlaps.values()):.2f} only"
-        elif not low <= distance <= high:
-            recorded = f"{nearest:.0f} to {farthest:.0f} mm were recorded"
-            record["reason"] = f"the instrument fits at {distance:.0f} mm only, {recorded}"
-        record["accepted"] = not record["reason"]
-        return record, last
-
-
-def state_of(record: Record) -> State:
-    """Return the state in the record of a frame."""
-    poses = {
-        name: InstrumentState(torch.tensor(item["pose"], dtype=torch.float64), item["joints"])
-        for name, item in record["state"].items()
-    }
-    return State(poses, 0.0)
-
-
-def _with_nearest(mask: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Return labels [H, W] uint8 of a mask's pixels [H, W] bool, each that of the nearest labelled pixel; else 0."""
-    free = (labels == 0).astype(np.uint8)
-    if free.all():
-        return np.zeros_like(labels)
-    _, places = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    of_place = np.zeros(int(places.max()) + 1, labels.dtype)
-    of_place[places[free == 0]] = labels[free == 0]
-    return np.where(mask, of_place[places], 0).astype(np.uint8)
-
-
-@dataclass(frozen=True)
-class _AcceptedFrame:
+class AcceptedFrame:
     """An accepted frame, from which the segmenter learns."""
 
     verifier: Verifier
@@ -373,7 +272,7 @@ class _AcceptedFrame:
         color, alpha = verifier.fitter.shares(state, frame.camera)
         rendered = alpha > LABELS.surface_alpha
         classes = np.where(rendered, color.argmax(0) + 1, 0).astype(np.uint8)
-        return Example(frame.load_image_bytes().numpy(), _with_nearest(mask, classes), mask == rendered)
+        return Example(frame.load_image_bytes().numpy(), with_nearest(mask, classes), mask == rendered)
 
 
 def _write_set(
@@ -419,7 +318,7 @@ def _write_set(
                 drawing = replace(
                     drawing,
                     image=frame.load_image(),
-                    parts=torch.from_numpy(_with_nearest(mask, rendered)),
+                    parts=torch.from_numpy(with_nearest(mask, rendered)),
                     share=torch.from_numpy(mask.astype(np.float32)),
                     unobserved=doubtful.float(),
                 )

@@ -1,0 +1,182 @@
+"""What the scene adds to the labels of `neeco adapt`: the same segmenter taught by other labels of the same frames.
+
+    python benchmarks/pseudo_labels.py SET CAPTURE [--seeds 3] [--arms cuts ...]
+
+SET: output of `neeco adapt` with at least one round. CAPTURE: its footage, with truth. Each network learns from SET's
+rendered images and, half of the time, from its first round's frames by the labels of an arm; all steps, images and
+seeds are the same. Prints IoU with the truth in all frames, and differences to `accepted` with 95 % intervals over
+seeds and blocks of frames. Finished networks are kept in SET/control.
+
+    none        rendered images alone
+    proposals   plain pseudo-labels: the network's own masks of all frames
+    cuts        these masks cut out along the image's edges; no scene, no rejection
+    accepted    as `adapt` does: accepted frames with their masks and parts, without doubtful pixels
+    permuted    accepted frames, each with the labels of another
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neeco.base.files import read_json, write_json
+from neeco.capture.images import read_labels
+from neeco.capture.model import Frame
+from neeco.capture.readers import read_capture
+from neeco.evaluation.masks import open_truth
+from neeco.evidence.image_cut import cut_out
+from neeco.studies.adaptation import AdaptRequest
+from neeco.studies.adaptation.adapt import INFO, ROUNDS, AcceptedFrame, rendered_samples
+from neeco.studies.adaptation.footage import adapted_frames
+from neeco.studies.adaptation.verification import ADAPT, PROPOSALS, Shared, Verifier, classes_of, with_nearest
+from neeco.studies.downstream.model import TrainingTask, input_size, model_class
+from neeco.studies.downstream.results import Arm, Scores, mask_scores
+from neeco.studies.downstream.samples import Example, Sample
+from neeco.studies.downstream.training_data import BatchSampler
+from neeco.tracking.from_labels import LabelFitter
+from neeco.training.run import SCENE_FILE, load_run
+
+ARMS = ("none", "proposals", "cuts", "accepted", "permuted")
+TEST = "next"
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A frame with labels."""
+
+    arm: str
+    frame: Frame
+    example: Example
+
+    @property
+    def name(self) -> str:
+        return self.frame.name
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.arm, self.name
+
+    def load(self) -> Example:
+        return self.example
+
+
+@dataclass(frozen=True)
+class Control:
+    """An adapted set, opened again."""
+
+    output: Path
+    settings: dict[str, Any]
+    verifier: Verifier
+    shared: Shared
+
+    @classmethod
+    def of(cls, output: Path) -> Control:
+        info = read_json(output / INFO)
+        settings = info["settings"]
+        run = load_run(Path(info["scene"]), torch.device("cpu"), force=True)
+        request = AdaptRequest(run=run.path, footage=Path(settings["footage"]), output=output)
+        frames = adapted_frames(
+            request.footage,
+            output / ROUNDS / "frames",
+            settings["frames"],
+            settings["intrinsics"] and tuple(settings["intrinsics"]),
+            run.scene.recorded,
+            lambda done, total: None,
+        )
+        shared = Shared(run.path / SCENE_FILE, torch.device("cpu"), request, tuple(frames))
+        fitter = LabelFitter.of(run.scene, *classes_of(run.scene, request))
+        return cls(output, settings, Verifier(fitter, shared.frames, settings["min_overlap"]), shared)
+
+    @property
+    def first(self) -> Path:
+        return self.output / ROUNDS / "1"
+
+    def samples(self, arm: str) -> list[Sample]:
+        """The frames that an arm adds."""
+        if arm in ("accepted", "permuted"):
+            records = self.verifier.verify(self.first, self.shared, lambda what, done, total: None)
+            chosen: list[Any] = [AcceptedFrame(self.verifier, record) for record in records if record["accepted"]]
+            if arm == "accepted":
+                return chosen
+            examples = [sample.load() for sample in chosen]
+            others = np.roll(np.random.default_rng(0).permutation(len(chosen)), 1)
+            return [
+                Labelled(arm, self.verifier.frames[sample.record["index"]], replace(examples[other], image=own.image))
+                for sample, own, other in zip(chosen, examples, others, strict=True)
+            ]
+        if arm == "none":
+            return []
+        added: list[Sample] = []
+        for frame in self.verifier.frames:
+            classes = read_labels(self.first / PROPOSALS / f"{frame.name}.png").numpy()
+            image = frame.load_image_bytes().numpy()
+            if arm == "cuts":
+                cut = cut_out(image, classes > 0, ADAPT.reach)
+                classes = np.zeros_like(classes) if cut is None else with_nearest(cut, classes)
+            if classes.any():
+                added.append(Labelled(arm, frame, Example(image, classes)))
+        return added
+
+    def taught(self, arm: str, seed: int) -> list[np.ndarray]:
+        """What a network that learned by this arm predicts for all frames, uint8 [H, W] each."""
+        kind, classes = model_class(self.settings["model"]), self.verifier.fitter.classes
+        sources: list[Sequence[Sample]] = [rendered_samples(self.output / ROUNDS / "synthetic", classes)]
+        if added := self.samples(arm):
+            sources.append(added)
+        camera = self.verifier.frames[0].camera
+        task = TrainingTask(
+            classes=classes,
+            batches=BatchSampler((), sources, seed=seed, augmented=True),
+            size=input_size((camera.width, camera.height), kind.image_size, kind.multiple),
+            steps=self.settings["steps"] or kind.steps,
+            batch=kind.batch,
+            seed=seed,
+            device=torch.device("cpu"),
+            folder=self.output,
+            keep_weights=False,
+        )
+        images = [frame.load_image_bytes().numpy() for frame in self.verifier.frames]
+        return [np.asarray(prediction) for prediction in kind().fit(task)(images)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("set", type=Path)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=["proposals", "cuts", "accepted"])
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    control, truth = Control.of(arguments.set), open_truth(read_capture(arguments.capture))
+    jobs = []
+    for seed in range(arguments.seeds):
+        for arm in arguments.arms:
+            file = arguments.set / "control" / f"{arm}-{seed}.json"
+            if not file.exists():
+                predictions = zip(control.verifier.frames, control.taught(arm, seed), strict=True)
+                rows = [
+                    mask_scores((mask > 0).astype(np.uint8), Example(mask, truth.load(frame.name) > 0), ["instrument"])
+                    for frame, mask in predictions
+                ]
+                scores = {"iou": float(np.mean([row["iou"] for row in rows])), "per_frame": rows}
+                write_json(file, {"model": "", "condition": arm, "real": 0, "fold": seed, "splits": {TEST: scores}})
+            jobs.append(read_json(file))
+            print(f"{arm} {seed}: {jobs[-1]['splits'][TEST]['iou']:.4f}", flush=True)
+    scores, reference = Scores(jobs), Arm("", "accepted", 0)
+    for arm in arguments.arms:
+        one = scores.estimate(Arm("", arm, 0), TEST, "iou")
+        line = f"{arm:10} {one.mean:.4f}" if one else arm
+        if arm != "accepted" and (gain := scores.estimate(reference, TEST, "iou", Arm("", arm, 0))):
+            ends = "" if gain.low is None else f" [{gain.low:+.4f}, {gain.high:+.4f}]"
+            line += f"   accepted - {arm}: {gain.mean:+.4f}{ends}"
+        print(line)
+
+
+if __name__ == "__main__":
+    main()
