@@ -15,7 +15,7 @@ from grasper_world import CAMERA, RecordedRun, grasper_state, make_scene
 
 from neeco.base.errors import NeecoError
 from neeco.capture.images import read_image_bytes, read_labels, write_image, write_labels
-from neeco.capture.model import State
+from neeco.capture.model import Frame, State
 from neeco.cli import main
 from neeco.evaluation.masks import iou
 from neeco.evidence.image_cut import cut_out
@@ -24,7 +24,8 @@ from neeco.scene.io import save_scene
 from neeco.states.crop_rendering import InstrumentRenderer
 from neeco.studies.adaptation import AdaptRequest, verification
 from neeco.studies.adaptation.adapt import Adapted, adapt_footage
-from neeco.studies.adaptation.verification import state_of
+from neeco.studies.adaptation.verification import Verifier, state_of
+from neeco.tracking.from_labels import LabelFitter
 
 COUNT = 4
 LARGE = CAMERA.scaled(2)
@@ -151,6 +152,30 @@ def test_interrupted_work_continues_to_the_same_bytes(run: RecordedRun, operatio
         adapt_footage(run, request_of(operation, output, min_overlap=0.7, resume=True), silent)
     adapt_footage(run, request_of(operation, output, resume=True), silent)
     assert contents(output) == contents(adapted.output)
+
+
+def test_pixels_that_a_mask_leaves_out_do_not_count(run: RecordedRun, operation: Path, tmp_path: Path) -> None:
+    """A bright text lies over the frames, and the proposals take it for an instrument."""
+    text = np.zeros((LARGE.height, LARGE.width), bool)
+    text[:, :40] = True
+    frames = []
+    for k in range(2):
+        name = f"{k:06d}.png"
+        image = read_image_bytes(operation / "images" / name)
+        image[text] = 250
+        write_image(tmp_path / "images" / name, torch.from_numpy(image).float() / 255)
+        write_labels(tmp_path / "counted" / name, torch.from_numpy((~text).astype(np.uint8) * 255))
+        mask = read_labels(operation / "masks" / name).numpy() | text
+        write_labels(tmp_path / "proposals" / name, torch.from_numpy(mask.astype(np.uint8)))
+        files = {"image_path": tmp_path / "images" / name, "mask_path": tmp_path / "counted" / name}
+        frames.append(Frame(**files, camera=LARGE, state=State({}, 0.0), split="footage"))
+    channels = run.scene.label_channels().sum(1, keepdim=True)
+    verifier = Verifier(LabelFitter.of(run.scene, ("instrument",), channels), frames, 0.8)
+    for index in verifier.chunk(tmp_path, (0, 1)):
+        assert json.loads((tmp_path / "fits" / f"{index:06d}.json").read_text())["accepted"]
+        mask = read_labels(tmp_path / "fits" / f"{index:06d}.png").numpy() > 0
+        assert not mask[text].any()
+        assert iou(mask, silhouette(states()[index]) & ~text) > 0.85
 
 
 def test_any_number_of_workers_writes_the_same_bytes(

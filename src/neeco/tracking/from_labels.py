@@ -94,20 +94,20 @@ class LabelFitter:
         """Return the fitter of single starts."""
         return self.search.fitter
 
-    def view(self, proposal: np.ndarray, camera: Camera) -> FrameView:
-        """Return the view of a proposal, float32 [C, H, W], of a frame taken by `camera`."""
+    def view(self, proposal: np.ndarray, camera: Camera, counted: np.ndarray) -> FrameView:
+        """Return the view of a proposal, float32 [C, H, W], of a frame taken by `camera`. counted: the pixels [H, W]
+        bool that count."""
         small = working_size(camera, self.search.recorded)
         factor = small.fx / camera.fx
         size = max(small.width, round(camera.width * factor)), max(small.height, round(camera.height * factor))
-        image = torch.zeros(small.height, small.width, LABEL_FIT.n_channels)
-        for channel, plane in enumerate(_as_channels(proposal)):
-            if size != plane.shape[::-1]:
-                plane = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
-            image[..., channel] = torch.from_numpy(plane[: small.height, : small.width])
+        planes = []
+        for plane in (*_as_channels(proposal), counted.astype(np.float32)):
+            reduced = plane if size == plane.shape[::-1] else cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
+            planes.append(torch.from_numpy(reduced[: small.height, : small.width]))
         return FrameView(
             camera=small,
-            image=image,
-            weight=torch.ones(small.height, small.width),
+            image=torch.stack(planes[:-1], 2),
+            weight=planes[-1],
             tissue=torch.zeros(small.height, small.width, LABEL_FIT.n_channels),
             shadow_of=None,
             diagonal=math.hypot(small.width, small.height),

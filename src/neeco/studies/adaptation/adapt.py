@@ -38,6 +38,7 @@ from neeco.studies.adaptation.verification import (
     Shared,
     Verifier,
     classes_of,
+    counted_pixels,
     state_of,
     with_nearest,
 )
@@ -266,13 +267,15 @@ class AcceptedFrame:
 
     def load(self) -> Example:
         """Return the image with the classes of its mask's pixels; pixels that only image or rendering show as
-        instrument are left out."""
+        instrument, and those that the frame's own mask leaves out, do not count."""
         frame, verifier = self.verifier.frames[self.record["index"]], self.verifier
         state, mask = state_of(self.record), read_labels(Path(self.record["mask"])).numpy() > 0
         color, alpha = verifier.fitter.shares(state, frame.camera)
         rendered = alpha > LABELS.surface_alpha
         classes = np.where(rendered, color.argmax(0) + 1, 0).astype(np.uint8)
-        return Example(frame.load_image_bytes().numpy(), with_nearest(mask, classes), mask == rendered)
+        return Example(
+            frame.load_image_bytes().numpy(), with_nearest(mask, classes), (mask == rendered) & counted_pixels(frame)
+        )
 
 
 def _write_set(
@@ -314,7 +317,7 @@ def _write_set(
                 drawing = draw_layers(scene, labeller, state, frame.camera, Settings.min_component)
                 mask = read_labels(Path(record["mask"])).numpy() > 0
                 rendered = drawing.parts.numpy()
-                doubtful = torch.from_numpy(mask != (rendered > 0))
+                doubtful = torch.from_numpy((mask != (rendered > 0)) | ~counted_pixels(frame))
                 drawing = replace(
                     drawing,
                     image=frame.load_image(),

@@ -37,7 +37,7 @@ class AdaptSettings:
     """Thresholds of the verification."""
 
     reach: float = 0.05  # share of the diagonal beyond a proposal, within which the image decides
-    rendered_reach: float = 0.025  # the same beyond the rendering
+    rendered_reach: float = 0.025  # the same beyond rendering and proposal
     # distance of the instrument, relative to the nearest and the farthest recorded one; farther away than that, a part
     # of the instrument was taken for all of it
     distance_range: tuple[float, float] = (0.5, 1.4)
@@ -114,23 +114,24 @@ class Verifier:
     ) -> tuple[Record, np.ndarray | None]:
         """Return the record of a frame, and the mask [H, W] bool that its image and the rendering lead to."""
         record: Record = {"frame": frame.name, "accepted": False, "reason": "", "overlap": 0.0, "state": None}
-        image, proposed = frame.load_image_bytes().numpy(), proposal > 0
+        image, counted = frame.load_image_bytes().numpy(), counted_pixels(frame)
+        proposed = (proposal > 0) & counted
         first = cut_out(image, proposed, ADAPT.reach)
-        if first is None or not first.any():
+        if first is None or not (first & counted).any():
             return record | {"reason": "nothing is proposed"}, None
-        classes = with_nearest(first, proposal)
+        classes = with_nearest(first & counted, proposal)
         shares = np.stack([classes == k + 1 for k in range(len(self.fitter.classes))]).astype(np.float32)
-        fit = self.fitter.fit(self.fitter.view(shares, frame.camera), nearby)
+        fit = self.fitter.fit(self.fitter.view(shares, frame.camera, counted), nearby)
         if fit is None:
             return record | {"reason": "no state of the instrument explains the proposal"}, None
         rendered = self.fitter.shares(fit.state, frame.camera)[1] > LABELS.surface_alpha
-        last = cut_out(image, rendered, ADAPT.rendered_reach)
+        last = cut_out(image, rendered & counted | proposed, ADAPT.rendered_reach)
         if last is None:
             return record | {"reason": "the instrument is hardly in view"}, None
         overlaps = {
-            "overlap": iou(rendered, last),  # of image and scene
-            "overlap_first": iou(rendered, first),  # of the scene and the cut that knows the proposal alone
-            "overlap_cuts": iou(first, last),
+            "overlap": iou(rendered, last, counted),  # of image and scene
+            "overlap_first": iou(rendered, first, counted),  # of the scene and the cut that knows the proposal alone
+            "overlap_cuts": iou(first, last, counted),
         }
         record |= {name: round(value, 4) for name, value in overlaps.items()}
         record["state"] = {
@@ -146,7 +147,7 @@ class Verifier:
             recorded = f"{nearest:.0f} to {farthest:.0f} mm were recorded"
             record["reason"] = f"the instrument fits at {distance:.0f} mm only, {recorded}"
         record["accepted"] = not record["reason"]
-        return record, last
+        return record, last & counted
 
 
 @lru_cache(maxsize=1)
@@ -162,6 +163,12 @@ def _work(shared: Shared, task: tuple[Path, range], threads: int) -> int:
     limit_threads(threads)
     folder, chunk = task
     return sum(1 for _ in _opened(shared).chunk(folder, chunk))
+
+
+def counted_pixels(frame: Frame) -> np.ndarray:
+    """Return the pixels [H, W] bool that count: all, or those of the frame's mask."""
+    mask = frame.load_mask()
+    return np.ones((frame.camera.height, frame.camera.width), bool) if mask is None else mask.numpy()
 
 
 def state_of(record: Record) -> State:
