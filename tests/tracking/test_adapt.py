@@ -105,9 +105,18 @@ def test_poor_proposals_become_labels_of_the_whole_instrument(adapted: Adapted, 
 
 def test_few_accepted_frames_are_doubtful(adapted: Adapted) -> None:
     """Another instrument's shaft may fit where little else is in view."""
-    assert adapted.verdict.startswith("usable: 100% of the frames accepted")
+    assert adapted.verdict.startswith("usable: 100% of the 4 frames with a proposal accepted")
     some = [entry | {"accepted": index == 0} for index, entry in enumerate(adapted.records)]
-    assert replace(adapted, records=some).verdict.startswith("DOUBTFUL: 25% of the frames accepted")
+    assert replace(adapted, records=some).verdict.startswith("DOUBTFUL: 25% of the 4 frames with a proposal accepted")
+
+
+def test_frames_without_an_instrument_do_not_make_labels_doubtful(
+    run: RecordedRun, operation: Path, tmp_path: Path
+) -> None:
+    for k in (1, 2):
+        write_labels(tmp_path / "masks" / f"{k:06d}.png", read_labels(operation / "masks" / f"{k:06d}.png"))
+    done = adapt_footage(run, request_of(operation, tmp_path / "out", masks=tmp_path / "masks"), silent)
+    assert done.verdict.startswith("usable: 100% of the 2 frames with a proposal accepted")
 
 
 def test_the_card_says_where_images_and_masks_are_from(adapted: Adapted, operation: Path) -> None:
@@ -132,7 +141,9 @@ def test_frames_of_another_instrument_are_refused_in_one_line(
     for k in range(COUNT):
         disc = cv2.circle(np.zeros((128, 192), np.uint8), (120, 60), 18, 1, -1)
         write_labels(masks / f"{k:06d}.png", torch.from_numpy(disc))
-    with pytest.raises(NeecoError, match=r"0 of 4 frames accepted, the best overlap is .*; check that it shows"):
+    with pytest.raises(
+        NeecoError, match=r"0 of 4 frames with a proposal accepted, the best overlap is .*; check that it shows"
+    ):
         adapt_footage(run, request_of(operation, tmp_path / "out", masks=masks, min_overlap=0.9), silent)
     records = json.loads((tmp_path / "out" / "adapt.json").read_text())["frames"]
     assert all(entry["reason"] and not entry["accepted"] for entry in records)

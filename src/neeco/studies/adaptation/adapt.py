@@ -32,6 +32,7 @@ from neeco.studies.adaptation import AdaptRequest
 from neeco.studies.adaptation.footage import adapted_frames
 from neeco.studies.adaptation.verification import (
     ADAPT,
+    EMPTY,
     PROPOSALS,
     Progress,
     Record,
@@ -74,8 +75,10 @@ class Adapted:
     def verdict(self) -> str:
         """One sentence on the agreement of image and rendering; the verdict DOUBTFUL is in capitals."""
         overlaps = [record["overlap"] for record in self.records if record["accepted"]]
-        share = self.accepted / len(self.records)
-        agreement = f"{share:.0%} of the frames accepted; median overlap of image and rendering {median(overlaps):.2f}"
+        proposed = sum(record["reason"] != EMPTY for record in self.records)
+        share = self.accepted / proposed
+        words = f"{share:.0%} of the {proposed} frames with a proposal accepted"
+        agreement = f"{words}; median overlap of image and rendering {median(overlaps):.2f}"
         if share < ADAPT.usual_accepted:
             usual = f"(usual: {ADAPT.usual_accepted:.0%} or more)"
             return f"DOUBTFUL: {agreement} {usual}; check that it shows the run's instrument, and preview.png"
@@ -287,11 +290,13 @@ def _write_set(
 ) -> None:
     """Write accepted frames as a data set. Raises NeecoError if hardly any is accepted."""
     accepted = sum(record["accepted"] for record in records)
-    if accepted < max(1.0, ADAPT.min_accepted * len(records)):
+    proposed = sum(record["reason"] != EMPTY for record in records)
+    if accepted < max(1.0, ADAPT.min_accepted * proposed):
         best = max(record["overlap"] for record in records)
         raise NeecoError(
-            f"{request.footage}: {accepted} of {len(records)} frames accepted, the best overlap is {best:.2f}; check "
-            "that it shows the run's instrument, give --backgrounds, or masks of another model by --masks; reasons: "
+            f"{request.footage}: {accepted} of {proposed} frames with a proposal accepted, the best overlap is "
+            f"{best:.2f}; check that it shows the run's instrument, give --backgrounds, or masks of another model by "
+            "--masks; reasons: "
             f"{Path(request.output) / INFO}"
         )
     scene = verifier.fitter.fitter.instruments.alone

@@ -28,6 +28,7 @@ from neeco.synthesis.generator import limit_threads
 from neeco.tracking.from_labels import LabelFitter
 
 PROPOSALS = "proposals"
+EMPTY = "nothing is proposed"  # reason of frames that may show no instrument
 Progress = Callable[[str, int, int], None]
 Record = dict[str, Any]
 
@@ -41,8 +42,8 @@ class AdaptSettings:
     # distance of the instrument, relative to the nearest and the farthest recorded one; farther away than that, a part
     # of the instrument was taken for all of it
     distance_range: tuple[float, float] = (0.5, 1.4)
-    min_accepted: float = 0.05  # minimum share of accepted frames
-    usual_accepted: float = 0.8  # share of accepted frames, below which the result is DOUBTFUL
+    min_accepted: float = 0.05  # minimum share of accepted frames, of those with a proposal
+    usual_accepted: float = 0.8  # the same share, below which the result is DOUBTFUL
     min_taught: int = 4  # minimum number of accepted frames from which a segmenter learns
     chunk: int = 8  # number of consecutive frames that one worker verifies; the first of them has no frame before it
 
@@ -117,8 +118,10 @@ class Verifier:
         image, counted = frame.load_image_bytes().numpy(), counted_pixels(frame)
         proposed = (proposal > 0) & counted
         first = cut_out(image, proposed, ADAPT.reach)
-        if first is None or not (first & counted).any():
-            return record | {"reason": "nothing is proposed"}, None
+        if first is None:
+            return record | {"reason": EMPTY}, None
+        if not (first & counted).any():
+            return record | {"reason": "the image has no edges about the proposal"}, None
         classes = with_nearest(first & counted, proposal)
         shares = np.stack([classes == k + 1 for k in range(len(self.fitter.classes))]).astype(np.float32)
         fit = self.fitter.fit(self.fitter.view(shares, frame.camera, counted), nearby)
