@@ -142,7 +142,7 @@ def test_frames_of_another_instrument_are_refused_in_one_line(
         disc = cv2.circle(np.zeros((128, 192), np.uint8), (120, 60), 18, 1, -1)
         write_labels(masks / f"{k:06d}.png", torch.from_numpy(disc))
     with pytest.raises(
-        NeecoError, match=r"0 of 4 frames with a proposal accepted, the best overlap is .*; check that it shows"
+        NeecoError, match=r"0 of 4 frames accepted, 4 have a proposal, the best overlap is .*; check that it shows"
     ):
         adapt_footage(run, request_of(operation, tmp_path / "out", masks=masks, min_overlap=0.9), silent)
     records = json.loads((tmp_path / "out" / "adapt.json").read_text())["frames"]

@@ -422,8 +422,8 @@ def draw_in_workers(spec: GeneratorSpec, output: Path, indices: Sequence[int], w
     tasks = [tuple(indices[k : k + size]) for k in range(0, len(indices), size)]
     try:
         pool, name = Workers(count=workers, threads=each), lambda index: f"image {tasks[index][0]}"
-        for drawn in results_of(_draw, shared, tasks, pool, name):
-            for result in drawn:
+        for images in results_of(_draw, shared, tasks, pool, name):
+            for result in images:
                 yield result.write(output) if isinstance(result, Encoded) else result
     finally:
         sweep_unfinished(output)  # a worker's unfinished files

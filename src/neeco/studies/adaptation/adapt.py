@@ -294,10 +294,9 @@ def _write_set(
     if accepted < max(1.0, ADAPT.min_accepted * proposed):
         best = max(record["overlap"] for record in records)
         raise NeecoError(
-            f"{request.footage}: {accepted} of {proposed} frames with a proposal accepted, the best overlap is "
-            f"{best:.2f}; check that it shows the run's instrument, give --backgrounds, or masks of another model by "
-            "--masks; reasons: "
-            f"{Path(request.output) / INFO}"
+            f"{request.footage}: {accepted} of {len(records)} frames accepted, {proposed} have a proposal, the best "
+            f"overlap is {best:.2f}; check that it shows the run's instrument, give --backgrounds, or masks of another "
+            f"model by --masks; reasons: {Path(request.output) / INFO}"
         )
     scene = verifier.fitter.fitter.instruments.alone
     labeller = CompositedLabels(scene)
