@@ -52,8 +52,8 @@ ADAPT = AdaptSettings()
 
 
 @dataclass(frozen=True, eq=False)
+class Shared:
     """The scene, the request and the frames, common to all workers."""
-    """What all workers that verify frames need."""
 
     scene: Path
     device: torch.device
