@@ -3,12 +3,14 @@
     python benchmarks/adapted.py SET CAPTURE [--seeds 3] [--arms cuts ...]
 
 SET: output of `neeco adapt`. CAPTURE: its footage, with truth. Prints, for each round, IoU with the truth: of the
-network in all frames, of the labels of accepted ones, of the parts. With --arms the same segmenter learns from SET's
-rendered images and, half of the time, from its first round's frames by other labels; all steps, images and seeds are
-the same. Prints their IoU in all frames, and differences to `accepted` with 95 % intervals over seeds and blocks of
-frames. Finished networks are kept in SET/control.
+network in all frames, of the labels of accepted ones, of the parts; and how far tips (the shaft's end where there is
+none) of the fitted states are from those of CAPTURE's states, px, as the run's scene places them. With --arms the same
+segmenter learns from SET's rendered images and, half of the time, from its first round's frames by other labels; all
+steps, images and seeds are the same. Prints their IoU in all frames, and differences to `accepted` with 95 % intervals
+over seeds and blocks of frames. Finished networks are kept in SET/control.
 
     none        rendered images alone
+    filtered    rendered images alone, without those whose label a network taught by the other half contradicts
     proposals   plain pseudo-labels: the network's own masks of all frames
     cuts        these masks cut out along the image's edges; no scene, no rejection
     accepted    as `adapt` does: accepted frames with their masks and parts, without doubtful pixels
@@ -28,23 +30,26 @@ import torch
 
 from neeco.base.files import read_json, write_json
 from neeco.capture.images import read_labels
-from neeco.capture.model import Frame
+from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.readers import read_capture
 from neeco.evaluation.masks import Masks, iou, open_truth
 from neeco.evidence.image_cut import cut_out
+from neeco.geometry.camera import Camera
+from neeco.scene import GaussianScene
 from neeco.studies.adaptation import AdaptRequest
 from neeco.studies.adaptation.adapt import INFO, ROUNDS, AcceptedFrame, rendered_samples
 from neeco.studies.adaptation.footage import adapted_frames
-from neeco.studies.adaptation.verification import ADAPT, PROPOSALS, Shared, Verifier, classes_of, with_nearest
-from neeco.studies.downstream.model import TrainingTask, input_size, model_class
+from neeco.studies.adaptation.verification import ADAPT, PROPOSALS, Shared, Verifier, classes_of, state_of, with_nearest
+from neeco.studies.downstream.model import Predict, TrainingTask, input_size, model_class
 from neeco.studies.downstream.results import Arm, Scores, mask_scores
 from neeco.studies.downstream.samples import Example, Sample, class_table
 from neeco.studies.downstream.training_data import BatchSampler
 from neeco.tracking.from_labels import LabelFitter
 from neeco.training.run import SCENE_FILE, load_run
 
-ARMS = ("none", "proposals", "cuts", "accepted", "permuted")
+ARMS = ("none", "filtered", "proposals", "cuts", "accepted", "permuted")
 TEST = "next"
+AGREED = 0.7  # minimum IoU of a rendered label and of what a network predicts there, of the arm `filtered`
 
 
 @dataclass(frozen=True)
@@ -111,7 +116,7 @@ class Control:
                 Labelled(arm, self.verifier.frames[sample.record["index"]], replace(examples[other], image=own.image))
                 for sample, own, other in zip(chosen, examples, others, strict=True)
             ]
-        if arm == "none":
+        if arm in ("none", "filtered"):
             return []
         added: list[Sample] = []
         for frame in self.verifier.frames:
@@ -126,13 +131,27 @@ class Control:
 
     def taught(self, arm: str, seed: int) -> list[np.ndarray]:
         """What a network that learned by this arm predicts for all frames, uint8 [H, W] each."""
-        kind, classes = model_class(self.settings["model"]), self.verifier.fitter.classes
-        sources: list[Sequence[Sample]] = [rendered_samples(self.output / ROUNDS / "synthetic", classes)]
-        if added := self.samples(arm):
-            sources.append(added)
-        camera = self.verifier.frames[0].camera
+        rendered: list[Sample] = [*rendered_samples(self.output / ROUNDS / "synthetic", self.verifier.fitter.classes)]
+        if arm == "filtered":
+            halves, kept = (rendered[::2], rendered[1::2]), []
+            for teaching, judged in (halves, halves[::-1]):
+                examples = [sample.load() for sample in judged]
+                predictions = self._learned([teaching], seed)([example.image for example in examples])
+                agreed = [
+                    not iou(np.asarray(prediction) > 0, example.classes > 0) < AGREED  # NaN: both are empty
+                    for prediction, example in zip(predictions, examples, strict=True)
+                ]
+                kept += [sample for sample, keep in zip(judged, agreed, strict=True) if keep]
+            print(f"filtered: {len(kept)} of {len(rendered)} rendered images stay", flush=True)
+            rendered = kept
+        sources = [samples for samples in (rendered, self.samples(arm)) if samples]
+        predict = self._learned(sources, seed)
+        return [np.asarray(p) for p in predict([frame.load_image_bytes().numpy() for frame in self.verifier.frames])]
+
+    def _learned(self, sources: Sequence[Sequence[Sample]], seed: int) -> Predict:
+        kind, camera = model_class(self.settings["model"]), self.verifier.frames[0].camera
         task = TrainingTask(
-            classes=classes,
+            classes=self.verifier.fitter.classes,
             batches=BatchSampler((), sources, seed=seed, augmented=True),
             size=input_size((camera.width, camera.height), kind.image_size, kind.multiple),
             steps=self.settings["steps"] or kind.steps,
@@ -142,30 +161,67 @@ class Control:
             folder=self.output,
             keep_weights=False,
         )
-        images = [frame.load_image_bytes().numpy() for frame in self.verifier.frames]
-        return [np.asarray(prediction) for prediction in kind().fit(task)(images)]
+        return kind().fit(task)
 
 
-def report(control: Control, truth: Masks) -> None:
+def tips_in(scene: GaussianScene, state: InstrumentState, camera: Camera) -> np.ndarray:
+    """The pixels [N, 2] of tips of an instrument, of its foremost point where it has none."""
+    (points,) = scene.deformation.keypoints(State({scene.instruments[0].name: state}, 0.0)).values()
+    tips = [point for name, point in points.items() if "tip" in name] or [points["shaft_near"]]
+    x, y, z = torch.stack(tips).detach().double().numpy().T
+    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
+
+
+def tip_errors(
+    scene: GaussianScene, pairs: Sequence[tuple[InstrumentState, InstrumentState]], camera: Camera
+) -> list[float]:
+    """Distances, px, between tips of fitted states and of true ones, of tips that are in view. Both are before the
+    camera; what is tracked of the instrument may differ between both recordings by a rigid transform, which is that of
+    the frame that leaves the smallest median. Left and right may be exchanged."""
+    best = [np.inf]
+    fitted = [tips_in(scene, found, camera) for found, _ in pairs]
+    for found, true in pairs:
+        between, errors = torch.linalg.inv(true.pose) @ found.pose, []
+        for tips, (_, other) in zip(fitted, pairs, strict=True):
+            expected = tips_in(scene, replace(other, pose=other.pose @ between), camera)
+            inside = ((expected >= 0) & (expected < [camera.width, camera.height])).all(1)
+            orders = [np.linalg.norm(order - expected, axis=1)[inside] for order in (tips, tips[::-1])]
+            errors += [float(value) for value in min(orders, key=lambda distances: float(distances.sum()))]
+        if errors and np.median(errors) < np.median(best):
+            best = errors
+    return best
+
+
+def report(control: Control, capture: Capture, truth: Masks) -> None:
     """Print the scores of each round."""
+    scene, recorded = control.verifier.fitter.fitter.instruments.alone, {f.name: f for f in capture.frames}
     classes = control.verifier.fitter.classes
     table = np.frombuffer(class_table(truth.names or {}, classes), np.uint8).copy()
     table[1:][table[1:] == 0] = 1  # a wrist that the scene does not tell from the shaft
     for folder in sorted((control.output / ROUNDS).glob("[0-9]*")):
         records = control.verifier.verify(folder, control.shared, lambda what, done, total: None)
-        network, labels, clear, parts = [], [], [], []
+        network, labels, clear, parts, states = [], [], [], [], []
         for record in records:
             true = truth.load(record["frame"])
             network.append(iou(read_labels(folder / PROPOSALS / f"{record['frame']}.png").numpy() > 0, true > 0))
             if record["accepted"]:
                 example = AcceptedFrame(control.verifier, record).load()
+                own = recorded[record["frame"]]
+                (found,), (true_state,) = state_of(record).instruments.values(), own.state.instruments.values()
+                before = torch.from_numpy(own.camera.camera_from_world) @ true_state.pose.double()
+                states.append((found, replace(true_state, pose=before)))
                 labels.append(iou(example.classes > 0, true > 0))
                 clear.append(iou(example.classes > 0, true > 0, example.valid))
                 parts.append([iou(example.classes == k + 1, table[true] == k + 1) for k in range(len(classes))])
+        told = f"round {folder.name}: network {np.nanmean(network):.3f}; {len(labels)} of {len(records)} accepted"
+        if not labels:
+            print(told)
+            continue
+        tips = tip_errors(scene, states, control.verifier.frames[0].camera)
         named = ", ".join(f"{name} {score:.3f}" for name, score in zip(classes, np.nanmean(parts, 0), strict=True))
         print(
-            f"round {folder.name}: network {np.mean(network):.3f}; {len(labels)} of {len(records)} accepted: labels "
-            f"{np.mean(labels):.3f} (lowest {min(labels):.3f}), without ignored {np.mean(clear):.3f}; {named}"
+            f"{told}: labels {np.mean(labels):.3f} (lowest {min(labels):.3f}), without ignored {np.mean(clear):.3f}; "
+            f"{named}; tips {np.median(tips):.1f} px (median of {len(tips)}; 90 % within {np.quantile(tips, 0.9):.1f})"
         )
 
 
@@ -177,8 +233,9 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=[])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    control, truth = Control.of(arguments.set), open_truth(read_capture(arguments.capture))
-    report(control, truth)
+    control, capture = Control.of(arguments.set), read_capture(arguments.capture)
+    truth = open_truth(capture)
+    report(control, capture, truth)
     jobs = []
     for seed in range(arguments.seeds):
         for arm in arguments.arms:

@@ -321,6 +321,19 @@ class PerturbedViews:
 
 
 @dataclass(frozen=True)
+class RolledViews:
+    """A recorded camera rolled about its optical axis by any angle: instruments enter the image from all sides, as
+    through other ports."""
+
+    recorded: RecordedViews
+
+    def __call__(self, state: State, rng: Generator) -> Camera:
+        camera = self.recorded(state, rng)
+        roll = Rotation.from_rotvec([0.0, 0.0, 2 * np.pi * rng.random()]).as_matrix()
+        return moved_camera(camera, to_numpy(camera.world_from_camera) @ rigid(roll, np.zeros(3)))
+
+
+@dataclass(frozen=True)
 class OrbitViews:
     """A recorded camera in orbit around `centre` (world mm), which stays at its position in the image.
 
@@ -382,6 +395,8 @@ def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views,
     still = scene.recorded.still
     if views == "perturbed":
         view_sampler = PerturbedViews(recorded, *((SAMPLING.still_degrees, SAMPLING.still_mm) if still else ()))
+    if views == "rolled":
+        view_sampler = RolledViews(recorded)
     if views == "orbit":
         if still:
             raise NeecoError("--views orbit: the scope was still, which shows only one side; use recorded or perturbed")

@@ -15,7 +15,7 @@ from neeco.base.settings import structure
 from neeco.labels.settings import LABELS
 
 LabelWay = Literal["composited", "threshold"]
-Views = Literal["recorded", "perturbed", "orbit"]
+Views = Literal["recorded", "perturbed", "rolled", "orbit"]
 ImageFormat = Literal["png", "jpg"]
 PUBLIC_SETS = ("endovis2017-parts", "endovis2018", "sar-rarp50")  # class ids of these
 FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder", *PUBLIC_SETS)  # of our own writers

@@ -182,6 +182,7 @@ def _taught(
         count=request.count,
         seed=request.seed,
         states="extrapolate",
+        views="rolled",
         backgrounds=backgrounds,
         match_colors=str(rounds / "frames"),
     )
@@ -195,18 +196,16 @@ def _taught(
         on_progress=lambda done: progress("rendered images", done, request.count),
         workers=request.workers,
     )
-    rendered = rendered_samples(folder, classes)
+    rendered: Sequence[Sample] = rendered_samples(folder, classes)
     camera = verifier.frames[0].camera
     size = input_size((camera.width, camera.height), kind.image_size, kind.multiple)
     records: list[Record] = []
+    accepted: list[Sample] = []
     for number in range(1, request.rounds + 1):
         place, words = rounds / str(number), f"round {number} of {request.rounds}"
         files = [place / PROPOSALS / f"{frame.name}.png" for frame in verifier.frames]
         if not all(file.exists() for file in files):
-            accepted = [AcceptedFrame(verifier, record) for record in records if record["accepted"]]
-            sources: list[Sequence[Sample]] = [rendered]
-            if len(accepted) >= ADAPT.min_taught:
-                sources.append(accepted)
+            sources = [rendered, accepted] if accepted else [rendered]
             place.mkdir(parents=True, exist_ok=True)
             task = TrainingTask(
                 classes=classes,
@@ -226,6 +225,9 @@ def _taught(
                 for file, prediction in zip(files[some], predict(images), strict=True):
                     write_unsynced(file, encoded_png(np.asarray(prediction, np.uint8)))
         records = verifier.verify(place, shared, progress, words)
+        accepted = [AcceptedFrame(verifier, record) for record in records if record["accepted"]]
+        if len(accepted) < ADAPT.min_taught:
+            break  # another round would learn the same
     return records
 
 
