@@ -126,7 +126,7 @@ def test_no_scene_is_seen_through_normalised_intrinsics_or_from_nowhere(scene):
         ({"count": math.nan}, "count: nan is not a whole number"),
         ({"margin": math.nan}, "margin: nan"),
         ({"margin": -0.1}, "margin: -0.1"),
-        ({"views": "round"}, r"views: 'round' is (none of|unknown; give one of) recorded, perturbed, orbit"),
+        ({"views": "round"}, r"views: 'round' is (none of|unknown; give one of) recorded, perturbed, rolled, orbit"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(scene, setting, words):

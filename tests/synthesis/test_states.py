@@ -24,6 +24,7 @@ from neeco.synthesis.samplers import (
     PathStates,
     PerturbedViews,
     RecordedViews,
+    RolledViews,
     interpolate_pose,
     make_sampler,
     shafts_of,
@@ -199,6 +200,17 @@ def test_an_orbit_keeps_its_centre_at_its_place_and_distance(camera):
         assert is_rigid(moved)
         assert np.allclose((np.linalg.inv(moved) @ np.append(centre, 1))[:3], centre)
     assert not np.allclose(moved, np.eye(4), atol=1e-3)
+
+
+def test_rolled_views_turn_the_image_about_its_principal_point_by_all_angles(camera):
+    views, ahead = RolledViews(RecordedViews((camera,))), np.array([0.0, 0.0, 100.0, 1.0])
+    angles = []
+    for k in range(400):
+        moved = views(State(), rng_of(k)).world_from_camera.numpy()
+        assert is_rigid(moved)
+        assert np.allclose(moved @ ahead, camera.world_from_camera.numpy() @ ahead, atol=1e-4)
+        angles.append(np.arctan2(moved[1, 0], moved[0, 0]))
+    assert np.histogram(angles, 8, (-np.pi, np.pi))[0].min() > 25
 
 
 def test_perturbed_views_stay_near_recorded_ones(camera):

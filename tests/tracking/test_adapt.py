@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -177,14 +178,15 @@ def test_pixels_that_a_mask_leaves_out_do_not_count(run: RecordedRun, operation:
         write_image(tmp_path / "images" / name, torch.from_numpy(image).float() / 255)
         write_labels(tmp_path / "counted" / name, torch.from_numpy((~text).astype(np.uint8) * 255))
         mask = read_labels(operation / "masks" / name).numpy() | text
-        write_labels(tmp_path / "proposals" / name, torch.from_numpy(mask.astype(np.uint8)))
+        write_labels(tmp_path / "1" / "proposals" / name, torch.from_numpy(mask.astype(np.uint8)))
         files = {"image_path": tmp_path / "images" / name, "mask_path": tmp_path / "counted" / name}
         frames.append(Frame(**files, camera=LARGE, state=State({}, 0.0), split="footage"))
     channels = run.scene.label_channels().sum(1, keepdim=True)
     verifier = Verifier(LabelFitter.of(run.scene, ("instrument",), channels), frames, 0.8)
-    for index in verifier.chunk(tmp_path, (0, 1)):
-        assert json.loads((tmp_path / "fits" / f"{index:06d}.json").read_text())["accepted"]
-        mask = read_labels(tmp_path / "fits" / f"{index:06d}.png").numpy() > 0
+    fits = tmp_path / "1" / "fits"
+    for index in verifier.chunk(tmp_path / "1", (0, 1)):
+        assert json.loads((fits / f"{index:06d}.json").read_text())["accepted"]
+        mask = read_labels(fits / f"{index:06d}.png").numpy() > 0
         assert not mask[text].any()
         assert iou(mask, silhouette(states()[index]) & ~text) > 0.85
 
@@ -217,6 +219,29 @@ def test_a_segmenter_learns_from_renderings_and_proposes(run: RecordedRun, opera
     for number in (1, 2):
         assert len(list((output / "rounds" / str(number) / "proposals").iterdir())) == COUNT
     assert (output / "coco" / "instances.json").exists()
+
+
+def test_a_frame_accepted_before_is_fitted_as_well_from_its_state_there(
+    run: RecordedRun, operation: Path, adapted: Adapted, tmp_path: Path
+) -> None:
+    rounds = tmp_path / "rounds"
+    shutil.copytree(adapted.output / "rounds" / "1", rounds / "1")
+    shutil.copytree(rounds / "1" / "proposals", rounds / "2" / "proposals")
+    frames = [Frame(path, LARGE, State({}, 0.0), "footage") for path in sorted((operation / "images").iterdir())]
+    channels = run.scene.label_channels().sum(1, keepdim=True)
+    verifier = Verifier(LabelFitter.of(run.scene, ("instrument",), channels), frames, 0.8)
+    assert list(verifier.chunk(rounds / "2", range(COUNT))) == list(range(COUNT))
+    for before in adapted.records:
+        after = json.loads((rounds / "2" / "fits" / f"{before['frame']}.json").read_text())
+        assert after["accepted"]
+        assert after["misfit"] < 1.05 * before["misfit"]
+
+
+def test_rounds_end_where_another_would_learn_the_same(run: RecordedRun, operation: Path, tmp_path: Path) -> None:
+    options = {"masks": None, "steps": 2, "count": 4, "rounds": 3, "min_overlap": 0.99}
+    with pytest.raises(NeecoError, match="0 of 4 frames accepted"):
+        adapt_footage(run, request_of(operation, tmp_path / "out", **options), silent)
+    assert not (tmp_path / "out" / "rounds" / "2").exists()
 
 
 def test_a_cut_follows_the_image_beyond_a_proposal() -> None:

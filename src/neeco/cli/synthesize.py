@@ -16,6 +16,7 @@ from neeco.synthesis.settings import DEFAULT_FORMATS, Settings, formats_help
 VIEWS_OF_STILL = {
     "recorded": "the recorded ones",
     "perturbed": "within about a degree and a millimetre of the recorded ones",
+    "rolled": "the recorded ones, rolled about the optical axis; tissue beyond the recorded images is in ignore/",
 }
 
 

@@ -154,7 +154,8 @@ class Settings(ImageSettings):
     margin: float = 0.2
     """How far `extrapolate` goes, as a share of the recorded range at either end."""
     views: Views = "recorded"
-    """Cameras: of a recorded frame with a similar state, near such ones, or from there in orbit about the tissue."""
+    """Cameras: of a recorded frame with a similar state, near such ones, rolled about their axes by any angle (so that
+    instruments enter from all sides), or from there in orbit about the tissue."""
     class_names: tuple[str, ...] = ()
     """INSTRUMENT=CLASS: names of classes in the data set's formats, which instruments may share. Default: those of the
     instruments."""

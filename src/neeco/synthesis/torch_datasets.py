@@ -74,7 +74,7 @@ def sample_states(
         count: how many
         seed: the same one gives the same states
         states: interpolate, extrapolate, grid, path:FILE.jsonl or FILE.jsonl
-        views: recorded, perturbed or orbit
+        views: recorded, perturbed, rolled or orbit
         margin: how far extrapolate goes, as a share of the recorded range at either end
 
     Nothing is rendered, so none is refused for what the image shows. Raises NeecoError for settings or a scene that do
@@ -96,7 +96,7 @@ class LabelledImages(Dataset[Sample]):
         count: how many images
         seed: the same one gives the same images
         states: interpolate, extrapolate, grid, path:FILE.jsonl or FILE.jsonl
-        views: recorded, perturbed or orbit
+        views: recorded, perturbed, rolled or orbit
         labels: composited or threshold
         camera_effects: YAML file of blur, noise, smoke and the like
         instruments: runs or scenes whose instruments are rendered over the scene's tissue, instead of its own

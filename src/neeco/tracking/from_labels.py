@@ -113,12 +113,15 @@ class LabelFitter:
             diagonal=math.hypot(small.width, small.height),
         )
 
-    def fit(self, view: FrameView, nearby: Sequence[State] = ()) -> StateFit | None:
-        """Return the best fit to a view's proposal, from recorded states and `nearby` ones (of neighbouring frames);
-        None where no state explains it better than no instrument."""
+    def fit(self, view: FrameView, nearby: Sequence[State] = (), earlier: State | None = None) -> StateFit | None:
+        """Return the best fit to a view's proposal, from recorded states and `nearby` ones (of neighbouring frames), or
+        from an `earlier` fit to this frame alone; None where no state explains it better than no instrument."""
         fitter, prior = self.fitter, loose_prior(self.fitter.parameters, *LABEL_FIT.prior)
-        candidates = fitter.ranked(view, [*self._starts(view), *nearby], 0.25)
-        starts = distinct(fitter.parameters, candidates, LABEL_FIT.n_starts)
+        if earlier is not None:
+            starts = [earlier]
+        else:
+            candidates = fitter.ranked(view, [*self._starts(view), *nearby], 0.25)
+            starts = distinct(fitter.parameters, candidates, LABEL_FIT.n_starts)
         fits = by_gain(fitter.fit(view, start, prior, levels=(0.25,), steps=(8,)) for start in starts)
         if not fits:
             return None

@@ -95,14 +95,18 @@ class Verifier:
         ]
 
     def chunk(self, folder: Path, indices: Iterable[int]) -> Iterator[int]:
-        """Verify consecutive frames; yield the index of each one whose record is in `folder` now."""
+        """Verify consecutive frames; yield the index of each one whose record is in `folder` now. A frame that was
+        accepted in the round before is fitted from its state there."""
         nearby: list[State] = []
+        before = folder.with_name(str(int(folder.name) - 1)) / "fits"
         for index in indices:
             frame = self.frames[index]
             file = folder / "fits" / f"{frame.name}.json"
             if not file.exists():
                 proposal = read_labels(folder / PROPOSALS / f"{frame.name}.png").numpy()
-                record, mask = self._verified(frame, proposal, nearby)
+                past = read_json(before / file.name) if (before / file.name).exists() else {"accepted": False}
+                earlier = state_of(past) if past["accepted"] else None
+                record, mask = self._verified(frame, proposal, nearby, earlier)
                 if mask is not None:
                     write_unsynced(file.with_suffix(".png"), encoded_png(mask.astype(np.uint8) * 255))
                 write_json(file, record)
@@ -111,7 +115,7 @@ class Verifier:
             yield index
 
     def _verified(
-        self, frame: Frame, proposal: np.ndarray, nearby: Sequence[State]
+        self, frame: Frame, proposal: np.ndarray, nearby: Sequence[State], earlier: State | None
     ) -> tuple[Record, np.ndarray | None]:
         """Return the record of a frame, and the mask [H, W] bool that its image and the rendering lead to."""
         record: Record = {"frame": frame.name, "accepted": False, "reason": "", "overlap": 0.0, "state": None}
@@ -124,7 +128,7 @@ class Verifier:
             return record | {"reason": "the image has no edges about the proposal"}, None
         classes = with_nearest(first & counted, proposal)
         shares = np.stack([classes == k + 1 for k in range(len(self.fitter.classes))]).astype(np.float32)
-        fit = self.fitter.fit(self.fitter.view(shares, frame.camera, counted), nearby)
+        fit = self.fitter.fit(self.fitter.view(shares, frame.camera, counted), nearby, earlier)
         if fit is None:
             return record | {"reason": "no state of the instrument explains the proposal"}, None
         rendered = self.fitter.shares(fit.state, frame.camera)[1] > LABELS.surface_alpha
