@@ -42,7 +42,7 @@ from neeco.studies.adaptation.footage import adapted_frames
 from neeco.studies.adaptation.verification import ADAPT, PROPOSALS, Shared, Verifier, classes_of, state_of, with_nearest
 from neeco.studies.downstream.model import Predict, TrainingTask, input_size, model_class
 from neeco.studies.downstream.results import Arm, Scores, mask_scores
-from neeco.studies.downstream.samples import Example, Sample, class_table
+from neeco.studies.downstream.samples import Example, Sample, paired_parts
 from neeco.studies.downstream.training_data import BatchSampler
 from neeco.tracking.from_labels import LabelFitter
 from neeco.training.run import SCENE_FILE, load_run
@@ -196,8 +196,10 @@ def report(control: Control, capture: Capture, truth: Masks) -> None:
     """Print the scores of each round."""
     scene, recorded = control.verifier.fitter.fitter.instruments.alone, {f.name: f for f in capture.frames}
     classes = control.verifier.fitter.classes
-    table = np.frombuffer(class_table(truth.names or {}, classes), np.uint8).copy()
-    table[1:][table[1:] == 0] = 1  # a wrist that the scene does not tell from the shaft
+    table = np.zeros(256, np.uint8)
+    for number, pair in paired_parts(truth.names or {}).items():
+        part = next((name for name in (pair, truth.names[number]) if name in classes), classes[0])
+        table[number] = number and classes.index(part) + 1  # what the scene does not tell from the first, such as a wrist
     for folder in sorted((control.output / ROUNDS).glob("[0-9]*")):
         records = control.verifier.verify(folder, control.shared, lambda what, done, total: None)
         network, labels, clear, parts, states = [], [], [], [], []
