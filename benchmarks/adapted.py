@@ -199,7 +199,7 @@ def report(control: Control, capture: Capture, truth: Masks) -> None:
     table = np.zeros(256, np.uint8)
     for number, pair in paired_parts(truth.names or {}).items():
         part = next((name for name in (pair, truth.names[number]) if name in classes), classes[0])
-        table[number] = number and classes.index(part) + 1  # what the scene does not tell from the first, such as a wrist
+        table[number] = number and classes.index(part) + 1  # a wrist may be none of the scene's
     for folder in sorted((control.output / ROUNDS).glob("[0-9]*")):
         records = control.verifier.verify(folder, control.shared, lambda what, done, total: None)
         network, labels, clear, parts, states = [], [], [], [], []
