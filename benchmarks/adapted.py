@@ -3,11 +3,11 @@
     python benchmarks/adapted.py SET CAPTURE [--seeds 3] [--arms cuts ...]
 
 SET: output of `neeco adapt`. CAPTURE: its footage, with truth. Prints, for each round, IoU with the truth: of the
-network in all frames, of the labels of accepted ones, of the parts; and how far tips (the shaft's end where there is
-none) of the fitted states are from those of CAPTURE's states, px, as the run's scene places them. With --arms the same
-segmenter learns from SET's rendered images and, half of the time, from its first round's frames by other labels; all
-steps, images and seeds are the same. Prints their IoU in all frames, and differences to `accepted` with 95 % intervals
-over seeds and blocks of frames. Finished networks are kept in SET/control.
+network in all frames, of the labels of accepted ones, of the parts; and how far the tip of the rendered state is from
+the true one in the image, px. With --arms the same segmenter learns from SET's rendered images and, half of the time,
+from its first round's frames by other labels; all steps, images and seeds are the same. Prints their IoU in all frames,
+and differences to `accepted` with 95 % intervals over seeds and blocks of frames. Finished networks are kept in
+SET/control.
 
     none        rendered images alone
     filtered    rendered images alone, without those whose label a network taught by the other half contradicts
@@ -30,12 +30,10 @@ import torch
 
 from neeco.base.files import read_json, write_json
 from neeco.capture.images import read_labels
-from neeco.capture.model import Capture, Frame, InstrumentState, State
+from neeco.capture.model import Frame
 from neeco.capture.readers import read_capture
 from neeco.evaluation.masks import Masks, iou, open_truth
 from neeco.evidence.image_cut import cut_out
-from neeco.geometry.camera import Camera
-from neeco.scene import GaussianScene
 from neeco.studies.adaptation import AdaptRequest
 from neeco.studies.adaptation.adapt import INFO, ROUNDS, AcceptedFrame, rendered_samples
 from neeco.studies.adaptation.footage import adapted_frames
@@ -164,54 +162,37 @@ class Control:
         return kind().fit(task)
 
 
-def tips_in(scene: GaussianScene, state: InstrumentState, camera: Camera) -> np.ndarray:
-    """The pixels [N, 2] of tips of an instrument, of its foremost point where it has none."""
-    (points,) = scene.deformation.keypoints(State({scene.instruments[0].name: state}, 0.0)).values()
-    tips = [point for name, point in points.items() if "tip" in name] or [points["shaft_near"]]
-    x, y, z = torch.stack(tips).detach().double().numpy().T
-    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
+def tip_of(mask: np.ndarray) -> np.ndarray | None:
+    """The pixel [2] of an instrument's mask that is farthest from where it enters the image; None where it is at the
+    border itself, or nothing enters."""
+    rows, columns = np.nonzero(mask)
+    inside = (rows > 0) & (rows < mask.shape[0] - 1) & (columns > 0) & (columns < mask.shape[1] - 1)
+    if inside.all() or not inside.any():
+        return None
+    points = np.stack([columns, rows], 1).astype(float)
+    farthest = int(np.linalg.norm(points - points[~inside].mean(0), axis=1).argmax())
+    return points[farthest] if inside[farthest] else None
 
 
-def tip_errors(
-    scene: GaussianScene, pairs: Sequence[tuple[InstrumentState, InstrumentState]], camera: Camera
-) -> list[float]:
-    """Distances, px, between tips of fitted states and of true ones, of tips that are in view. Both are before the
-    camera; what is tracked of the instrument may differ between both recordings by a rigid transform, which is that of
-    the frame that leaves the smallest median. Left and right may be exchanged."""
-    best = [np.inf]
-    fitted = [tips_in(scene, found, camera) for found, _ in pairs]
-    for found, true in pairs:
-        between, errors = torch.linalg.inv(true.pose) @ found.pose, []
-        for tips, (_, other) in zip(fitted, pairs, strict=True):
-            expected = tips_in(scene, replace(other, pose=other.pose @ between), camera)
-            inside = ((expected >= 0) & (expected < [camera.width, camera.height])).all(1)
-            orders = [np.linalg.norm(order - expected, axis=1)[inside] for order in (tips, tips[::-1])]
-            errors += [float(value) for value in min(orders, key=lambda distances: float(distances.sum()))]
-        if errors and np.median(errors) < np.median(best):
-            best = errors
-    return best
-
-
-def report(control: Control, capture: Capture, truth: Masks) -> None:
+def report(control: Control, truth: Masks) -> None:
     """Print the scores of each round."""
-    scene, recorded = control.verifier.fitter.fitter.instruments.alone, {f.name: f for f in capture.frames}
-    classes = control.verifier.fitter.classes
+    frames, classes = control.verifier.frames, control.verifier.fitter.classes
     table = np.zeros(256, np.uint8)
     for number, pair in paired_parts(truth.names or {}).items():
         part = next((name for name in (pair, truth.names[number]) if name in classes), classes[0])
         table[number] = number and classes.index(part) + 1  # a wrist may be none of the scene's
     for folder in sorted((control.output / ROUNDS).glob("[0-9]*")):
         records = control.verifier.verify(folder, control.shared, lambda what, done, total: None)
-        network, labels, clear, parts, states = [], [], [], [], []
+        network, labels, clear, parts, tips = [], [], [], [], []
         for record in records:
             true = truth.load(record["frame"])
             network.append(iou(read_labels(folder / PROPOSALS / f"{record['frame']}.png").numpy() > 0, true > 0))
             if record["accepted"]:
                 example = AcceptedFrame(control.verifier, record).load()
-                own = recorded[record["frame"]]
-                (found,), (true_state,) = state_of(record).instruments.values(), own.state.instruments.values()
-                before = torch.from_numpy(own.camera.camera_from_world) @ true_state.pose.double()
-                states.append((found, replace(true_state, pose=before)))
+                rendered = control.verifier.fitter.shares(state_of(record), frames[record["index"]].camera)[1] > 0.5
+                ends = tip_of(rendered), tip_of(true > 0)
+                if ends[0] is not None and ends[1] is not None:
+                    tips.append(float(np.linalg.norm(ends[0] - ends[1])))
                 labels.append(iou(example.classes > 0, true > 0))
                 clear.append(iou(example.classes > 0, true > 0, example.valid))
                 parts.append([iou(example.classes == k + 1, table[true] == k + 1) for k in range(len(classes))])
@@ -219,7 +200,6 @@ def report(control: Control, capture: Capture, truth: Masks) -> None:
         if not labels:
             print(told)
             continue
-        tips = tip_errors(scene, states, control.verifier.frames[0].camera)
         named = ", ".join(f"{name} {score:.3f}" for name, score in zip(classes, np.nanmean(parts, 0), strict=True))
         print(
             f"{told}: labels {np.mean(labels):.3f} (lowest {min(labels):.3f}), without ignored {np.mean(clear):.3f}; "
@@ -235,9 +215,8 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=[])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    control, capture = Control.of(arguments.set), read_capture(arguments.capture)
-    truth = open_truth(capture)
-    report(control, capture, truth)
+    control, truth = Control.of(arguments.set), open_truth(read_capture(arguments.capture))
+    report(control, truth)
     jobs = []
     for seed in range(arguments.seeds):
         for arm in arguments.arms:
