@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from neeco.base.errors import NeecoError
 from neeco.base.files import read_json, write_json
 from neeco.capture.images import read_labels
 from neeco.capture.model import Frame
@@ -141,7 +142,8 @@ class Control:
                 ]
                 kept += [sample for sample, keep in zip(judged, agreed, strict=True) if keep]
             print(f"filtered: {len(kept)} of {len(rendered)} rendered images stay", flush=True)
-            rendered = kept
+            if not (rendered := kept):
+                raise NeecoError(f"{self.output}: no rendered image is confirmed; adapt with more --steps")
         sources = [samples for samples in (rendered, self.samples(arm)) if samples]
         predict = self._learned(sources, seed)
         return [np.asarray(p) for p in predict([frame.load_image_bytes().numpy() for frame in self.verifier.frames])]
