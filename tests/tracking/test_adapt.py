@@ -106,7 +106,7 @@ def test_poor_proposals_become_labels_of_the_whole_instrument(adapted: Adapted, 
 
 def test_few_accepted_frames_are_doubtful(adapted: Adapted) -> None:
     """Another instrument's shaft may fit where little else is in view."""
-    assert adapted.verdict.startswith("usable: 100% of the 4 frames with a proposal accepted")
+    assert adapted.verdict.startswith("usable, if it shows the run's instrument, which is not checked: 100% of the 4")
     some = [entry | {"accepted": index == 0} for index, entry in enumerate(adapted.records)]
     assert replace(adapted, records=some).verdict.startswith("DOUBTFUL: 25% of the 4 frames with a proposal accepted")
 
@@ -117,7 +117,7 @@ def test_frames_without_an_instrument_do_not_make_labels_doubtful(
     for k in (1, 2):
         write_labels(tmp_path / "masks" / f"{k:06d}.png", read_labels(operation / "masks" / f"{k:06d}.png"))
     done = adapt_footage(run, request_of(operation, tmp_path / "out", masks=tmp_path / "masks"), silent)
-    assert done.verdict.startswith("usable: 100% of the 2 frames with a proposal accepted")
+    assert ": 100% of the 2 frames with a proposal accepted" in done.verdict
 
 
 def test_the_card_says_where_images_and_masks_are_from(adapted: Adapted, operation: Path) -> None:

@@ -82,7 +82,7 @@ class Adapted:
         if share < ADAPT.usual_accepted:
             usual = f"(usual: {ADAPT.usual_accepted:.0%} or more)"
             return f"DOUBTFUL: {agreement} {usual}; check that it shows the run's instrument, and preview.png"
-        return f"usable: {agreement}"
+        return f"usable, if it shows the run's instrument, which is not checked: {agreement}"
 
 
 def adapt_footage(run: GaussianRun, request: AdaptRequest, progress: Progress) -> Adapted:
