@@ -67,14 +67,21 @@ def run(args: Arguments) -> int:
 
 def explain(words: Sequence[str]) -> None:
     """Print the settings of the method named in `words`, as a table after the help text."""
-    from neeco.cli._output import print_settings
+    from rich.box import ROUNDED
+    from rich.console import Console
+    from rich.table import Column, Table
+    from rich.text import Text
+
+    from neeco.base.settings import described
     from neeco.scene.method_registry import DEFAULT, method_class, methods
 
     named = [word for before, word in pairwise(["", *words]) if before == "--method" or word.startswith("--method=")]
     method = method_class((named or [DEFAULT])[-1].removeprefix("--method=").partition("+")[0])
+    title = f"settings of method {method.method}: --set deformation.NAME=VALUE"
+    table = Table(Column(no_wrap=True), Column("default"), Column(), title=title, title_justify="left", box=ROUNDED)
+    for row in described(method.Settings):
+        table.add_row(*map(Text, row))
+    console = Console(highlight=False, markup=False)
+    console.print(table if table.rows else f"{title}: none")
     other_methods = ", ".join(name for name in methods() if name != method.method)
-    print_settings(
-        f"settings of method {method.method}: --set deformation.NAME=VALUE",
-        method.Settings,
-        f"of other methods: neeco train --method NAME --help ({other_methods})",
-    )
+    console.print(f"of other methods: neeco train --method NAME --help ({other_methods})")
