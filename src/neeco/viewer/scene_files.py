@@ -43,7 +43,6 @@ from neeco.raster.types import Gaussians
 from neeco.scene import GaussianScene
 from neeco.scene.drawable import ArticulatedMotion
 
-Format = Literal["ply", "spz"]
 SpzVersion = Literal[3, 4]
 DIRECTIONS = 64  # by which harmonics are rotated: four times as many as there are harmonics
 MIN_SCALE = 1e-30  # mm: the logarithm of 0 is no number of a file
@@ -105,12 +104,6 @@ def splats_of(scene: GaussianScene, state: State, camera: Camera, *, moving: boo
     if not all(bool(tensor.isfinite().all()) for tensor in tensors):
         raise NeecoError("the scene's Gaussians are not finite in this state; give another state, or train again")
     return Splats(*(tensor.float().cpu().numpy() for tensor in tensors))
-
-
-def write_splats(splats: Splats, path: Path, format: Format, spz_version: SpzVersion = 4) -> None:
-    """Write a file of that format. Raises NeecoError where the format cannot hold them, or the disk refuses."""
-    data = ply_bytes(splats) if format == "ply" else spz_bytes(splats, spz_version)
-    write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
 def ply_bytes(splats: Splats) -> bytes:
@@ -313,7 +306,6 @@ def _link_pose(motion: ArticulatedMotion, number: int, link: int, state: Instrum
 class _Document:
     """JSON and binary chunk while they are put together."""
 
-    per_mm: float  # units of the file
     content: dict[str, Any] = field(default_factory=lambda: {"accessors": [], "bufferViews": [], "meshes": []})
     nodes: list[dict[str, Any]] = field(default_factory=list)
     binary: bytearray = field(default_factory=bytearray)
@@ -345,20 +337,11 @@ class _Document:
             self.nodes[parent].setdefault("children", []).append(len(self.nodes) - 1)
         return len(self.nodes) - 1
 
-    def packed(self) -> bytes:
-        """Return the file."""
-        self.content["buffers"] = [{"byteLength": len(self.binary)}]
-        text = json.dumps(self.content | {"nodes": self.nodes}, separators=(",", ":"), allow_nan=False).encode()
-        text += b" " * (-len(text) % 4)
-        size = 12 + 8 + len(text) + 8 + len(self.binary)
-        chunks = struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(self.binary), b"BIN\0")
-        return struct.pack("<4sII", b"glTF", 2, size) + b"".join(chunks) + bytes(self.binary)
-
 
 def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") -> None:
     """Write the scene and its camera as glTF, lengths in `unit`: the root turns the capture's world (right, down,
     front) by 180 degrees about z to glTF's axes. Raises NeecoError where the disk refuses."""
-    document = _Document(UNITS[unit])
+    document, per_mm = _Document(), UNITS[unit]
     root = document.node("neeco", rotation=TURN.tolist())
     clock: int | None = None
     channels: list[dict[str, Any]] = []
@@ -369,7 +352,7 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") 
         if item.poses is not None:  # the first at rest, all of them as an animation
             if clock is None and len(scene.times) > 1:
                 clock = document.add(scene.times, bounds=True)
-            rotations, places = _rotations(item.poses), (item.poses[:, :3, 3] * document.per_mm).astype(np.float32)
+            rotations, places = _rotations(item.poses), (item.poses[:, :3, 3] * per_mm).astype(np.float32)
             document.nodes[node] |= {"rotation": rotations[0].tolist(), "translation": places[0].tolist()}
             for target, values in (("rotation", rotations), ("translation", places)):
                 if clock is not None and np.ptp(values, axis=0).max() > 0:
@@ -377,11 +360,11 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") 
                     channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": target}})
         if (splats := item.splats) is not None:  # in the node's frame
             colors = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, splats.opacities[:, None]], 1)
-            columns = {"SCALE": np.exp(splats.log_scales) * document.per_mm, "OPACITY": splats.opacities}
+            columns = {"SCALE": np.exp(splats.log_scales) * per_mm, "OPACITY": splats.opacities}
             for degree in range(splats.degree + 1):
                 for order in range(2 * degree + 1):
                     columns[f"SH_DEGREE_{degree}_COEF_{order}"] = splats.sh[:, degree**2 + order]
-            attributes = {"POSITION": document.add((splats.means * document.per_mm).astype(np.float32), bounds=True)}
+            attributes = {"POSITION": document.add((splats.means * per_mm).astype(np.float32), bounds=True)}
             attributes["COLOR_0"] = document.add(to_uint8(255 * colors))
             turned = np.rint(splats.quats[:, [1, 2, 3, 0]] * np.iinfo(np.int16).max).astype(np.int16)  # to 0.002 deg
             attributes[f"{EXTENSION}:ROTATION"] = document.add(turned)
@@ -395,18 +378,24 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") 
     lens = {
         "yfov": 2 * math.atan(camera.height / (2 * camera.fy)),
         "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
-        "znear": document.per_mm,  # 1 mm
+        "znear": per_mm,  # 1 mm
     }
     document.content["cameras"] = [{"name": "laparoscope", "type": "perspective", "perspective": lens}]
     rotation = _rotations((pose[:3, :3] @ CAMERA_TURN).numpy()[None])
-    place = (pose[:3, 3] * document.per_mm).tolist()
+    place = (pose[:3, 3] * per_mm).tolist()
     # glTF cannot state a principal point off the image's centre
     document.node("laparoscope", root, camera=0, rotation=rotation[0].tolist(), translation=place)
     document.content |= {"asset": {"version": "2.0", "generator": "neeco"}, "extensionsUsed": [EXTENSION]}
     document.content |= {"scene": 0, "scenes": [{"nodes": [root]}]}
     if channels:
         document.content["animations"] = [{"name": "states", "channels": channels, "samplers": samplers}]
-    write_atomically(path, lambda temporary: temporary.write_bytes(document.packed()))
+    document.content["buffers"] = [{"byteLength": len(document.binary)}]
+    text = json.dumps(document.content | {"nodes": document.nodes}, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + len(document.binary)
+    chunks = struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(document.binary), b"BIN\0")
+    data = struct.pack("<4sII", b"glTF", 2, size) + b"".join(chunks) + document.binary
+    write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
 def _rotations(poses: np.ndarray) -> np.ndarray:

@@ -16,7 +16,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -31,7 +30,7 @@ from neeco.labels.drawing import to_numpy
 from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 from neeco.viewer.access import HOST, PORT, Access, controlled_sockets
 from neeco.viewer.panel import Panel, message_html, status_html
-from neeco.viewer.runs import LoadedRun, SavedStates, ViewedRun, score_frame
+from neeco.viewer.runs import VIEWER, LoadedRun, SavedStates, ViewedRun, score_frame
 from neeco.viewer.views import (
     Overlays,
     aspect_of,
@@ -44,32 +43,12 @@ from neeco.viewer.views import (
     pose_of,
     render_run,
     stands_at,
-    upward,
 )
 
 if TYPE_CHECKING:
     import viser
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewerSettings:
-    """Settings of what a viewer renders, and when."""
-
-    settled_s: float = 0.15  # s without a request after which a sharp picture is rendered
-    idle_s: float = 0.5  # maximum s between two checks for requests
-    moving_px: int = 256  # maximum height in px during motion
-    sharp_px: int = 720  # maximum height in px of a sharp rendering
-    min_px: int = 32  # minimum height in px
-    moving_s: float = 0.15  # maximum s of a rendering during motion
-    sharp_s: float = 0.4  # maximum s of a sharp rendering
-    remembered: int = 3  # number of timed renderings, robust to one that computed something first
-    jpeg_moving: int = 80  # JPEG quality during motion
-    jpeg_sharp: int = 92  # JPEG quality of a sharp rendering
-    played_per_s: float = 10.0  # frames per s of `play`
-    status_every_s: float = 0.25  # minimum s between two updates of the status during motion
-
-
-VIEWER = ViewerSettings()
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 
@@ -409,7 +388,9 @@ class ViserPage(contextlib.AbstractContextManager["ViserPage"]):
             raise NeecoError(f"view: viser {viser.__version__} is too old or too new; {install_hint('view')}")
         pose = to_numpy(cameras[0].world_from_camera)
         scene, initial = self._server.scene, self._server.initial_camera
-        scene.set_up_direction(tuple(upward(cameras)))
+        up = -np.mean([to_numpy(camera.world_from_camera)[:3, 1] for camera in cameras], axis=0)  # of most images
+        length = float(np.linalg.norm(up))
+        scene.set_up_direction(tuple(up / length if length > 1e-6 else np.array([0.0, -1.0, 0.0])))
         scene.world_axes.visible = False
         initial.position = tuple(pose[:3, 3] * unit)
         initial.look_at = tuple((pose[:3, 3] + distance * pose[:3, 2]) * unit)
