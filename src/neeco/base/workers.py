@@ -242,7 +242,14 @@ def _serve(function: TaskFunction, shared: Any, threads: int, connection: Connec
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def exit_with_parent() -> None:  # at once when it was killed, so as not to write while its successor does
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=exit_with_parent, daemon=True).start()
     if gpu is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpu  # before PyTorch looks for the first time
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError, KeyboardInterrupt):
@@ -253,14 +260,6 @@ def _serve(function: TaskFunction, shared: Any, threads: int, connection: Connec
             except Exception as error:
                 answer = "failed", _in_one_line(error)
             connection.send(answer)
-
-
-def _exit_with_parent() -> None:
-    """Exit a worker at once when its parent was killed, so that it does not write while its successor does."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def _in_one_line(error: BaseException) -> str:
