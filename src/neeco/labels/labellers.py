@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,10 +20,8 @@ from neeco.geometry.camera import Camera
 from neeco.labels.settings import LABELS
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians, Rendering
+from neeco.scene import DrawableScene, GaussianScene
 from neeco.scene.deformation import otsu
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene, GaussianScene
 
 DELTAS = ("means", "quats", "scales")
 
