@@ -123,27 +123,24 @@ def read_effects(path: Path) -> CameraEffects:
         raise NeecoError(f"{path}: {SOFT_MASKS}: {soft!r} is neither mid nor mean")
     if unknown := sorted(set(map(str, lines)) - set(EFFECTS)):
         raise NeecoError(f"{path}: {unknown[0]}: no such effect; there are {', '.join([*EFFECTS, SOFT_MASKS])}")
+    ranges = {}
     with faults_in(path):
-        return CameraEffects(
-            {name: _range(Node(value, field=name), EFFECTS[name]) for name, value in lines.items()}, soft
-        )
-
-
-def _range(node: Node, effect: Effect) -> Range:
-    value, share = node.value, 1.0
-    if isinstance(value, dict):
-        if not set(value) <= {"range", "share"} or "range" not in value:
-            node.fail("give a number, [LOW, HIGH], or {range: [LOW, HIGH], share: S}")
-        value, share = value["range"], node.given("share", Node.number, 1.0)
-    ends = [as_float(end) for end in (value if isinstance(value, list) else [value, value])]
-    if len(ends) != 2 or ends[0] is None or ends[1] is None:
-        node.fail(f"{value!r} is no range; give a number or [LOW, HIGH]")
-    if not effect.lowest <= ends[0] <= ends[1] <= effect.highest:
-        limits = f"{effect.lowest:g} to {effect.highest:g} ({effect.meaning})"
-        node.fail(f"{value} is out of range; give LOW <= HIGH within {limits}")
-    if not 0 <= share <= 1:
-        node.fail(f"share: {share:g} is not a share of the images; give 0 to 1")
-    return Range(ends[0], ends[1], share)
+        for name, value in lines.items():
+            node, effect, share = Node(value, field=name), EFFECTS[name], 1.0
+            if isinstance(value, dict):
+                if not set(value) <= {"range", "share"} or "range" not in value:
+                    node.fail("give a number, [LOW, HIGH], or {range: [LOW, HIGH], share: S}")
+                value, share = value["range"], node.given("share", Node.number, 1.0)
+            ends = [as_float(end) for end in (value if isinstance(value, list) else [value, value])]
+            if len(ends) != 2 or ends[0] is None or ends[1] is None:
+                node.fail(f"{value!r} is no range; give a number or [LOW, HIGH]")
+            if not effect.lowest <= ends[0] <= ends[1] <= effect.highest:
+                limits = f"{effect.lowest:g} to {effect.highest:g} ({effect.meaning})"
+                node.fail(f"{value} is out of range; give LOW <= HIGH within {limits}")
+            if not 0 <= share <= 1:
+                node.fail(f"share: {share:g} is not a share of the images; give 0 to 1")
+            ranges[name] = Range(ends[0], ends[1], share)
+    return CameraEffects(ranges, soft)
 
 
 def srgb_to_linear(image: np.ndarray) -> np.ndarray:

@@ -55,9 +55,9 @@ from neeco.synthesis.tissue_replacement import (
     Appearance,
     Appearances,
     ImageFolder,
-    MixedSampler,
     Mixture,
     split,
+    with_colors,
 )
 from neeco.synthesis.writers import Encoded, Record, encoded_sample, skipped_sample
 
@@ -150,7 +150,7 @@ class SampleGenerator:
 
     scene: GaussianScene
     labeller: Labeller
-    sampler: Sampler | MixedSampler
+    sampler: Sampler | Mixture
     acceptance: Acceptance
     settings: Settings
     effects: CameraEffects | None = None
@@ -164,7 +164,7 @@ class SampleGenerator:
         """Return the generator that `settings` describe, of `scene` or of its tissue under the instruments of
         `instrument_scenes`. Raises NeecoError where the scenes do not support them."""
         cameras = DrawnCameras.of(settings, scene.recorded, scene.recorded.cameras)
-        sampler: Sampler | MixedSampler
+        sampler: Sampler | Mixture
         groups: tuple[frozenset[str], ...] = ()
         gains: tuple[tuple[float, float, float], ...] = ()
         tissue = scene
@@ -257,7 +257,7 @@ class SampleGenerator:
             owners = self.labeller.owners(state, gaussians)
             image = appearance.over_background(split(gaussians, owners, camera, image, share))
         colors = appearance.colors
-        return image if colors is None else torch.from_numpy(colors.given_to(image.numpy()))
+        return image if colors is None else torch.from_numpy(with_colors(image.numpy(), *colors))
 
     @torch.no_grad()
     def _through_camera(

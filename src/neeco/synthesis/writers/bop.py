@@ -60,14 +60,9 @@ class Bop(Writer):
                 }
                 poses[key] = []
                 for label in record["labels"]:
-                    pose = np.array(label["camera_from_instrument"])
-                    poses[key].append(
-                        {
-                            "cam_R_m2c": pose[:3, :3].ravel().tolist(),
-                            "cam_t_m2c": pose[:3, 3].tolist(),
-                            "obj_id": instruments.index(label["name"]) + 1,
-                        }
-                    )
+                    pose, number = np.array(label["camera_from_instrument"]), instruments.index(label["name"]) + 1
+                    rotation, translation = pose[:3, :3].ravel().tolist(), pose[:3, 3].tolist()
+                    poses[key].append({"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": number})
                 infos[key] = _masks(images, folder, record)
             write_json(folder / "scene_camera.json", cameras)
             write_json(folder / "scene_gt.json", poses)
