@@ -13,7 +13,6 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from neeco.base.errors import counted
-from neeco.capture.model import Capture
 from neeco.evaluation.image_metrics import COMPARISON, PART_COLORS, Pixels, overlay_outline, overlay_parts, psnr
 from neeco.evaluation.masks import load_reference
 from neeco.labels.drawing import draw
@@ -102,12 +101,23 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
     sections += [
         Section(title=name, notes=lines) for name, lines in (("Failed trainings", failed), ("Notes", notes)) if lines
     ]
-    sections.append(Section(title="Configuration", facts=_facts(experiment, capture, computer)))
+    labels, machine = experiment["labels"] or "the capture's truth", experiment["machine"]
+    facts = [
+        ("capture", experiment["capture"]),
+        ("frames", split_counts(capture)),
+        ("labelled frames", f"of {experiment['labelled']:,}, different in every fold; labels: {labels}"),
+        *((f"other recording {name}", path) for name, path in experiment["captures"].items()),
+        *((f"set {data['name']}", f"{data['images']:,} images of {data['path']}") for data in experiment["sets"]),
+        ("classes", ", ".join(experiment["classes"])),
+        ("machine", computer),
+        ("versions", f"neeco {experiment['version']}, Python {machine['python']}, torch {machine['torch']}"),
+    ]
+    sections.append(Section(title="Configuration", facts=facts))
     return write_page(
         plan.request.output / REPORT_FILE,
         "study.html",
-        title=f"{capture.root.name}: benefit of synthetic images",
-        name=capture.root.name,
+        capture.root.name,
+        "benefit of synthetic images",
         subtitle="benefit of synthetic images",
         version=experiment["version"],
         stamps=[computer],
@@ -187,21 +197,6 @@ def picture(example: Example, prediction: Prediction | None = None) -> Pixels:
     return pixels
 
 
-def _facts(experiment: Experiment, capture: Capture, computer: str) -> list[tuple[str, str]]:
-    labels = experiment["labels"] or "the capture's truth"
-    machine = experiment["machine"]
-    return [
-        ("capture", experiment["capture"]),
-        ("frames", split_counts(capture)),
-        ("labelled frames", f"of {experiment['labelled']:,}, different in every fold; labels: {labels}"),
-        *((f"other recording {name}", path) for name, path in experiment["captures"].items()),
-        *((f"set {data['name']}", f"{data['images']:,} images of {data['path']}") for data in experiment["sets"]),
-        ("classes", ", ".join(experiment["classes"])),
-        ("machine", computer),
-        ("versions", f"neeco {experiment['version']}, Python {machine['python']}, torch {machine['torch']}"),
-    ]
-
-
 def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
     """Write `report.html` into the output and return its path. Every displayed frame is rendered once per
     configuration. Raises NeecoError if a run cannot be opened or the page cannot be written."""
@@ -240,8 +235,8 @@ def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
     return write_page(
         plan.request.output / REPORT_FILE,
         "study.html",
-        title=f"{capture.root.absolute().name}: {study.title}",
-        name=capture.root.absolute().name,
+        capture.root.absolute().name,
+        study.title,
         subtitle=study.title,
         stamps=[computer],
         intro=intro,
