@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -22,9 +22,7 @@ from rich.text import Text
 from neeco.base.errors import NeecoError, nearest
 from neeco.base.files import finite, new_folder, require_replaceable, write_json
 from neeco.base.settings import field_texts, value_words
-
-if TYPE_CHECKING:
-    from neeco.studies.configurations import ResultTable
+from neeco.studies.configurations import ResultTable
 
 STANDARD_OUTPUT = Path("-")  # value of --json
 FILE_WIDTH = 1000  # maximum width of lines in files and pipes

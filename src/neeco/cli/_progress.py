@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,10 +19,7 @@ from neeco.cli._output import whole_lines
 from neeco.raster.devices import device_failure
 
 if TYPE_CHECKING:
-    import torch
-
     from neeco.studies.study import JobEvent
-    from neeco.training.config import TrainConfig
     from neeco.training.train import ProgressRow
 
 
@@ -77,7 +73,7 @@ class Bars:
                 for task in [task for task in others if (task.elapsed or 0) >= least] + tasks[-1:]:
                     self._print(_line(task))
         if kind is None and self.tasks and (passed := time.monotonic() - self.began) >= self.settings.min_shown_s:
-            self._print(f"total: {_duration(passed)}")
+            self._print(f"total: {duration(passed)}")
 
     def stage(self, what: str, done: int, total: int | None) -> None:
         """Show that `done` of `total` are completed, and so are earlier stages."""
@@ -147,13 +143,14 @@ def _line(task: Task) -> str:
     passed = task.finished_time or task.elapsed or 0.0
     parts = [f"{task.percentage:.0f} %"] if task.total else []
     parts += [task.fields["text"]] if task.fields["text"] else []
-    parts += [f"{_duration(passed)} elapsed"]
+    parts += [f"{duration(passed)} elapsed"]
     if task.time_remaining:
-        parts += [f"about {_duration(task.time_remaining)} left"]
+        parts += [f"about {duration(task.time_remaining)} left"]
     return f"{task.description}: {', '.join(parts)}"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Return seconds as h:mm:ss."""
     return str(timedelta(seconds=round(seconds)))
 
 
@@ -179,28 +176,3 @@ def resumable(begun: Path, how: str = "work so far is kept; run the same command
         if failure := device_failure(error):
             raise NeecoError(f"{failure}; {how}") from error
         raise
-
-
-def train_with_progress(
-    capture: Path, output: Path, config: TrainConfig, device: torch.device, *, resume: bool = False
-) -> Path:
-    """Call `train` with a bar that shows PSNR, Gaussians and remaining time. Return the run's folder."""
-    from neeco.training.run import resume_command
-    from neeco.training.train import train
-
-    run, hint = shlex.quote(str(output)), f"continue with: {resume_command(capture, output)}"
-    started: list[int] = []  # the iteration of the first row
-
-    def show(row: ProgressRow) -> None:
-        if not row.note and not started:
-            started.append(row.iteration)
-            slow = " (a CUDA device is faster)" if device.type == "cpu" else ""
-            remaining = row.seconds_left
-            whole = "" if remaining is None else f", estimated total time {_duration(row.seconds + remaining)}"
-            bars.training(replace(row, note=f"training on {device.type}{slow}{whole}; view it: neeco view {run}"))
-        bars.training(row)
-
-    with Bars() as bars, resumable(output, hint):
-        path = train(capture, output, config, device=device, resume=resume, progress=show)
-        bars.end("training")
-    return path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -52,15 +52,31 @@ class Arguments:
 
 def run(args: Arguments) -> int:
     """Train with a progress bar; print the path of the run."""
-    from neeco.cli._progress import train_with_progress
+    from neeco.cli._progress import Bars, duration, resumable
     from neeco.raster.devices import device_of
     from neeco.training.config import FLAGS, training_config
-    from neeco.training.run import begun_config
+    from neeco.training.run import begun_config, resume_command
+    from neeco.training.train import ProgressRow, train
 
     flags = {name: getattr(args, name) for name in FLAGS if name != "method"}
     begun = begun_config(args.output) if args.resume else None
     config = training_config(args.method, flags, args.set, begun)
-    path = train_with_progress(args.capture, args.output, config, device_of(args.device), resume=args.resume)
+    device, started = device_of(args.device), list[int]()  # the iteration of the first row
+
+    def show(row: ProgressRow) -> None:
+        if not row.note and not started:
+            started.append(row.iteration)
+            slow = " (a CUDA device is faster)" if device.type == "cpu" else ""
+            remaining = row.seconds_left
+            whole = "" if remaining is None else f", estimated total time {duration(row.seconds + remaining)}"
+            view = f"view it: neeco view {shlex.quote(str(args.output))}"
+            bars.training(replace(row, note=f"training on {device.type}{slow}{whole}; {view}"))
+        bars.training(row)
+
+    hint = f"continue with: {resume_command(args.capture, args.output)}"
+    with Bars() as bars, resumable(args.output, hint):
+        path = train(args.capture, args.output, config, device=device, resume=args.resume, progress=show)
+        bars.end("training")
     print(f"finished: {path}  (next: neeco evaluate {shlex.quote(str(path))})")
     return 0
 

@@ -14,12 +14,10 @@ import numpy as np
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.synthesis.samplers import JointRange, Shaft
 from neeco.viewer.runs import VIEWER, FrameScore, LoadedRun, Timeline
-from neeco.viewer.views import IMAGE, Controls, InstrumentControls, Picture, slider_ranges, views_of
+from neeco.viewer.views import IMAGE, Controls, InstrumentControls, Overlays, Picture, slider_ranges, views_of
 
 if TYPE_CHECKING:
     import viser
-
-    from neeco.viewer.views import Overlays
 
 
 NONE_CHOSEN = "—"

@@ -12,7 +12,7 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
-from neeco.capture.model import Capture, Frame
+from neeco.capture.model import Frame
 from neeco.labels.drawing import to_numpy
 from neeco.viewer.access import HOST, PORT
 from neeco.viewer.panel import message_html
@@ -42,19 +42,18 @@ class RecordingServer(ViserPage):
         self.unit = VIEWER.distance_units / self.distance
         super().__init__(host, port, [frame.camera for frame in frames], self.distance, self.unit)
         self.sessions: dict[int, RecordingSession] = {}
-
-        def connect(client: viser.ClientHandle) -> None:
-            self.sessions[client.client_id] = RecordingSession(client, self.capture, self.unit, self.distance)
-
-        self._server.on_client_connect(connect)
+        self._server.on_client_connect(
+            lambda client: self.sessions.update({client.client_id: RecordingSession(client, self)})
+        )
         self._server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
 
 
 class RecordingSession:
     """One browser's view of a capture. viser draws everything over the image of the frame whose camera it stands at."""
 
-    def __init__(self, client: viser.ClientHandle, capture: Capture, unit: float, distance: float) -> None:
-        self._client, self._capture, self._unit, self._distance = client, capture, unit, distance
+    def __init__(self, client: viser.ClientHandle, server: RecordingServer) -> None:
+        capture, unit = server.capture, server.unit
+        self._client, self._capture, self._unit, self._distance = client, capture, unit, server.distance
         self._lock, self._shown = threading.RLock(), (-1, 0.0)
         gui, scene, cameras = client.gui, client.scene, [frame.camera for frame in capture.frames]
         overlays = Overlays(client, cameras, capture.points, unit, self.go_to, lambda: None)

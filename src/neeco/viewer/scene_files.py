@@ -33,6 +33,7 @@ from zstandard import ZstdCompressor
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import write_atomically
 from neeco.capture.model import Camera, InstrumentState, State
+from neeco.capture.points import encoded_ply
 from neeco.capture.readers import read_states
 from neeco.evaluation.image_metrics import to_uint8
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply, quat_to_matrix, rotate_about, spread_directions
@@ -115,9 +116,7 @@ def ply_bytes(splats: Splats) -> bytes:
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     columns = [splats.means, np.zeros_like(splats.means), splats.sh[:, 0], rest, splats.logits[:, None]]
     table = np.concatenate([*columns, splats.log_scales, splats.quats], 1).astype("<f4")
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [*(f"property float {name}" for name in names), "end_header", ""]
-    return "\n".join(lines).encode() + table.tobytes()
+    return encoded_ply(table.view([(name, "<f4") for name in names])[:, 0])
 
 
 def spz_bytes(splats: Splats, version: SpzVersion = 4) -> bytes:
