@@ -281,9 +281,7 @@ def evaluate_run(
         "names": [list(name) for name in scene.label_names],
         "pair_assignment": pair_assignment,
     }
-    evaluation: dict[str, Any] = finite(
-        result | {"notes": notes, "doubts": doubts, "labels": labels, "per_frame": per_frame}
-    )
+    evaluation = finite(result | {"notes": notes, "doubts": doubts, "labels": labels, "per_frame": per_frame})
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
 

@@ -25,7 +25,7 @@ from neeco.capture import read_capture
 from neeco.capture.checks import inspect_capture
 from neeco.capture.documents import Problem, errors_only
 from neeco.capture.model import Capture, Frame, evenly_spaced
-from neeco.evaluation.image_metrics import outline
+from neeco.evaluation.image_metrics import outline, to_uint8
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
 from neeco.ingest.foreground.rough_shape import RoughShape
@@ -43,7 +43,6 @@ from neeco.report.page import (
     page_style,
     round_ticks,
     split_counts,
-    to_bytes,
     write_page,
 )
 
@@ -82,7 +81,7 @@ def posed_picture(
     fx, fy, cx, cy = (scale * value for value in (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy))
     size = (2 * MAX_WIDTH, round(frame.camera.height * scale))
     camera = Camera(frame.camera.world_from_camera, fx, fy, cx, cy, *size)
-    image = Image.fromarray(to_bytes(frame.load_image().numpy())).resize(size, Image.Resampling.BICUBIC)
+    image = Image.fromarray(to_uint8(frame.load_image().numpy() * 255)).resize(size, Image.Resampling.BICUBIC)
     for name, pose in poses.items():
         if name in shapes:  # the outline of the shape's points, each as large as its grid cell
             mask = Image.new("L", image.size)
@@ -267,8 +266,7 @@ class Ingested:
         """Return numbers and the verdict for scripts."""
         if self.result is None or self.assessment is None:
             return {}
-        numbers: dict[str, Any] = finite(self.result.as_json() | self.assessment.as_json())
-        return numbers
+        return finite(self.result.as_json() | self.assessment.as_json())
 
     def lines(self) -> list[str]:
         """Return results, paths and the verdict, for a terminal."""

@@ -31,7 +31,7 @@ from torch import Tensor
 import neeco
 from neeco.base.files import write_text
 from neeco.capture.model import Capture
-from neeco.evaluation.image_metrics import difference_map, to_uint8
+from neeco.evaluation.image_metrics import difference_map
 from neeco.studies.configurations import ResultTable
 
 
@@ -360,8 +360,3 @@ def _data_uri(image: Image.Image, form: str, **options: Any) -> str:
     stream = io.BytesIO()
     image.save(stream, form, **options)
     return f"data:image/{form.lower()};base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
-
-
-def to_bytes(image: np.ndarray) -> np.ndarray:
-    """Convert an image in [0, 1] to uint8 [H, W, 3]."""
-    return to_uint8(image * 255)

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 
 from neeco.base.files import read_bytes
 from neeco.capture.model import Capture, Frame, State, evenly_spaced
-from neeco.evaluation.image_metrics import COMPARISON, overlay_outline, overlay_parts, part_color
+from neeco.evaluation.image_metrics import COMPARISON, overlay_outline, overlay_parts, part_color, to_uint8
 from neeco.evaluation.masks import load_reference
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
@@ -31,7 +31,6 @@ from neeco.report.page import (
     line_chart,
     short,
     split_counts,
-    to_bytes,
     write_page,
 )
 from neeco.scene import DrawableScene
@@ -162,8 +161,8 @@ def frame_figures(
             drawing = draw(scene, *_poses(frame, row))
             recorded, image = frame.load_image().numpy(), drawing.image.numpy()
             pictures = [
-                ("recorded image", jpeg(to_bytes(recorded))),
-                ("rendered image", jpeg(to_bytes(image))),
+                ("recorded image", jpeg(to_uint8(recorded * 255))),
+                ("rendered image", jpeg(to_uint8(image * 255))),
                 ("difference of the two", difference(image, recorded, frame.load_mask())),
             ]
             if drawing.parts is not None:
@@ -283,7 +282,7 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
     for k in ranked[: PAGES.max_frames]:  # each with the contours of its labels, and its confidence
         record, frame = records[k], capture.frames[k]
         trust, moved = record["trust"], record["moved"]
-        image = Image.fromarray(to_bytes(frame.load_image().numpy()))
+        image = Image.fromarray(to_uint8(frame.load_image().numpy() * 255))
         pen = ImageDraw.Draw(image)
         for number, label in enumerate(record["labels"]):
             for polygon in label.get("polygons", ()):
@@ -391,7 +390,7 @@ def _tracked_charts(tracked: Tracked) -> list[str]:
 def _tracked_figure(tracked: Tracked, frame: Frame, record: dict[str, Any]) -> dict[str, Any]:
     """Return one frame: its image, tinted by the rendered label."""
     image, trust = frame.load_image().numpy(), record["trust"]
-    picture = to_bytes(image)
+    picture = to_uint8(image * 255)
     if record["how"] != "lost":
         parts = draw(tracked.scene, state_of(record), frame.camera).parts
         assert parts is not None

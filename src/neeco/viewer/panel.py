@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 
 NONE_CHOSEN = "—"
-PLOT_COLOR = "#228be6"
 
 
 class Panel:
@@ -105,7 +104,7 @@ class Panel:
             self._plot.data = data
         else:
             label = f"{self._loaded.name} (dB)"[: VIEWER.line]
-            line = {"label": label, "stroke": PLOT_COLOR, "width": 1.5, "points": {"show": False}}
+            line = {"label": label, "stroke": "#228be6", "width": 1.5, "points": {"show": False}}
             with self._timeline_folder:
                 self._plot = self._gui.add_uplot(
                     data,

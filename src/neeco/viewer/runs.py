@@ -323,12 +323,8 @@ class SavedStates:
     def __init__(self, run: Path, size: SizeSettings = RECORDED_SIZE) -> None:
         self.size = size
         self.folder = Path(run) / FOLDER
+        self.states_path = self.folder / STATES  # for `synthesize --states`
         self._lock = threading.Lock()
-
-    @property
-    def states_path(self) -> Path:
-        """File for `synthesize --states`."""
-        return self.folder / STATES
 
     def add(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> int:
         """Add a state and the camera [4, 4] that sees it (OpenCV axes, mm); returns how many are saved. Raises

@@ -22,7 +22,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -173,18 +173,6 @@ def _in_world(posed: Gaussians) -> Tensor:
     return torch.einsum("nkl,nlc->nkc", turned[which], posed.sh)
 
 
-@dataclass(frozen=True, kw_only=True)
-class MovingSettings:
-    """Settings of scenes that move."""
-
-    frame_s: float = 1 / 15  # between states without increasing times
-    least_weight: float = 0.9  # of a link, below which a Gaussian blends links
-    meters_per_unit: float = 0.001  # of OpenUSD's stage
-    extent_sd: float = 3.0  # standard deviations to which a Gaussian counts for the extent
-    codes_per_second: float = 1000.0  # time codes: states keep their times to the ms
-
-
-MOVING = MovingSettings()
 EXTENSION, SCHEMA = "KHR_gaussian_splatting", "ParticleField3DGaussianSplat"  # of glTF, of OpenUSD
 Unit = Literal["m", "cm", "mm"]
 UNITS: Mapping[Unit, float] = {"m": 1e-3, "cm": 0.1, "mm": 1.0}  # of the file, per mm
@@ -213,6 +201,11 @@ class MovingScene:
     nodes: tuple[MovingNode, ...]  # parents before their children
     times: np.ndarray  # [T] s, from 0 on; `frame_s` apart where the states have none that increase
     blended: float  # share of the instruments' Gaussians that blend links: right in the first state only
+    frame_s: ClassVar[float] = 1 / 15  # between states without increasing times
+    least_weight: ClassVar[float] = 0.9  # of a link, below which a Gaussian blends links
+    meters_per_unit: ClassVar[float] = 0.001  # of OpenUSD's stage
+    extent_sd: ClassVar[float] = 3.0  # standard deviations to which a Gaussian counts for the extent
+    codes_per_second: ClassVar[float] = 1000.0  # time codes: states keep their times to the ms
 
 
 def exported_states(scene: GaussianScene, first: State, states: Path | None) -> list[State]:
@@ -235,7 +228,7 @@ def moving_scene(scene: GaussianScene, states: Sequence[State], camera: Camera) 
     splats = splats_of(scene, states[0], camera, moving=motion is not None)
     times = np.array([float(state.time) for state in states])
     if not (np.diff(times) > 0).all():
-        times = MOVING.frame_s * np.arange(len(states))
+        times = MovingScene.frame_s * np.arange(len(states))
     times = (times - times[0]).astype(np.float32)
     if motion is None:
         return MovingScene((MovingNode(name="tissue", splats=splats),), times, 0.0)
@@ -273,7 +266,7 @@ def moving_scene(scene: GaussianScene, states: Sequence[State], camera: Camera) 
                 local = local_splats(splats, link_rows[parts == part], bodies[0] @ poses[0])
                 facts = {"instrument": instrument.name, "part": name, "link": link}
                 nodes.append(MovingNode(name=name, parent=body, poses=poses, splats=local, facts=facts))
-    blended = [weights.max(1).values < MOVING.least_weight for weights, _ in motion.links]
+    blended = [weights.max(1).values < MovingScene.least_weight for weights, _ in motion.links]
     share = float(torch.cat(blended).float().mean()) if blended else 0.0
     return MovingScene(tuple(nodes), times, share)
 
@@ -427,11 +420,11 @@ def write_usd(scene: MovingScene, path: Path) -> None:
     require_usd()
     from pxr import Gf, Tf, Usd, UsdGeom, UsdSemantics, UsdVol, Vt
 
-    codes = scene.times * MOVING.codes_per_second
+    codes = scene.times * scene.codes_per_second
     stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageMetersPerUnit(stage, MOVING.meters_per_unit)
+    UsdGeom.SetStageMetersPerUnit(stage, scene.meters_per_unit)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    stage.SetTimeCodesPerSecond(MOVING.codes_per_second)
+    stage.SetTimeCodesPerSecond(scene.codes_per_second)
     stage.SetStartTimeCode(float(codes[0]))
     stage.SetEndTimeCode(float(codes[-1]))
     root = UsdGeom.Xform.Define(stage, "/Scene")
@@ -449,7 +442,7 @@ def write_usd(scene: MovingScene, path: Path) -> None:
             splats = node.splats  # in its own frame
             prim = getattr(UsdVol, SCHEMA).Define(stage, places[-1])
             scales = np.exp(splats.log_scales)
-            reach = MOVING.extent_sd * scales.max(1, keepdims=True)
+            reach = scene.extent_sd * scales.max(1, keepdims=True)
             extent = np.stack([(splats.means - reach).min(0), (splats.means + reach).max(0)])
             quats = np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])  # w last
             coefficients = np.ascontiguousarray(splats.sh.reshape(-1, 3))
