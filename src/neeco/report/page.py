@@ -326,7 +326,7 @@ def write_page(path: Path, template: str, name: str, topic: str, **data: Any) ->
 
     Every page has for its header `subtitle` and `stamps`: facts shown with time and version.
     """
-    data |= {"name": name, "title": f"{name}: {topic}", "made_at": f"{now():%Y-%m-%d %H:%M %Z}"}
+    data |= {"name": name, "title": f"{name}: {topic}", "made_at": f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"}
     page = TEMPLATES.get_template(template)
     write_text(path, page.render({"version": neeco.__version__, **data}) + "\n")
     return path
@@ -335,11 +335,6 @@ def write_page(path: Path, template: str, name: str, topic: str, **data: Any) ->
 def split_counts(capture: Capture) -> str:
     """Return the number of frames per split, as `40 train, 5 test`."""
     return ", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits)
-
-
-def now() -> datetime:
-    """Return the time stated on a page."""
-    return datetime.now().astimezone()
 
 
 def difference(image: np.ndarray, recorded: np.ndarray, counted: Tensor | None) -> str:

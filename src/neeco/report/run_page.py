@@ -268,9 +268,6 @@ def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: 
     return line_chart(title, "iterations", series, starts=starts, note=note, logarithmic=logarithmic, size=PAGES.small)
 
 
-PAGE = "annotate.html"
-
-
 def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], capture: Capture, min_trust: float) -> Path:
     """Write the self-contained annotate.html into `output` and return its path.
 
@@ -302,7 +299,7 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
         )
     written = sum(not record.get("skipped") for record in records)
     return write_page(
-        output / PAGE,
+        output / "annotate.html",
         "annotate.html",
         capture.root.name,
         "annotated",

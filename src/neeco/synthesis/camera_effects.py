@@ -31,7 +31,6 @@ from neeco.labels.drawing import LayeredDrawing, keypoint_arrays, to_numpy
 from neeco.scene import GaussianScene, Recorded
 from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
 
-SoftMasks = Literal["mid", "mean"]
 SOFT_MASKS = "soft_masks"
 SMOKE_MM = 100.0  # distance for which `smoke` is stated
 
@@ -78,7 +77,7 @@ class CameraEffects:
     it."""
 
     ranges: Mapping[str, Range]
-    soft_masks: SoftMasks = "mid"
+    soft_masks: Literal["mid", "mean"] = "mid"
     smoke_grey: ClassVar[float] = 0.6  # brightness of smoke if the file does not state it
     max_subframes: ClassVar[int] = 64  # of an exposure
     subframe_px: ClassVar[float] = 1.0  # maximum motion between two subframes

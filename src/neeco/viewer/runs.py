@@ -313,17 +313,13 @@ def coarse_psnr(loaded: LoadedRun, index: int) -> float:
     return psnr(rendered, torch.from_numpy(image), mask)
 
 
-FOLDER = "kept"  # of the run
-STATES, SAMPLES = "states.jsonl", "samples"
-
-
 class SavedStates:
     """Writes into one run's folder `kept/`, whoever of several users asks. Any thread may call it. size: of images."""
 
     def __init__(self, run: Path, size: SizeSettings = RECORDED_SIZE) -> None:
         self.size = size
-        self.folder = Path(run) / FOLDER
-        self.states_path = self.folder / STATES  # for `synthesize --states`
+        self.folder = Path(run) / "kept"
+        self.states_path = self.folder / "states.jsonl"  # for `synthesize --states`
         self._lock = threading.Lock()
 
     def add(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> int:
@@ -351,7 +347,7 @@ class SavedStates:
         with scene.torch_threads(), torch.no_grad():
             drawing = draw_layers(scene, labeller, state, camera, Settings.min_component)
             labels = labels_of(scene, drawing, annotate(scene, drawing, labeller.names))
-        root = self.folder / SAMPLES
+        root = self.folder / "samples"
         with self._lock, own_folder(root, wait_s=LOCK_WAIT_S):
             index = 0
             while record_path(root, index).exists() and load_record(root, index) is not None:

@@ -44,7 +44,6 @@ from neeco.raster.types import Gaussians
 from neeco.scene import GaussianScene
 from neeco.scene.drawable import ArticulatedMotion
 
-SpzVersion = Literal[3, 4]
 DIRECTIONS = 64  # by which harmonics are rotated: four times as many as there are harmonics
 MIN_SCALE = 1e-30  # mm: the logarithm of 0 is no number of a file
 SPZ_MAGIC = 0x5053474E
@@ -119,7 +118,7 @@ def ply_bytes(splats: Splats) -> bytes:
     return encoded_ply(table.view([(name, "<f4") for name in names])[:, 0])
 
 
-def spz_bytes(splats: Splats, version: SpzVersion = 4) -> bytes:
+def spz_bytes(splats: Splats, version: Literal[3, 4] = 4) -> bytes:
     """Niantic's SPZ: about a tenth of the size of PLY; version 4 is compressed by Zstandard, 3 by gzip. Raises
     NeecoError where positions leave its range."""
     turn = np.array([1, -1, -1], np.float32)
