@@ -275,10 +275,8 @@ def subframes(
         points += list(surface_points(drawing.tissue_depth, drawing.camera, CameraEffects.tissue_step_px))
         places.append([place_in_image(point, camera) for point in points])
     moved = [np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in zip(*places, strict=True) if a and b]
-    apart = float(max(moved, default=0.0))
-    count = (
-        2 * int(np.clip(np.ceil(apart / CameraEffects.subframe_px / 2), 0, CameraEffects.max_subframes // 2 - 1)) + 1
-    )
+    steps = np.ceil(float(max(moved, default=0.0)) / CameraEffects.subframe_px / 2)
+    count = 2 * int(np.clip(steps, 0, CameraEffects.max_subframes // 2 - 1)) + 1
     times = ((np.arange(count) + 0.5) / count - 0.5) * shutter_s
     return [motion.advanced(drawing.state, drawing.camera, float(time)) for time in times]
 

@@ -42,17 +42,10 @@ class RestingTissue:
     end_mm: ClassVar[float] = 15.0  # radius of the working end around the tips
     n_measured: ClassVar[int] = 100  # Gaussians sampled per working end
     quantile: ClassVar[float] = 0.97  # quantile of their depths, robust to single outliers
-    touching_mm: ClassVar[
-        float
-    ] = -1.5  # depth at which contact has probability 1/2; tissue learned during contact is indented
+    touching_mm: ClassVar[float] = -1.5  # where contact has probability 1/2; tissue learned in contact is indented
     depth_sd_mm: ClassVar[float] = 6.0  # standard deviation of a depth, calibrated for correct confidences
-    joint_quantiles: ClassVar[tuple[float, float]] = (
-        0.05,
-        0.95,
-    )  # quantiles of recorded values: a range without outliers
-    closed_share: ClassVar[float] = (
-        0.25  # share of the recorded range of the jaws' opening, below which they are closed
-    )
+    joint_quantiles: ClassVar[tuple[float, float]] = (0.05, 0.95)  # a range of recorded values without outliers
+    closed_share: ClassVar[float] = 0.25  # share of the range of the jaws' opening, below which they are closed
     of: ClassVar[WeakKeyDictionary[GaussianScene, RestingTissue]] = WeakKeyDictionary()  # cache
 
     def __init__(self, scene: GaussianScene) -> None:
