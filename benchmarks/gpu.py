@@ -43,7 +43,7 @@ from neeco.raster import Camera, Gaussians, rasterize
 from neeco.raster.devices import device_of, readable_failures
 from neeco.raster.losses import photometric_loss
 from neeco.raster.native import synchronise
-from neeco.raster.optimizer import adam_step
+from neeco.raster.optimizer import Update, adam_steps
 from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, GaussianScene, Recorded
 from neeco.scene.method_registry import make_deformation, method_settings
@@ -180,7 +180,7 @@ class Case:
         photometric_loss(drawn, self.target, ssim_weight=0.2).backward()
         for tensor, moments in zip(self.learned, self.moments, strict=True):
             if tensor.grad is not None:
-                adam_step(tensor, tensor.grad, *moments, lr=0.0, step=1)
+                adam_steps([Update(tensor, tensor.grad, *moments, lr=0.0, step=1)])
             tensor.requires_grad_(False)
             tensor.grad = None
 

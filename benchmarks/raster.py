@@ -16,10 +16,9 @@ import torch
 from torch import Tensor
 
 from neeco.raster import Camera, Gaussians, rasterize
-from neeco.raster.cpu_backend import last_statistics
 from neeco.raster.losses import photometric_loss
-from neeco.raster.native import keep_freed_memory, set_threads, simd
-from neeco.raster.optimizer import adam_step
+from neeco.raster.native import keep_freed_memory, native, set_threads, simd
+from neeco.raster.optimizer import Update, adam_steps
 
 WORKLOADS = {
     "20k, 256x192": (20_000, 256, 192),
@@ -75,7 +74,7 @@ class Runner:
             leaf.grad = None
         timings["forward"].append((middle - start) * 1e3)
         timings["forward+backward"].append((end - start) * 1e3)
-        for stage, value in last_statistics().items():
+        for stage, value in native().last_statistics().items():
             timings[stage].append(value)
 
 
@@ -112,7 +111,7 @@ def run_training_kernels(repeats: int) -> None:
     image.requires_grad_()
     plain = median_of(lambda: photometric_loss(image, target).backward(), repeats)
     tensors = torch.rand(4, 100_000, 48)
-    adam = median_of(lambda: adam_step(*tensors, lr=1e-3, step=5), repeats)
+    adam = median_of(lambda: adam_steps([Update(*tensors, lr=1e-3, step=5)]), repeats)
     print(f"\nloss 320x256x3, forward+backward: {plain:.2f} ms")
     print(f"Adam, 4.8M numbers: {adam:.2f} ms")
 

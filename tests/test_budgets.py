@@ -14,26 +14,26 @@ from source_trees import module_paths, module_trees
 
 # lines of Python: the limit, and the aim
 ROOMS = {
-    "cli": (1807, 1700),
-    "viewer": (2862, 2100),
-    "report": (1524, 1500),
-    "studies": (3714, 2600),
+    "cli": (1737, 1700),
+    "viewer": (2765, 2100),
+    "report": (1481, 1500),
+    "studies": (3688, 2600),
     "ingest": (15_018, 10_500),
     "tracking": (1613, 1200),
-    "synthesis": (4175, 3200),
-    "evaluation": (1326, 1200),
-    "labels": (892, 800),
+    "synthesis": (4098, 3200),
+    "evaluation": (1301, 1200),
+    "labels": (866, 800),
     "methods": (5187, 3500),
     "training": (2021, 1700),
     "states": (3278, 2600),
     "evidence": (1057, 1200),
     "scene": (1956, 1800),
-    "capture": (4547, 3900),
-    "raster": (3990, 3800),
+    "capture": (4493, 3900),
+    "raster": (3923, 3800),
     "geometry": (983, 1000),
-    "base": (1571, 1500),
+    "base": (1544, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (282, 240), (3187, 3000), (284, 300)
+FILES, FUNCTIONS, NUMBERS = (281, 240), (3143, 3000), (284, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

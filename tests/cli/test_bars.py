@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from neeco.base.errors import NeecoError
-from neeco.cli._progress import Bars, ProgressSettings, counting
+from neeco.cli._progress import Bars, counting
 from neeco.studies.study import JobEvent
 from neeco.training.train import ProgressRow
 
@@ -24,7 +24,7 @@ def test_a_file_gets_a_line_at_intervals_with_what_how_far_and_how_long_still(ca
     row = ProgressRow(
         iteration=12345678, loss=0.1, psnr=30.04, num_gaussians=23456, phase=1, progress=0.25, seconds=0.4, prepared=0.1
     )
-    with Bars(ProgressSettings(line_interval_s=0.02)) as bars:
+    with Bars(line_interval_s=0.02) as bars:
         bars.training(row)
         time.sleep(0.1)
     first, *_, last = capsys.readouterr().err.splitlines()
@@ -36,7 +36,7 @@ def test_a_file_gets_a_line_at_intervals_with_what_how_far_and_how_long_still(ca
 def test_a_stage_that_reports_nothing_is_told_too_and_an_error_alone_ends_it(capsys):
 
     def work() -> None:
-        with Bars(ProgressSettings(line_interval_s=0.02)) as bars:
+        with Bars(line_interval_s=0.02) as bars:
             bars.stage("reading", 0, 0)
             bars.stage("matching", 0, 0)
             time.sleep(0.1)
@@ -48,7 +48,7 @@ def test_a_stage_that_reports_nothing_is_told_too_and_an_error_alone_ends_it(cap
 
 
 def test_the_time_left_follows_from_the_speed_without_preparation(capsys):
-    with Bars(ProgressSettings(line_interval_s=0.02)) as bars:
+    with Bars(line_interval_s=0.02) as bars:
         clock = [1000.0]
         bars.bar.get_time = lambda: clock[0]
         for iteration, share in ((100, 0.1), (200, 0.2)):
@@ -67,6 +67,6 @@ def test_jobs_that_all_ended_have_said_so_and_leave_no_last_line(capsys):
 
 
 def test_work_of_some_length_ends_with_its_total_time(capsys):
-    with Bars(ProgressSettings(min_shown_s=0.0)) as bars:
+    with Bars(min_shown_s=0.0) as bars:
         bars.stage("reading", 1, 1)
     assert capsys.readouterr().err.splitlines()[-1] == "total: 0:00:00"

@@ -11,7 +11,6 @@ from neeco.labels.annotation import annotate, place_in_image, visibility
 from neeco.labels.drawing import draw, draw_layers
 from neeco.labels.labellers import (
     CompositedLabels,
-    DeltaThresholds,
     ThresholdLabels,
     composited_labels,
     find_thresholds,
@@ -161,9 +160,9 @@ def test_threshold_labels_separate_what_moved_from_what_did_not(scene, state, ca
     tissue = scene.canonical.counts[0]
     assert (owners[:tissue] == -1).all()
     assert (owners[tissue:] == 0).all()
-    assert labeller.thresholds.means is not None
-    assert 1e-3 < labeller.thresholds.means < 70
-    assert labeller.thresholds.quats is None  # this scene turns no Gaussian: says nothing
+    assert labeller.thresholds["means"] is not None
+    assert 1e-3 < labeller.thresholds["means"] < 70
+    assert labeller.thresholds["quats"] is None  # this scene turns no Gaussian: says nothing
     by_motion, _ = labelled(scene, state(), camera, labeller)
     by_compositing, _ = labelled(scene, state(), camera)
     one, other = by_motion.parts > 0, by_compositing.parts > 0
@@ -193,7 +192,7 @@ def test_a_scene_that_does_not_move_cannot_be_labelled_by_threshold():
 
 
 def test_no_gaussian_over_the_thresholds_means_an_empty_mask(scene, state, camera):
-    labeller = ThresholdLabels(scene, DeltaThresholds(means=1e6, quats=None, scales=None))
+    labeller = ThresholdLabels(scene, {"means": 1e6, "quats": None, "scales": None})
     assert (labeller.owners(state(), scene.at(state())) == -1).all()
     drawing, label = labelled(scene, state(), camera, labeller)
     assert not drawing.parts.any()

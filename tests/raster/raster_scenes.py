@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neeco.geometry.rotations import quat_to_matrix
 from neeco.raster import Camera, Gaussians, Headlight, Rendering, rasterize
+from neeco.raster.optimizer import BETAS, EPS, Update, adam_steps
 from neeco.raster.reference import (
     MAX_ALPHA,
     MIN_ALPHA,
@@ -157,3 +158,18 @@ def assert_same_as_reference(scene: Scene, backend: str = "cpu", tolerance: floa
     assert bool((actual.visible | (expected.radii == 0)).all()), "a Gaussian that is drawn counts as visible"
     both = actual.visible & (expected.radii > 0)
     assert error(actual.radii[both], expected.radii[both]) < tolerance
+
+
+def adam_step(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    *,
+    lr: float,
+    step: int,
+    betas: tuple[float, float] = BETAS,
+    eps: float = EPS,
+) -> None:
+    """`adam_steps` for one tensor, whose gradient may have another float type."""
+    adam_steps([Update(param, grad.detach().to(param.dtype), exp_avg, exp_avg_sq, lr, step)], betas, eps)

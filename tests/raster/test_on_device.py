@@ -10,14 +10,13 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
-from raster_scenes import draw, leaves, make_scene
+from raster_scenes import adam_step, draw, leaves, make_scene
 
 from neeco.base.errors import NeecoError
 from neeco.raster import kernels, rasterize
 from neeco.raster.devices import CachedPredicate, constant, tf32_products
 from neeco.raster.losses import photometric_loss
 from neeco.raster.native import Family, runs_native, torch_threads
-from neeco.raster.optimizer import adam_step
 from neeco.raster.triton import ready
 
 CPU, CUDA, META = torch.device("cpu"), torch.device("cuda"), torch.device("meta")

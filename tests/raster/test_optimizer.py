@@ -9,11 +9,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from raster_scenes import adam_step
 
 from neeco.base.errors import NeecoError
 from neeco.raster import kernels
 from neeco.raster.native import Family, set_threads
-from neeco.raster.optimizer import adam_step
 
 
 @pytest.mark.parametrize("shape", [(1,), (7, 3), (501, 16, 3), (0, 4)])

@@ -9,12 +9,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from raster_scenes import adam_step
 from torch import Tensor
 
 from neeco.base.errors import NeecoError
 from neeco.raster import losses, optimizer
 from neeco.raster.losses import photometric_loss, photometric_loss_reference
-from neeco.raster.optimizer import Adam, Update, adam_step, adam_steps
+from neeco.raster.optimizer import Adam, Update, adam_steps
 from neeco.raster.triton import photometric
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, of the interpreter

@@ -9,7 +9,7 @@ from rod_world import WALL_MM
 from neeco.capture.model import InstrumentState, State, Uncertainty
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
-from neeco.synthesis.contact import CONTACT, contact_of
+from neeco.synthesis.contact import RestingTissue, contact_of
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 
@@ -28,7 +28,7 @@ def contact(scene, camera):
 def test_a_tip_that_is_lowered_through_tissue_touches_it_and_its_depth_is_measured(contact, state):
     depths = (-6.0, -4.0, 0.5, 2.0, 4.0)
     labels = [contact(state(z=WALL_MM - ROD_MM + depth, jaw=0.0, roll=0.4)) for depth in depths]
-    assert [label["contact"] != "none" for label in labels] == [depth > CONTACT.touching_mm for depth in depths]
+    assert [label["contact"] != "none" for label in labels] == [depth > RestingTissue.touching_mm for depth in depths]
     assert [label["penetration_mm"] for label in labels] == pytest.approx(depths, abs=0.3)
     assert all(0.5 <= label["contact_confidence"] <= 1 for label in labels)
     assert labels[0]["contact_confidence"] > labels[1]["contact_confidence"] > 0.65
@@ -42,7 +42,7 @@ def test_jaws_that_close_on_tissue_grasp_it(contact, state):
 
 def test_the_box_is_the_tissue_within_reach(contact, state, camera):
     x, _, width, height = contact(state(z=WALL_MM, jaw=0.0))["contact_box"]
-    reach = CONTACT.reach_mm * camera.fx / WALL_MM  # px
+    reach = RestingTissue.reach_mm * camera.fx / WALL_MM  # px
     assert (width, height) == pytest.approx((2 * reach, 2 * reach), abs=3)
     assert x < camera.cx < x + width
     assert contact(state(z=70.0))["contact_box"] is None

@@ -257,7 +257,7 @@ def test_an_exposure_is_drawn_as_often_as_its_motion_needs(moving: GaussianScene
     counts = [len(subframes(moving, drawing, motion, 0.02)) for motion in (still, slow, fast)]
     assert counts[0] == 1
     assert counts[1] in (7, 9)  # 8 mm at 70 mm and 60 px: 6.9 px
-    assert counts[2] <= camera_effects.SETTINGS.max_subframes
+    assert counts[2] <= camera_effects.CameraEffects.max_subframes
 
 
 def blurred(scene: GaussianScene, state: State, motion: Motion, shutter_s: float, count: int) -> torch.Tensor:

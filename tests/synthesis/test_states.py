@@ -15,7 +15,6 @@ from neeco.capture.readers import read_states
 from neeco.capture.writer import state_to_json
 from neeco.geometry.rotations import rigid
 from neeco.synthesis.samplers import (
-    SAMPLING,
     ExtrapolatedStates,
     GridStates,
     InterpolatedStates,
@@ -25,6 +24,7 @@ from neeco.synthesis.samplers import (
     PerturbedViews,
     RecordedViews,
     RolledViews,
+    SimilarFrames,
     interpolate_pose,
     make_sampler,
     shafts_of,
@@ -228,16 +228,16 @@ def standing_at(x: float, turn: float = 0.0, jaw: float = 0.0) -> State:
 
 
 def test_a_state_is_seen_by_cameras_that_recorded_like_ones_whatever_its_joints(camera):
-    count = 5 * SAMPLING.n_similar
+    count = 5 * SimilarFrames.n_similar
     cameras = [replace(camera, fx=float(k + 1)) for k in range(count)]
     views = RecordedViews(cameras, [standing_at(float(k), 0.01 * k, jaw=float(k % 2)) for k in range(count)])
     chosen = {int(views(standing_at(count / 2 + 0.3, 0.005 * count, jaw=9.0), rng_of(k)).fx) - 1 for k in range(200)}
-    assert len(chosen) == SAMPLING.n_similar
-    assert max(abs(k - count / 2) for k in chosen) <= SAMPLING.n_similar / 2 + 1
+    assert len(chosen) == SimilarFrames.n_similar
+    assert max(abs(k - count / 2) for k in chosen) <= SimilarFrames.n_similar / 2 + 1
 
 
 def test_without_like_states_any_recorded_camera_may_see_a_state(camera):
-    cameras = [replace(camera, fx=float(k + 1)) for k in range(3 * SAMPLING.n_similar)]
+    cameras = [replace(camera, fx=float(k + 1)) for k in range(3 * SimilarFrames.n_similar)]
     other = State({"other": standing_at(0.0).instruments["tool"]})
     known = [standing_at(float(k)) for k in range(len(cameras))]
     for views, state in (

@@ -30,7 +30,7 @@ from neeco.cli import main
 from neeco.ingest.posing.posed_capture import read_answers
 from neeco.viewer import posing
 from neeco.viewer.access import Access
-from neeco.viewer.posing import PICTURES, PosingServer
+from neeco.viewer.posing import PosingServer
 
 pytest.importorskip("viser")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -173,7 +173,7 @@ def test_pictures_come_side_by_side(server: PosingServer, monkeypatch: pytest.Mo
     monkeypatch.setattr(posing, "open_image", lambda path: (meet.wait(), opened(path))[1])
     with ThreadPoolExecutor(6) as pool:
         widths = list(pool.map(lambda k: image(server, "picture", index=k, small=True).width, range(12)))
-    assert widths == [PICTURES.thumbnail_width] * 12
+    assert widths == [PosingServer.thumbnail_width] * 12
 
 
 def test_without_the_token_nobody_may_ask(server: PosingServer) -> None:

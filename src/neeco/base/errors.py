@@ -84,7 +84,11 @@ def memory_failure(error: BaseException) -> str | None:
     if isinstance(error, NeecoError) and str(error).startswith(TOO_LITTLE):
         return str(error)
     cause: BaseException | None = error
-    while cause is not None and not _is_memory_failure(cause):
+    while cause is not None:
+        if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno == errno.ENOMEM):
+            break
+        if not isinstance(cause, NeecoError) and MEMORY_MESSAGES.search(str(cause)):
+            break
         cause = cause.__cause__ or cause.__context__
     if cause is None:
         return None
@@ -103,12 +107,6 @@ def memory_failure(error: BaseException) -> str | None:
         f"{TOO_LITTLE}{details}: close other programs or raise the limit (ulimit -v), take smaller images "
         "(--scale 0.5), fewer Gaussians (--max-tissue-gaussians), fewer --workers, or a machine with more"
     )
-
-
-def _is_memory_failure(error: BaseException) -> bool:
-    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
-        return True
-    return not isinstance(error, NeecoError) and bool(MEMORY_MESSAGES.search(str(error)))
 
 
 def _size(number: str, unit: str) -> str:

@@ -233,11 +233,6 @@ def require_utf8(path: Path | str) -> None:
         raise NeecoError(f"{os.fsencode(name)!r}: the name is not in UTF-8; rename the file or folder")
 
 
-def follows_links() -> bool:
-    """Return whether links in a capture may lead out of it (`--follow-links`): workers inherit the environment."""
-    return os.environ.get(FOLLOW_LINKS, "") not in ("", "0")
-
-
 def require_inside(file: Path, folder: Path) -> Path:
     """`file`, whose path goes through `folder`. Raises NeecoError when a link on the way leads out of that, or in a
     circle."""

@@ -116,13 +116,6 @@ def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool, 
     return None
 
 
-def limits_fault(limits: tuple[float, float], slides: bool) -> Fault | None:
-    """Check a joint's stated limits, rad or mm."""
-    if slides or max(map(abs, limits)) <= 2 * PLAUSIBLE.full_turn:
-        return None
-    return f"{limits[0]:g} .. {limits[1]:g} rad: degrees?", "give radians"
-
-
 def mask_fault(pixels: float, points: float | None) -> Fault | None:
     """Check loss masks by the shares that they hide: of the lit pixels in most images, and of the projected sparse
     points (None: there are none)."""

@@ -133,8 +133,7 @@ def structure(kind: type[T], values: Mapping[str, Any], where: str = "", owner: 
     Raises NeecoError naming the field (`where` and its dotted path) that is unknown or does not fit its type.
     """
     with faults_in(""):
-        settings: T = read(kind, Place(values, field=where), owner)
-        return settings
+        return read(kind, Place(values, field=where), owner)
 
 
 def name_and_value(option: str, text: str, example: str) -> tuple[str, str]:
@@ -147,9 +146,7 @@ def name_and_value(option: str, text: str, example: str) -> tuple[str, str]:
 
 def plain(settings: Any) -> dict[str, Any]:
     """Return `settings` as dicts, lists and scalars; `structure` is the inverse."""
-    value = _plain(dataclasses.asdict(settings))
-    assert isinstance(value, dict)
-    return value
+    return _plain(dataclasses.asdict(settings))
 
 
 def with_fields(settings: Any, values: Mapping[str, Any]) -> Any:

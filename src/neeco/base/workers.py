@@ -23,24 +23,10 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.placeholders import read_head
-
-
-@dataclass(frozen=True, kw_only=True)
-class WorkerSettings:
-    """Times and numbers of tasks that workers share."""
-
-    max_retries: int = 3  # limit on the retries of a task whose worker died
-    connect_s: float = 5.0  # limit on the s that a cluster's head takes to answer
-    probe_s: float = 60.0  # limit on the s that a cluster's nodes take to start a worker and look at a folder
-    poll_s: float = 1.0  # s between two looks at running tasks
-    tasks_per_worker: int = 2  # tasks submitted to a cluster per worker, so that no worker waits for the next
-
-
-LIMITS = WorkerSettings()
 
 # (what all tasks share, a task, threads that it may use) -> its result; pickled, so it is a function of a module
 TaskFunction = Callable[[Any, Any, int], Any]
@@ -52,7 +38,7 @@ Stage = Literal["started", "done", "failed", "died", "abandoned"]
 class TaskEvent:
     """Progress of one task: `value` is its result once it is done, or the reason why it failed or its worker died.
 
-    A task whose worker died is begun again, LIMITS.max_retries times at most; then it is abandoned.
+    A task whose worker died is begun again, Workers.max_retries times at most; then it is abandoned.
     """
 
     index: int
@@ -78,6 +64,11 @@ class Workers:
     stop_s: float = 5.0
     writes: Path | None = None
     reads: frozenset[Path] = frozenset()
+    max_retries: ClassVar[int] = 3  # limit on the retries of a task whose worker died
+    connect_s: ClassVar[float] = 5.0  # limit on the s that a cluster's head takes to answer
+    probe_s: ClassVar[float] = 60.0  # limit on the s that a cluster's nodes take to start a worker and look at a folder
+    poll_s: ClassVar[float] = 1.0  # s between two looks at running tasks
+    tasks_per_worker: ClassVar[int] = 2  # tasks submitted to a cluster per worker, so that no worker waits for the next
 
 
 def address() -> str | None:
@@ -98,7 +89,7 @@ def check_workers(count: int) -> None:
     if "/" in cluster or not (host and port.isdecimal()):  # ray://..., auto, local: for Ray to understand
         return
     try:
-        socket.create_connection((host, int(port)), LIMITS.connect_s).close()
+        socket.create_connection((host, int(port)), Workers.connect_s).close()
     except (OSError, OverflowError) as error:
         raise NeecoError(
             f"RAY_ADDRESS: no Ray cluster answers at {cluster} ({error}); start it, or unset RAY_ADDRESS to work here"
@@ -133,7 +124,7 @@ def run_tasks(
                     yield TaskEvent(index, "started")
                 for index, outcome, value in pool.finished():
                     deaths[index] += outcome == "died"
-                    given_up = deaths[index] > LIMITS.max_retries
+                    given_up = deaths[index] > Workers.max_retries
                     if outcome == "died" and not given_up:
                         waiting.insert(0, index)
                     yield TaskEvent(index, "abandoned" if given_up else outcome, value)
@@ -198,9 +189,9 @@ class Processes:
             worker.connection.send(task)
 
     def finished(self) -> list[tuple[int, Outcome, Any]]:
-        """Return what ended within LIMITS.poll_s."""
+        """Return what ended within Workers.poll_s."""
         results: list[tuple[int, Outcome, Any]] = []
-        for connection in wait(list(self.running), LIMITS.poll_s):
+        for connection in wait(list(self.running), Workers.poll_s):
             worker, index = self.running.pop(connection)
             try:
                 stage, value = worker.connection.recv()
@@ -242,7 +233,14 @@ def _serve(function: TaskFunction, shared: Any, threads: int, connection: Connec
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def exit_with_parent() -> None:  # at once when it was killed, so as not to write while its successor does
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=exit_with_parent, daemon=True).start()
     if gpu is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpu  # before PyTorch looks for the first time
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError, KeyboardInterrupt):
@@ -253,14 +251,6 @@ def _serve(function: TaskFunction, shared: Any, threads: int, connection: Connec
             except Exception as error:
                 answer = "failed", _in_one_line(error)
             connection.send(answer)
-
-
-def _exit_with_parent() -> None:
-    """Exit a worker at once when its parent was killed, so that it does not write while its successor does."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def _in_one_line(error: BaseException) -> str:
@@ -285,7 +275,7 @@ class RayTasks:
         options: dict[str, Any] = {"num_cpus": threads, "num_gpus": share, "max_retries": 0}
         if workers.fresh:
             options["max_calls"] = 1
-        self.capacity = workers.count * (1 if workers.fresh else LIMITS.tasks_per_worker)
+        self.capacity = workers.count * (1 if workers.fresh else Workers.tasks_per_worker)
         self._ray, self._stop_s = ray, workers.stop_s
         self._remote = ray.remote(**options)(work_on_node)
         self._arguments = function, ray.put(shared), threads, os.getcwd()
@@ -297,9 +287,9 @@ class RayTasks:
         self.running[self._remote.remote(function, shared, task, threads, folder)] = index
 
     def finished(self) -> list[tuple[int, Outcome, Any]]:
-        """Return what ended within LIMITS.poll_s."""
+        """Return what ended within Workers.poll_s."""
         results: list[tuple[int, Outcome, Any]] = []
-        for reference in self._ray.wait(list(self.running), timeout=LIMITS.poll_s)[0]:
+        for reference in self._ray.wait(list(self.running), timeout=Workers.poll_s)[0]:
             index = self.running.pop(reference)
             try:
                 results.append((index, "done", self._ray.get(reference)))
@@ -372,7 +362,7 @@ def require_shared(ray: Any, file: Path, inputs: Collection[Path]) -> None:
                 probe = ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=on_node)(node_problem)
                 name = f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
                 probes[probe.remote(file, token, tuple(inputs))] = name
-        answered, silent = ray.wait(list(probes), num_returns=len(probes), timeout=LIMITS.probe_s)
+        answered, silent = ray.wait(list(probes), num_returns=len(probes), timeout=Workers.probe_s)
         for probe in answered:
             try:
                 problem = ray.get(probe)
@@ -381,7 +371,7 @@ def require_shared(ray: Any, file: Path, inputs: Collection[Path]) -> None:
             if problem:
                 raise NeecoError(f"RAY_ADDRESS: node {probes[probe]} {problem}")
         if silent:
-            node, limit = probes[silent[0]], LIMITS.probe_s
+            node, limit = probes[silent[0]], Workers.probe_s
             raise NeecoError(f"RAY_ADDRESS: node {node} does not answer within {limit:.0f} s; remove it")
     finally:
         file.unlink(missing_ok=True)

@@ -148,8 +148,7 @@ class KinematicTree:
 
     def world_from_root(self, pose: Array, readings: Mapping[str, float]) -> Array:
         """[4, 4] mm from the recorded pose of the link `pose_of`. Raises KeyError without a reading that moves it."""
-        back: Array = pose if self.pose_of is None else pose @ np.linalg.inv(self.root_from_recorded(readings))
-        return back
+        return pose if self.pose_of is None else pose @ np.linalg.inv(self.root_from_recorded(readings))
 
     @cached_property
     def rest_poses(self) -> dict[str, Array]:

@@ -104,10 +104,14 @@ def write_ply(path: Path, points: PointCloud) -> None:
         vertices[axis] = points.positions[:, column]
     for column, name in enumerate(("red", "green", "blue")):
         vertices[name] = np.clip(np.rint(points.colors[:, column] * 255), 0, 255)
+    write_atomically(Path(path), lambda temporary: temporary.write_bytes(encoded_ply(vertices)))
+
+
+def encoded_ply(vertices: np.ndarray) -> bytes:
+    """Return the content of a binary PLY of a structured array of float32 and uint8, little-endian."""
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property {'float' if name in 'xyz' else 'uchar'} {name}" for name, _ in fields] + ["end_header", ""]
-    content = "\n".join(header).encode("ascii") + vertices.tobytes()
-    write_atomically(Path(path), lambda temporary: temporary.write_bytes(content))
+    header += [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind, *_ in vertices.dtype.descr]
+    return "\n".join([*header, "end_header", ""]).encode("ascii") + vertices.tobytes()
 
 
 def random_points(center: np.ndarray, half_size: float, count: int = 20_000, seed: int = 0) -> PointCloud:

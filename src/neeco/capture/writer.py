@@ -189,8 +189,19 @@ def _write_frame(
     ]
     intrinsics = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
     intrinsics |= {"w": camera.width, "h": camera.height}
+    if image is None and not has_alpha(frame.image_path):
+        image_file = f"images/{name}{frame.image_path.suffix}"
+        _copy(frame.image_path, path / image_file)
+    else:  # given, or flattened
+        if image is not None and not isinstance(image, Tensor):
+            image = torch.from_numpy(np.array(image))  # those of a decoder cannot be written, of which PyTorch warns
+        pixels, wanted = frame.load_image() if image is None else image, (camera.height, camera.width, 3)
+        if tuple(pixels.shape) != wanted:
+            raise NeecoError(f"{frame.image_path}: image has shape {tuple(pixels.shape)}, its camera says {wanted}")
+        image_file = f"images/{name}.png"
+        write_unsynced(path / image_file, encoded_image(pixels / 255 if pixels.dtype == torch.uint8 else pixels))
     entry: dict[str, Any] = {
-        "file_path": _write_image(frame, name, path, image),
+        "file_path": image_file,
         "transform_matrix": swap_camera_axes(world_from_camera).tolist(),
         **{name: _number(value) for name, value in intrinsics.items()},
         "time": _number(frame.state.time),
@@ -212,23 +223,6 @@ def _rigid(pose: Tensor, field: str) -> np.ndarray:
     if (fault := rigid_fault(matrix)) is not None:
         raise NeecoError(f"{field}: {fault[0]}; {fault[1]}")
     return matrix
-
-
-def _write_image(frame: Frame, name: str, path: Path, image: Tensor | np.ndarray | None) -> str:
-    """Write, copy or flatten a frame's image; its path in the new capture."""
-    if image is None and not has_alpha(frame.image_path):
-        target = f"images/{name}{frame.image_path.suffix}"
-        _copy(frame.image_path, path / target)
-        return target
-    if image is not None and not isinstance(image, Tensor):
-        image = torch.from_numpy(np.array(image))  # those of a decoder cannot be written, of which PyTorch warns
-    pixels = frame.load_image() if image is None else image
-    wanted = (frame.camera.height, frame.camera.width, 3)
-    if tuple(pixels.shape) != wanted:
-        raise NeecoError(f"{frame.image_path}: image has shape {tuple(pixels.shape)}, its camera says {wanted}")
-    target = f"images/{name}.png"
-    write_unsynced(path / target, encoded_image(pixels / 255 if pixels.dtype == torch.uint8 else pixels))
-    return target
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -65,7 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     pipe was closed. Usage errors (2) and `--help` (0) raise SystemExit. Standard streams may be closed, and may have
     any encoding.
     """
-    words = _with_target(list(sys.argv[1:] if arguments is None else arguments))
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    for at in reversed([at for at, word in enumerate(words) if word == "--json"]):
+        if at + 1 == len(words) or words[at + 1].startswith("--"):  # without a file: to standard output
+            words.insert(at + 1, "-")
     _prepare_streams()
     terminate, before = None, os.environ.get(FOLLOW_LINKS)
     if "--follow-links" in words[1:]:
@@ -101,21 +104,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         return 1
     finally:
-        _discard_unwritable()
+        for stream in (sys.stdout, sys.stderr):  # discard unwritable output, or the interpreter fails on exit
+            try:
+                stream.flush()
+            except OSError:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         if before is None:
             os.environ.pop(FOLLOW_LINKS, None)
         else:
             os.environ[FOLLOW_LINKS] = before
         if terminate is not None:
             signal.signal(signal.SIGTERM, terminate)
-
-
-def _with_target(words: list[str]) -> list[str]:
-    """Insert `-`, standard output, after every `--json` without a file."""
-    for at in reversed([at for at, word in enumerate(words) if word == "--json"]):
-        if at + 1 == len(words) or words[at + 1].startswith("--"):
-            words.insert(at + 1, "-")
-    return words
 
 
 def _prepare_streams() -> None:
@@ -129,15 +128,6 @@ def _prepare_streams() -> None:
             setattr(sys, name, os.fdopen(null, "w" if number else "r", encoding="utf-8"))
         elif number and isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-
-
-def _discard_unwritable() -> None:
-    """Discard unwritable output, so that the interpreter does not fail on exit."""
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except OSError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _print_error(message: str) -> None:

@@ -12,20 +12,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
-from rich import box
 from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Table
 from rich.text import Text
 
 from neeco.base.errors import NeecoError, nearest
 from neeco.base.files import finite, new_folder, require_replaceable, write_json
-from neeco.base.settings import described, field_texts, value_words
-
-if TYPE_CHECKING:
-    from neeco.studies.configurations import ResultTable
+from neeco.base.settings import field_texts, value_words
+from neeco.studies.configurations import ResultTable
 
 STANDARD_OUTPUT = Path("-")  # value of --json
 FILE_WIDTH = 1000  # maximum width of lines in files and pipes
@@ -182,20 +179,15 @@ def state_defaults(kind: Any) -> None:
             owner.__annotations__[field.name] = bare
 
 
-def option_names(kind: Any) -> list[str]:
-    """Return the options of a dataclass of arguments, such as `--output`."""
-    names = []
-    for _, field, _, markers in _options(kind):
-        if tyro.conf.Positional not in markers:
-            name = next(filter(None, (getattr(marker, "name", None) for marker in markers)), field.name)
-            names.append(f"--{'no-' if field.default is True else ''}{name.replace('_', '-')}")
-    return names
-
-
 def usage_error(box: str, words: Sequence[str], kind: Any) -> str:
     """Return a one-line message for a command line that tyro refused in a framed `box`: similar options for unknown
     ones, else tyro's words without its frame and its list of similar options."""
-    options, slips = [*option_names(kind), "--help"], []
+    options, slips = list[str](), []
+    for _, field, _, markers in _options(kind):
+        if tyro.conf.Positional not in markers:
+            name = next(filter(None, (getattr(marker, "name", None) for marker in markers)), field.name)
+            options.append(f"--{'no-' if field.default is True else ''}{name.replace('_', '-')}")
+    options.append("--help")
     for option in (word.partition("=")[0] for word in words):
         if option.startswith("--") and option not in options and (meant := nearest(option, options)) is not None:
             slips.append(f"{option}: no such option of {words[0]}; did you mean {meant}?")
@@ -218,13 +210,3 @@ def usage_error(box: str, words: Sequence[str], kind: Any) -> str:
         text = field_texts(kind).get(option.replace("-", "_"), "").partition(DEFAULT)[0].rstrip(".")
         line = f"{line if value[2] else f'--{option}: needs a value'}: {text}".rstrip(" :")
     return f"{line}; see `neeco {words[0]} --help`"
-
-
-def print_settings(title: str, kind: type[Any], note: str) -> None:
-    """Print a table of the fields of the dataclass `kind`, if it has any, and a line below it."""
-    console = Console(highlight=False, markup=False)
-    table = Table(Column(no_wrap=True), Column("default"), Column(), title=title, title_justify="left", box=box.ROUNDED)
-    for row in described(kind):
-        table.add_row(*map(Text, row))
-    console.print(table if table.rows else f"{title}: none")
-    console.print(note)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,16 +19,14 @@ from neeco.cli._output import whole_lines
 from neeco.raster.devices import device_failure
 
 if TYPE_CHECKING:
-    import torch
-
     from neeco.studies.study import JobEvent
-    from neeco.training.config import TrainConfig
     from neeco.training.train import ProgressRow
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProgressSettings:
-    """Times and sizes of bars and lines."""
+@dataclass(kw_only=True)
+class Bars:
+    """A bar for each count and each running job on a terminal; elsewhere a line for each every `line_interval_s`.
+    Nothing is printed before there is progress, so that invalid input prints its error line only."""
 
     line_interval_s: float = 30.0  # s between two lines about the same task without a terminal
     wide: int = 100  # minimum width in characters of a terminal for long bars
@@ -37,24 +34,16 @@ class ProgressSettings:
     evaluation_share: float = 0.1  # share of a job's bar for evaluation; the rest is training
     speed_s: float = 3600.0  # s, window of the speed for estimating the remaining time
 
-
-PROGRESS = ProgressSettings()
-
-
-class Bars:
-    """A bar for each count and each running job on a terminal; elsewhere a line for each every `line_interval_s`.
-    Nothing is printed before there is progress, so that invalid input prints its error line only."""
-
-    def __init__(self, settings: ProgressSettings = PROGRESS) -> None:
-        self.settings, console = settings, whole_lines(stderr=True)
+    def __post_init__(self) -> None:
+        console = whole_lines(stderr=True)
         columns = (
             TextColumn("{task.description}"),
-            BarColumn(bar_width=20 if console.width >= PROGRESS.wide else 5),
+            BarColumn(bar_width=20 if console.width >= self.wide else 5),
             TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self.bar = Progress(*columns, console=console, speed_estimate_period=PROGRESS.speed_s)
+        self.bar = Progress(*columns, console=console, speed_estimate_period=self.speed_s)
         self.tasks: dict[str, TaskID] = {}
         self.stages: list[TaskID] = []
         self.began = time.monotonic()
@@ -73,11 +62,11 @@ class Bars:
             self.lines.join()
             if kind is None:
                 tasks = [task for task in self.bar.tasks if task.visible]  # none if all were completed jobs
-                others, least = tasks[:-1], self.settings.min_shown_s
+                others, least = tasks[:-1], self.min_shown_s
                 for task in [task for task in others if (task.elapsed or 0) >= least] + tasks[-1:]:
                     self._print(_line(task))
-        if kind is None and self.tasks and (passed := time.monotonic() - self.began) >= self.settings.min_shown_s:
-            self._print(f"total: {_duration(passed)}")
+        if kind is None and self.tasks and (passed := time.monotonic() - self.began) >= self.min_shown_s:
+            self._print(f"total: {duration(passed)}")
 
     def stage(self, what: str, done: int, total: int | None) -> None:
         """Show that `done` of `total` are completed, and so are earlier stages."""
@@ -115,9 +104,9 @@ class Bars:
             line = f"{title}: {news.stage}: {outcome} ({len(self.ended)} of {news.total} finished)"
             self._print(line, style="red" if news.stage == "failed" else "")
             return
-        share = news.share * (1 - PROGRESS.evaluation_share)
+        share = news.share * (1 - self.evaluation_share)
         if news.stage == "evaluating":
-            share = 1 - PROGRESS.evaluation_share * (1 - news.share)
+            share = 1 - self.evaluation_share * (1 - news.share)
         self.bar.update(task, completed=share, text=f"{news.stage} {news.text}".rstrip())
 
     def _task(self, title: str, total: float | None = 1.0) -> TaskID:
@@ -134,7 +123,7 @@ class Bars:
         self.bar.update(task, completed=total, total=total)
 
     def _print_lines(self) -> None:
-        while not self.left.wait(self.settings.line_interval_s):
+        while not self.left.wait(self.line_interval_s):
             for task in [task for task in self.bar.tasks if task.visible and not task.finished]:
                 self._print(_line(task))
 
@@ -147,13 +136,14 @@ def _line(task: Task) -> str:
     passed = task.finished_time or task.elapsed or 0.0
     parts = [f"{task.percentage:.0f} %"] if task.total else []
     parts += [task.fields["text"]] if task.fields["text"] else []
-    parts += [f"{_duration(passed)} elapsed"]
+    parts += [f"{duration(passed)} elapsed"]
     if task.time_remaining:
-        parts += [f"about {_duration(task.time_remaining)} left"]
+        parts += [f"about {duration(task.time_remaining)} left"]
     return f"{task.description}: {', '.join(parts)}"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Return seconds as h:mm:ss."""
     return str(timedelta(seconds=round(seconds)))
 
 
@@ -179,28 +169,3 @@ def resumable(begun: Path, how: str = "work so far is kept; run the same command
         if failure := device_failure(error):
             raise NeecoError(f"{failure}; {how}") from error
         raise
-
-
-def train_with_progress(
-    capture: Path, output: Path, config: TrainConfig, device: torch.device, *, resume: bool = False
-) -> Path:
-    """Call `train` with a bar that shows PSNR, Gaussians and remaining time. Return the run's folder."""
-    from neeco.training.run import resume_command
-    from neeco.training.train import train
-
-    run, hint = shlex.quote(str(output)), f"continue with: {resume_command(capture, output)}"
-    started: list[int] = []  # the iteration of the first row
-
-    def show(row: ProgressRow) -> None:
-        if not row.note and not started:
-            started.append(row.iteration)
-            slow = " (a CUDA device is faster)" if device.type == "cpu" else ""
-            remaining = row.seconds_left
-            whole = "" if remaining is None else f", estimated total time {_duration(row.seconds + remaining)}"
-            bars.training(replace(row, note=f"training on {device.type}{slow}{whole}; view it: neeco view {run}"))
-        bars.training(row)
-
-    with Bars() as bars, resumable(output, hint):
-        path = train(capture, output, config, device=device, resume=resume, progress=show)
-        bars.end("training")
-    return path

@@ -52,17 +52,9 @@ def run(arguments: Arguments) -> int:
         trained.require_trusted("annotate")
         capture = None if arguments.capture is None else read_checked(arguments.capture)
         with counting("annotate") as advance, resumable(arguments.output):
-            annotated = annotate_capture(
-                trained,
-                arguments.output,
-                capture=capture,
-                min_trust=arguments.min_trust,
-                formats=arguments.formats,
-                images=arguments.images,
-                class_names=arguments.class_names,
-                resume=arguments.resume,
-                on_progress=advance,
-            )
+            passed = ("min_trust", "formats", "images", "class_names", "resume")
+            options = {name: getattr(arguments, name) for name in passed}
+            annotated = annotate_capture(trained, arguments.output, capture=capture, on_progress=advance, **options)
         page = write_annotated_page(annotated.output, annotated.records, annotated.capture, arguments.min_trust)
     count, omitted = len(annotated.records), len(annotated.records) - annotated.written
     out = f"; {omitted} left out with a trust below {arguments.min_trust:g}" if omitted else ""

@@ -56,20 +56,16 @@ def _print(problems: list[Problem], errors: int, summary: CaptureSummary) -> Non
         console.print(f"{counted(errors, 'error')}, {counted(warnings, 'warning')}")
     else:
         console.print(Text("no problems found", "bold green"))
-    for line in _summary_lines(summary) if summary.splits else []:
-        console.print(Text(line))
-
-
-def _summary_lines(summary: CaptureSummary) -> list[str]:
-    frames = ", ".join(f"{count} {name!r}" for name, count in summary.splits.items()) or "none"
-    lines = [f"frames: {frames}", f"sparse points: {summary.points}"]
+    if not summary.splits:
+        return
+    console.print(Text("frames: " + ", ".join(f"{count} {name!r}" for name, count in summary.splits.items())))
+    console.print(Text(f"sparse points: {summary.points}"))
     if summary.still:
-        lines.append("scope: still; other viewpoints were not observed, so render views near the recorded ones")
+        console.print("scope: still; other viewpoints were not observed, so render views near the recorded ones")
     for name, travel in summary.travel_mm.items():
         joints = [
             f"{joint.removeprefix(name + '.')} {low:.3g} .. {high:.3g}"
             for joint, (low, high) in summary.joints.items()
             if joint.startswith(name + ".")
         ]
-        lines.append(f"instrument {name!r}: " + ", ".join([f"moves {travel:.1f} mm", *joints]))
-    return lines
+        console.print(Text(f"instrument {name!r}: " + ", ".join([f"moves {travel:.1f} mm", *joints])))

@@ -40,7 +40,7 @@ def run(args: Evaluate) -> int:
     from neeco.raster.devices import device_of
     from neeco.report.run_page import write_report
     from neeco.training.run import open_run
-    from neeco.viewer.export import embedded_page
+    from neeco.viewer.export import EXPORT, page_of_run, why_not
 
     console = whole_lines()
     networks = find_lpips(args.lpips_weights)
@@ -50,7 +50,8 @@ def run(args: Evaluate) -> int:
             evaluation = evaluate_run(
                 trained, capture, args.splits, align=args.align, networks=networks, progress=bars.stage
             )
-        page = write_report(args.run, evaluation, capture, trained.scene, playable=embedded_page(trained))
+        playable = None if why_not(trained.scene) else page_of_run(trained, EXPORT.embedded_degree)
+        page = write_report(args.run, evaluation, capture, trained.scene, playable=playable)
         if write_numbers(args.json, evaluation):
             return 0
     console.print(evaluation_table(evaluation))

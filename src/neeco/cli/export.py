@@ -37,6 +37,7 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Write the file and print a summary of its content."""
+    from neeco.base.files import write_atomically
     from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.training.run import open_gaussian_run
@@ -71,6 +72,9 @@ def run(arguments: Arguments) -> int:
             note = f"{len(moving.times)} states; {moving.blended:.0%} of the instruments' Gaussians blend links"
         else:
             note = "without joints and labels"
-            scene_files.write_splats(scene_files.splats_of(scene, state, camera), output, format, arguments.spz_version)
+            splats = scene_files.splats_of(scene, state, camera)
+            ply = format == "ply"
+            data = scene_files.ply_bytes(splats) if ply else scene_files.spz_bytes(splats, arguments.spz_version)
+            write_atomically(output, lambda temporary: temporary.write_bytes(data))
     print(f"{output}: {scene.num_gaussians:,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, {note}")
     return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from rich.table import Column, Table
@@ -48,35 +48,25 @@ def run(arguments: Arguments) -> int:
         if write_numbers(arguments.json, scores):
             return 0
     console = whole_lines()
-    console.print(_table(scores))
-    for line in _lines(scores):
-        console.print(line, markup=False, highlight=False)
+    table = Table("part", *(Column(title, justify="right") for title, _ in COLUMNS), Column("images", justify="right"))
+    for part, numbers in {"instrument": scores["instrument"], **(scores["parts"] or {})}.items():
+        images = "-" if numbers["images"] is None else str(numbers["images"])
+        table.add_row(part, *(_formatted(numbers[key]) for _, key in COLUMNS), images)
+    console.print(table)
+    splits = f" of {', '.join(scores['splits'])}" if scores["splits"] else ""
+    challenge = _formatted(scores["instrument"]["challenge_iou"])
+    line = f"{scores['images']} images{splits}; Challenge IoU of the instrument {challenge}"
+    if scores["classes"] is not None:
+        line += f", of its parts {_formatted(scores['classes']['challenge_iou'])}"
+    console.print(line, markup=False, highlight=False)
+    for pair, way in scores["pair_assignment"].items():
+        if way == "swapped":
+            line = f"{pair}: left and right are swapped, which matches this folder better"
+            console.print(line, markup=False, highlight=False)
     for note in scores["notes"]:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
     return 0
 
 
-def _table(scores: dict[str, Any]) -> Table:
-    table = Table("part", *(Column(title, justify="right") for title, _ in COLUMNS), Column("images", justify="right"))
-    for part, numbers in {"instrument": scores["instrument"], **(scores["parts"] or {})}.items():
-        values = (numbers[key] for _, key in COLUMNS)
-        images = "-" if numbers["images"] is None else str(numbers["images"])
-        table.add_row(part, *("-" if value is None else f"{value:.3f}" for value in values), images)
-    return table
-
-
-def _lines(scores: dict[str, Any]) -> list[str]:
-    """Return lines with the numbers that belong to no part."""
-
-    def formatted(value: float | None) -> str:
-        return "-" if value is None else f"{value:.3f}"
-
-    splits = f" of {', '.join(scores['splits'])}" if scores["splits"] else ""
-    challenge = formatted(scores["instrument"]["challenge_iou"])
-    lines = [f"{scores['images']} images{splits}; Challenge IoU of the instrument {challenge}"]
-    if scores["classes"] is not None:
-        lines[0] += f", of its parts {formatted(scores['classes']['challenge_iou'])}"
-    for pair, way in scores["pair_assignment"].items():
-        if way == "swapped":
-            lines.append(f"{pair}: left and right are swapped, which matches this folder better")
-    return lines
+def _formatted(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"

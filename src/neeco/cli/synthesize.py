@@ -61,19 +61,10 @@ def run(arguments: Arguments) -> int:
         raise NeecoError("--instruments: requires --tissue RUN and vice versa; give both or neither")
     settings, first = arguments.settings, arguments.run or arguments.tissue
     assert first is not None
+    passed = ("instruments", "formats", "resume", "workers", "device", "force")
+    options = {name: getattr(arguments, name) for name in passed} | vars(settings)
     with Bars() as bars, resumable(arguments.output):
-        made = synthesize(
-            first,
-            arguments.output,
-            instruments=arguments.instruments,
-            formats=arguments.formats,
-            resume=arguments.resume,
-            workers=arguments.workers,
-            device=arguments.device,
-            force=arguments.force,
-            progress=bars.stage,
-            **vars(settings),
-        )
+        made = synthesize(first, arguments.output, progress=bars.stage, **options)
     if made.still and settings.views in VIEWS_OF_STILL:
         print(f"the scope was still: views are {VIEWS_OF_STILL[settings.views]}")
     print(f"{made.images} images in {made.output} ({made.made_now} rendered now); see {made.output / 'preview.png'}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -52,29 +52,52 @@ class Arguments:
 
 def run(args: Arguments) -> int:
     """Train with a progress bar; print the path of the run."""
-    from neeco.cli._progress import train_with_progress
+    from neeco.cli._progress import Bars, duration, resumable
     from neeco.raster.devices import device_of
     from neeco.training.config import FLAGS, training_config
-    from neeco.training.run import begun_config
+    from neeco.training.run import begun_config, resume_command
+    from neeco.training.train import ProgressRow, train
 
     flags = {name: getattr(args, name) for name in FLAGS if name != "method"}
     begun = begun_config(args.output) if args.resume else None
     config = training_config(args.method, flags, args.set, begun)
-    path = train_with_progress(args.capture, args.output, config, device_of(args.device), resume=args.resume)
+    device, started = device_of(args.device), list[int]()  # the iteration of the first row
+
+    def show(row: ProgressRow) -> None:
+        if not row.note and not started:
+            started.append(row.iteration)
+            slow = " (a CUDA device is faster)" if device.type == "cpu" else ""
+            remaining = row.seconds_left
+            whole = "" if remaining is None else f", estimated total time {duration(row.seconds + remaining)}"
+            view = f"view it: neeco view {shlex.quote(str(args.output))}"
+            bars.training(replace(row, note=f"training on {device.type}{slow}{whole}; {view}"))
+        bars.training(row)
+
+    hint = f"continue with: {resume_command(args.capture, args.output)}"
+    with Bars() as bars, resumable(args.output, hint):
+        path = train(args.capture, args.output, config, device=device, resume=args.resume, progress=show)
+        bars.end("training")
     print(f"finished: {path}  (next: neeco evaluate {shlex.quote(str(path))})")
     return 0
 
 
 def explain(words: Sequence[str]) -> None:
     """Print the settings of the method named in `words`, as a table after the help text."""
-    from neeco.cli._output import print_settings
+    from rich.box import ROUNDED
+    from rich.console import Console
+    from rich.table import Column, Table
+    from rich.text import Text
+
+    from neeco.base.settings import described
     from neeco.scene.method_registry import DEFAULT, method_class, methods
 
     named = [word for before, word in pairwise(["", *words]) if before == "--method" or word.startswith("--method=")]
     method = method_class((named or [DEFAULT])[-1].removeprefix("--method=").partition("+")[0])
+    title = f"settings of method {method.method}: --set deformation.NAME=VALUE"
+    table = Table(Column(no_wrap=True), Column("default"), Column(), title=title, title_justify="left", box=ROUNDED)
+    for row in described(method.Settings):
+        table.add_row(*map(Text, row))
+    console = Console(highlight=False, markup=False)
+    console.print(table if table.rows else f"{title}: none")
     other_methods = ", ".join(name for name in methods() if name != method.method)
-    print_settings(
-        f"settings of method {method.method}: --set deformation.NAME=VALUE",
-        method.Settings,
-        f"of other methods: neeco train --method NAME --help ({other_methods})",
-    )
+    console.print(f"of other methods: neeco train --method NAME --help ({other_methods})")

@@ -66,23 +66,19 @@ def run(arguments: Arguments) -> int:
         print(export_page(arguments.source, arguments.export, arguments.sh, device_of(arguments.device)))
         return 0
     arguments.size.check()
-    if is_capture(arguments.source):
+    source = arguments.source
+    if not source.exists():
+        raise NeecoError(f"{source}: neither a run folder nor a capture; correct the path")
+    if (source / "transforms.json").is_file() and not (source / "config.yaml").exists():  # a capture, no run
         from neeco.viewer.recording import RecordingServer
 
-        with RecordingServer(arguments.source, arguments.host, arguments.port) as recording:
+        with RecordingServer(source, arguments.host, arguments.port) as recording:
             return _serve(recording.address, arguments)
     from neeco.viewer.server import ViewerServer
 
     device = device_of(arguments.device)
-    with ViewerServer(arguments.source, arguments.host, arguments.port, device, arguments.size) as viewer:
+    with ViewerServer(source, arguments.host, arguments.port, device, arguments.size) as viewer:
         return _serve(viewer.address, arguments)
-
-
-def is_capture(path: Path) -> bool:
-    """Return whether a folder is a capture and not a run. Raises NeecoError if it does not exist."""
-    if not path.exists():
-        raise NeecoError(f"{path}: neither a run folder nor a capture; correct the path")
-    return (path / "transforms.json").is_file() and not (path / "config.yaml").exists()
 
 
 def _serve(address: str, arguments: Arguments) -> int:

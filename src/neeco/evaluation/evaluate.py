@@ -10,8 +10,9 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,12 +50,10 @@ from neeco.raster.native import synchronise
 from neeco.raster.resampling import of_learned_size
 from neeco.raster.shadow import GAMMA, shadowed
 from neeco.raster.types import Rendering
+from neeco.scene import DrawableScene
 from neeco.scene.gaussian_scene import GaussianScene, is_gaussian, require_gaussians
 from neeco.states.alignment import align_frame, pose_changes
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene
-    from neeco.training.run import TrainedRun
+from neeco.training.run import TrainedRun
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,18 +222,6 @@ class _Tally:
     counts: list[np.ndarray] = field(default_factory=list)  # of `label_counts`, by frame
 
 
-@dataclass(frozen=True)
-class _Context:
-    """Inputs that all frames share."""
-
-    scene: DrawableScene
-    posed: GaussianScene | None  # `scene`, if its poses are fitted to the frames
-    capture: Capture
-    networks: Mapping[str, Lpips]
-    coverage: Coverage
-    foreground: Foreground | None  # pixel classifier for images without masks
-
-
 def evaluate_run(
     run: TrainedRun,
     capture: Capture,
@@ -259,13 +246,10 @@ def evaluate_run(
     report = progress or (lambda what, done, total: None)
     report("training views", 0, 1)
     train = capture.split("train")
-    context = _Context(
-        scene,
-        posed,
-        capture,
-        networks,
-        observed_depths(scene, train),
-        learned_foreground(scene, train) if is_gaussian(scene) else None,
+    coverage = observed_depths(scene, train)
+    foreground = learned_foreground(scene, train) if is_gaussian(scene) else None
+    score = partial(
+        _score_frame, scene, capture, posed=posed, networks=networks, coverage=coverage, foreground=foreground
     )
     report("training views", 1, 1)
     kinds = ("given", "aligned") if align else ("given",)
@@ -279,12 +263,12 @@ def evaluate_run(
         frames = capture.split(split)
         tallies = {kind: _Tally(PartTally(names)) for kind in kinds}
         for done, frame in enumerate(frames, 1):
-            _score_frame(context, frame, tallies)
+            score(frame, tallies)
             report(split, done, len(frames))
-        fps, count = _speed(scene, frames)
+        fps = _speed(scene, frames)
         for kind, tally in tallies.items():
             numbers, pair_assignment[kind][split] = _summary(scene, tally)
-            result[kind][split] = numbers | {"fps": fps, "num_gaussians": count, "frames": len(frames)}
+            result[kind][split] = numbers | {"fps": fps, "num_gaussians": scene.num_gaussians, "frames": len(frames)}
             per_frame[kind][split] = tally.rows
         quality = quality_of(tallies[kinds[-1]].counts)  # at fitted poses where there are any: those of labels
         if quality is not None and quality.doubt is not None:
@@ -297,9 +281,7 @@ def evaluate_run(
         "names": [list(name) for name in scene.label_names],
         "pair_assignment": pair_assignment,
     }
-    evaluation: dict[str, Any] = finite(
-        result | {"notes": notes, "doubts": doubts, "labels": labels, "per_frame": per_frame}
-    )
+    evaluation = finite(result | {"notes": notes, "doubts": doubts, "labels": labels, "per_frame": per_frame})
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
 
@@ -319,36 +301,45 @@ def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tu
     return tuple(dict.fromkeys(splits))
 
 
-def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) -> None:
+def _score_frame(
+    scene: DrawableScene,
+    capture: Capture,
+    frame: Frame,
+    tallies: dict[str, _Tally],
+    *,
+    posed: GaussianScene | None,
+    networks: Mapping[str, Lpips],
+    coverage: Coverage,
+    foreground: Foreground | None,
+) -> None:
     """Render one frame at its recorded poses and, if requested, at fitted ones; add the scores to the tallies. A score
-    without a reference is None."""
-    scene = context.scene
-    unobserved, tissue = unobserved_tissue(context.coverage, scene, frame)
-    reference = load_reference(context.capture, frame)
+    without a reference is None. posed: `scene`, if poses are fitted; foreground: for images without masks."""
+    unobserved, tissue = unobserved_tissue(coverage, scene, frame)
+    reference = load_reference(capture, frame)
     target, mask = frame.load_image(), frame.load_mask()
     counted = torch.ones(target.shape[:2], dtype=torch.bool, device=target.device) if mask is None else mask
     tissue_pixels = int((tissue & counted).sum())
-    networks = context.networks if min(target.shape[:2]) >= COMPARISON.min_size else {}
+    networks = networks if min(target.shape[:2]) >= COMPARISON.min_size else {}
     features = {name: network.features(target) for name, network in networks.items()}
-    shafts = [number for number, part in truth_names(context.capture.root).items() if part == "shaft"]
+    shafts = [number for number, part in truth_names(capture.root).items() if part == "shaft"]
     true_shaft = None
     if reference is not None and reference.parts is not None and shafts:
         true_shaft = torch.isin(reference.parts, torch.tensor(shafts, dtype=reference.parts.dtype))
-    true_shadow = load_shadow(context.capture, frame)
+    true_shadow = load_shadow(capture, frame)
     for kind, tally in tallies.items():
         row: dict[str, Any] = {"frame": frame.name}
         state, camera = frame.state, frame.camera
         if kind == "aligned":
-            assert context.posed is not None
-            fit = align_frame(context.posed, frame, target)
+            assert posed is not None
+            fit = align_frame(posed, frame, target)
             state, camera = fit.state, fit.camera
             row["moved"] = pose_changes(frame, state, camera)
             row["world_from_camera"] = camera.world_from_camera.tolist()
             row["joints"] = {name: dict(item.joints) for name, item in state.instruments.items()}
             row["world_from_instrument"] = {name: item.pose.tolist() for name, item in state.instruments.items()}
-        if context.foreground is not None and is_gaussian(scene):
+        if foreground is not None and is_gaussian(scene):
             view = Comparison.of(scene, state, scene.recorded.as_learned(camera), target, mask)
-            tally.counts.append(label_counts(view, context.foreground))
+            tally.counts.append(label_counts(view, foreground))
         drawing = draw(scene, state, camera)
         image = drawing.image
         shadow = true_shadow
@@ -400,8 +391,8 @@ def _summary(scene: DrawableScene, tally: _Tally) -> tuple[dict[str, Any], dict[
 
 
 @torch.no_grad()
-def _speed(scene: DrawableScene, frames: Sequence[Frame]) -> tuple[float, int | None]:
-    """Return renderings per second (median, after two for warm-up; fewer if slow) and the number of Gaussians."""
+def _speed(scene: DrawableScene, frames: Sequence[Frame]) -> float:
+    """Return renderings per second: median, after two for warm-up; fewer if slow."""
     seconds: list[float] = []
     for index in range(SETTINGS.timed + 2):
         frame = frames[index % len(frames)]
@@ -410,7 +401,7 @@ def _speed(scene: DrawableScene, frames: Sequence[Frame]) -> tuple[float, int | 
         seconds.append(time.perf_counter() - start)
         if len(seconds) > 1 and sum(seconds) > SETTINGS.max_timed_s:
             break
-    return 1.0 / statistics.median(seconds[2:] or seconds[1:]), scene.num_gaussians
+    return 1.0 / statistics.median(seconds[2:] or seconds[1:])
 
 
 def _scene_notes(scene: DrawableScene, networks: Mapping[str, Lpips], names: Mapping[int, str]) -> list[str]:

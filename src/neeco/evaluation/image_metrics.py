@@ -169,12 +169,6 @@ class Lpips:
                 total += float((difference * share).sum() / share.sum())
         return total
 
-    def distance(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-        """Return the LPIPS of `image` [H, W, 3] against `target` [H, W, 3], both in [0, 1], over pixels in `mask`."""
-        if mask is not None:
-            image = torch.where(mask[..., None], image, target)
-        return self.between(self.features(image), self.features(target), mask)
-
 
 def find_lpips(folder: Path | None = None) -> dict[str, Lpips]:
     """Return the networks whose weights are in `folder`, else in the folder that NEECO_LPIPS_WEIGHTS names, if any.
@@ -216,15 +210,13 @@ def load_lpips(path: Path, network: str) -> Lpips:
     return Lpips(layers, {name: tensor.float() for name, tensor in weights.items()})
 
 
-def difference_map(
-    image: np.ndarray, target: np.ndarray, full_scale: float = COMPARISON.full_scale, legend: bool = True
-) -> Pixels:
+def difference_map(image: np.ndarray, target: np.ndarray, legend: bool = True) -> Pixels:
     """Return |image - target| averaged over colours as uint8 colours; both inputs are [H, W, 3] floats in [0, 1].
 
     Differences of `full_scale` and above take the brightest colour. legend: adds a labelled scale, `legend_height` px.
     """
     difference = np.abs(np.asarray(image, np.float64) - np.asarray(target, np.float64)).mean(axis=2)
-    colored = _colored(difference / full_scale)
+    colored = _colored(difference / COMPARISON.full_scale)
     if not legend:
         return colored
     width, height, margin = colored.shape[1], COMPARISON.legend_height, COMPARISON.legend_margin
@@ -233,7 +225,7 @@ def difference_map(
     pen, font = ImageDraw.Draw(strip), ImageFont.load_default(COMPARISON.legend_font)
     for place, anchor in ((0.0, "ls"), (0.5, "ms"), (1.0, "rs")):
         across = round(margin + place * (width - 2 * margin))
-        pen.text((across, height - 2), f"{place * full_scale:.3g}", "white", font, anchor)
+        pen.text((across, height - 2), f"{place * COMPARISON.full_scale:.3g}", "white", font, anchor)
     return np.concatenate([colored, np.asarray(strip)])
 
 

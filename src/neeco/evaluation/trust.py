@@ -65,21 +65,11 @@ class Trust:
         return {name: round(number, 4) for name, number in asdict(self).items()}
 
 
-@dataclass(frozen=True)
-class _Errors:
-    """Pixels [H, W] of the label and its neighbourhood, and errors of the rendering and of the tissue alone."""
-
-    label: np.ndarray
-    nearby: np.ndarray
-    whole: np.ndarray
-    tissue: np.ndarray
-
-
 def typical_errors_of(drawings: Sequence[tuple[LabelledRendering, Tensor, Tensor | None]]) -> TypicalErrors:
     """Return the typical errors of renderings of training frames, each with its image [H, W, 3] and loss mask."""
     errors = [_errors(*drawing) for drawing in drawings]
-    inside = np.concatenate([frame.whole[frame.label] for frame in errors])
-    nearby = np.concatenate([frame.whole[frame.nearby] for frame in errors])
+    inside = np.concatenate([whole[label] for label, _, whole, _ in errors])
+    nearby = np.concatenate([whole[near] for _, near, whole, _ in errors])
     inside_error, nearby_error = (
         round(float(np.quantile(values, SETTINGS.typical_quantile)), 5) if len(values) else 1.0
         for values in (inside, nearby)
@@ -99,22 +89,24 @@ def estimate_trust(
     Pixels outside the frame's loss mask do not vote; next to the label, those up to `neighbourhood` of the image's
     diagonal away do.
     """
-    errors = _errors(drawing, image, mask, neighbourhood)
-    unexplained = (errors.whole > typical.inside) & (errors.whole > SETTINGS.max_share * errors.tissue)
-    against = errors.label & ((errors.whole > errors.tissue) | unexplained)
-    missed = errors.nearby & (errors.whole > typical.nearby)
-    size = max(1, int(errors.label.sum()))
+    label, near, whole, tissue = _errors(drawing, image, mask, neighbourhood)
+    unexplained = (whole > typical.inside) & (whole > SETTINGS.max_share * tissue)
+    against = label & ((whole > tissue) | unexplained)
+    missed = near & (whole > typical.nearby)
+    size = max(1, int(label.sum()))
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     opened = (
         cv2.erode(v.astype(np.uint8), cross, borderType=cv2.BORDER_CONSTANT, borderValue=0) for v in (against, missed)
     )
     n_against, n_missed = (cv2.countNonZero(cv2.dilate(votes, cross)) for votes in opened)  # without single pixels
-    return Trust((int(errors.label.sum()) - n_against) / (size + n_missed), n_against / size, n_missed / size)
+    return Trust((int(label.sum()) - n_against) / (size + n_missed), n_against / size, n_missed / size)
 
 
 def _errors(
     drawing: LabelledRendering, image: Tensor, mask: Tensor | None, neighbourhood: float = SETTINGS.neighbourhood
-) -> _Errors:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the voting pixels [H, W] of the label and of its neighbourhood, and the errors [H, W] of the rendering and
+    of the tissue alone."""
     votes = np.ones(drawing.parts.shape, dtype=bool) if mask is None else mask.numpy()
     label = drawing.parts.numpy() > 0
     near = ~label & (distances_to(label) <= neighbourhood * float(np.hypot(*label.shape)))
@@ -123,4 +115,4 @@ def _errors(
         uniform_filter((rendered - image).abs().mean(2).numpy(), SETTINGS.window_px)
         for rendered in (drawing.image, drawing.tissue_image)
     )
-    return _Errors(label & votes, near & votes, whole, tissue)
+    return label & votes, near & votes, whole, tissue

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,10 +21,8 @@ from neeco.geometry.projection import project_local
 from neeco.labels.drawing import LayeredDrawing, draw_layers, keypoint_arrays, shows_any, surface_depth, to_numpy
 from neeco.labels.labellers import CompositedLabels, instruments_of
 from neeco.labels.settings import LABELS
+from neeco.scene import DrawableScene, GaussianScene
 from neeco.scene.gaussian_scene import require_gaussians
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene, GaussianScene
 
 SHAFT_ENDS = ("shaft_far", "shaft_near")  # keypoints; all others are of the working end
 OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2  # OUTSIDE: outside the image, or the instrument is not rendered at all
@@ -360,12 +358,6 @@ class LabelledImage(RGBDImage):
         }
 
 
-@overload
-def draw_labelled(
-    scene: DrawableScene, state: State, camera: Camera, labels: Literal[True] = True
-) -> LabelledImage: ...
-@overload
-def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bool) -> RGBDImage: ...
 @torch.no_grad()
 def draw_labelled(scene: DrawableScene, state: State, camera: Camera, labels: bool = True) -> RGBDImage:
     """Render `state` for a camera; the result is a `LabelledImage` with `labels`, an `RGBDImage` without.

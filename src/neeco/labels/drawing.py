@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -21,9 +20,7 @@ from neeco.labels.labellers import Labeller, composited_labels, instruments_of, 
 from neeco.labels.settings import LABELS
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians, Layer, Rendering
-
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene, GaussianScene
+from neeco.scene import DrawableScene, GaussianScene
 
 NEIGHBOURS = np.ones((3, 3), np.uint8)  # 8-neighbourhood: with 4, the band of a slanted border is thinner than a pixel
 

@@ -8,8 +8,7 @@ instrument, without parts and occlusion.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -21,12 +20,13 @@ from neeco.geometry.camera import Camera
 from neeco.labels.settings import LABELS
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians, Rendering
+from neeco.scene import DrawableScene, GaussianScene
 from neeco.scene.deformation import otsu
 
-if TYPE_CHECKING:
-    from neeco.scene import DrawableScene, GaussianScene
-
 DELTAS = ("means", "quats", "scales")
+# by DELTAS, magnitude above which a Gaussian counts as moved: position (mm), rotation (quaternion), scale (mm); None:
+# this kind of delta is the same for all Gaussians
+Thresholds = dict[str, float | None]
 
 
 def threshold_of(scene: DrawableScene) -> float:
@@ -107,28 +107,11 @@ class CompositedLabels:
         return rendering, *composited_labels(labels, self.threshold)
 
 
-@dataclass(frozen=True)
-class DeltaThresholds:
-    """Magnitudes above which a Gaussian counts as moved: position (mm), rotation (quaternion), scale (mm).
-
-    None for a kind of delta that is the same for all Gaussians.
-    """
-
-    means: float | None
-    quats: float | None
-    scales: float | None
-
-    def moved(self, magnitudes: dict[str, Tensor]) -> Tensor:
-        """Return [N] bool: which Gaussians exceed all thresholds that are set."""
-        tests = [magnitudes[kind] > limit for kind, limit in vars(self).items() if limit is not None]
-        return torch.stack(tests).all(dim=0)
-
-
 class ThresholdLabels:
     """The paper's labels: Gaussians whose deltas exceed thresholds are rendered alone on black, and all other than
     black pixels are the mask. The paper has one instrument; of several, the nearest owns a moved Gaussian."""
 
-    def __init__(self, scene: GaussianScene, thresholds: DeltaThresholds | None = None) -> None:
+    def __init__(self, scene: GaussianScene, thresholds: Thresholds | None = None) -> None:
         instruments = tuple(instrument.name for instrument in scene.instruments)
         if not instruments:
             raise NeecoError("scene: --labels threshold needs a scene with instruments; this one was trained without")
@@ -138,7 +121,9 @@ class ThresholdLabels:
 
     def owners(self, state: State, posed: Gaussians) -> Tensor:
         """Return [N] int64: index in `names` of the instrument nearest to a Gaussian that moved, -1 for others."""
-        moved = self.thresholds.moved(delta_magnitudes(self.scene, state))
+        magnitudes = delta_magnitudes(self.scene, state)
+        tests = [magnitudes[kind] > limit for kind, limit in self.thresholds.items() if limit is not None]
+        moved = torch.stack(tests).all(dim=0)  # which Gaussians exceed all thresholds that are set
         means = posed.means
         origins = torch.stack(
             [
@@ -180,7 +165,7 @@ def delta_magnitudes(scene: GaussianScene, state: State) -> dict[str, Tensor]:
     return {kind: getattr(deltas, kind).norm(dim=1) for kind in DELTAS}
 
 
-def find_thresholds(scene: GaussianScene) -> DeltaThresholds:
+def find_thresholds(scene: GaussianScene) -> Thresholds:
     """Return thresholds by Otsu's method on the deltas' log-magnitude over recorded states (open in the paper).
 
     Raises NeecoError when no kind of delta separates Gaussians, as in a scene in which nothing moves.
@@ -196,7 +181,7 @@ def find_thresholds(scene: GaussianScene) -> DeltaThresholds:
         raise NeecoError(
             f"scene: method {scene.method!r} moves nothing with the state; --labels threshold needs deltas"
         )
-    return DeltaThresholds(**limits)
+    return limits
 
 
 def otsu_of_magnitudes(magnitudes: Tensor) -> float | None:

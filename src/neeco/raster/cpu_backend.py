@@ -47,12 +47,6 @@ def _alone(drawing: Any, sets: Sequence[Tensor], alpha: Tensor, depth: Tensor) -
     return layers
 
 
-def last_statistics() -> dict[str, float]:
-    """Return stage times in ms, visible Gaussians and (tile, Gaussian) pairs of the latest rendering and its
-    gradient."""
-    return native().last_statistics()
-
-
 def _prepared(tensor: Tensor) -> Tensor:
     if tensor.device.type != "cpu":
         raise NeecoError(f"backend: cpu: tensors are on {tensor.device}; move them or use backend='triton'")

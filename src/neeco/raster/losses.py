@@ -34,7 +34,10 @@ def photometric_loss(image: Tensor, target: Tensor, mask: Tensor | None = None, 
     if not native_kernel and not runs_triton(image):
         return photometric_loss_reference(image, target.detach(), mask, ssim_weight)
     _check(image, target, mask)
-    kernel = _by_native if native_kernel else _by_triton
+    if native_kernel:
+        kernel: Kernel = _by_native
+    else:
+        from neeco.raster.triton.photometric import photometric as kernel
     return _Photometric.apply(image, target, mask, ssim_weight, kernel)
 
 
@@ -74,7 +77,8 @@ class _Photometric(torch.autograd.Function):
         ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, kernel: Kernel
     ) -> Tensor:
         plain, observed = image.detach().contiguous(), target.detach().to(torch.float32).contiguous()
-        loss, gradient = kernel(plain, observed, mask, ssim_weight, ctx.needs_input_grad[0])
+        counted = None if mask is None else mask.contiguous()
+        loss, gradient = kernel(plain, observed, counted, ssim_weight, ctx.needs_input_grad[0])
         if gradient is not None:
             ctx.save_for_backward(gradient)
         return loss
@@ -96,14 +100,6 @@ def _by_native(
     counts = None if mask is None else mask.to(torch.float32).contiguous()
     loss = native().photometric(image, target, counts, ssim_weight, pixels, gradient)
     return torch.tensor(loss, dtype=image.dtype), gradient
-
-
-def _by_triton(
-    image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, wanted: bool
-) -> tuple[Tensor, Tensor | None]:
-    from neeco.raster.triton.photometric import photometric
-
-    return photometric(image, target, None if mask is None else mask.contiguous(), ssim_weight, wanted)
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:

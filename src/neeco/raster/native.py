@@ -30,7 +30,7 @@ def kernels(family: Family) -> Iterator[None]:
     """Select the `family` of kernels that this thread uses for CPU tensors within the block.
 
     "native": neeco's own, the default; "torch": plain torch, which works on every device and is slow. Applies to
-    `rasterize(backend="auto")`, `photometric_loss` and `adam_step`. Raises NeecoError for another family.
+    `rasterize(backend="auto")`, `photometric_loss` and `adam_steps`. Raises NeecoError for another family.
     """
     if family not in get_args(Family):
         raise NeecoError(f"kernels: {family!r}: unknown; use one of {', '.join(get_args(Family))}")

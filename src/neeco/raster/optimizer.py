@@ -32,22 +32,6 @@ class Update:
     step: int  # counts from 1
 
 
-def adam_step(
-    param: Tensor,
-    grad: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    *,
-    lr: float,
-    step: int,
-    betas: tuple[float, float] = BETAS,
-    eps: float = EPS,
-) -> None:
-    """Apply one step of Adam (Kingma and Ba 2015), in place, without autograd: `adam_steps` for one tensor, whose
-    gradient may have another float type."""
-    adam_steps([Update(param, grad.detach().to(param.dtype), exp_avg, exp_avg_sq, lr, step)], betas, eps)
-
-
 @torch.no_grad()
 def adam_steps(updates: Sequence[Update], betas: tuple[float, float] = BETAS, eps: float = EPS) -> None:
     """Apply a step of Adam to each of several tensors, in place, without autograd.
@@ -70,30 +54,17 @@ def adam_steps(updates: Sequence[Update], betas: tuple[float, float] = BETAS, ep
                 raise NeecoError(f"adam_step: {name}: must be contiguous")
         if by_triton:
             together.append(update)
-        else:
-            _step_native(update, betas, eps)
+        else:  # as arrays of NumPy, which reach the kernel in a third of the time
+            tensors = (update.parameter.detach(), update.gradient.contiguous(), update.exp_avg, update.exp_avg_sq)
+            native().adam(*(tensor.numpy() for tensor in tensors), update.lr, update.step, *betas, eps)
     if together:
         from neeco.raster.triton.photometric import step_together
 
-        tensors = [(u.parameter, u.gradient.contiguous(), u.exp_avg, u.exp_avg_sq) for u in together]
-        step_together(tensors, [(u.lr, u.step) for u in together], betas, eps)
+        groups = [(u.parameter, u.gradient.contiguous(), u.exp_avg, u.exp_avg_sq) for u in together]
+        step_together(groups, [(u.lr, u.step) for u in together], betas, eps)
     # the counter by which autograd detects in-place changes; kernels do not increment it
     for update in updates:
         torch.autograd.graph.increment_version(update.parameter)
-
-
-def _step_native(update: Update, betas: tuple[float, float], eps: float) -> None:
-    # as arrays of NumPy, which reach the kernel in a third of the time
-    native().adam(
-        update.parameter.detach().numpy(),
-        update.gradient.contiguous().numpy(),
-        update.exp_avg.numpy(),
-        update.exp_avg_sq.numpy(),
-        update.lr,
-        update.step,
-        *betas,
-        eps,
-    )
 
 
 @torch.no_grad()

@@ -70,7 +70,17 @@ def rasterize(
         from neeco.raster.cpu_backend import rasterize_cpu
 
         return rasterize_cpu(gaussians, camera, channels, background, alone)
-    rendering = _rasterize_by(backend, gaussians, camera, channels, background)
+    if backend == "reference":  # this and triton share no work between a rendering and its layers
+        from neeco.raster.reference import rasterize_reference
+
+        rendering = rasterize_reference(gaussians, camera, channels, background)
+    elif backend == "triton":
+        require_triton(gaussians.means.device)
+        from neeco.raster.triton_backend import rasterize_triton
+
+        rendering = rasterize_triton(gaussians, camera, channels, background)
+    else:
+        raise NeecoError(f"backend: {backend!r}: unknown; use one of {', '.join(BACKENDS)}")
     return replace(rendering, alone=tuple(_alone(gaussians.select(chosen), camera, backend) for chosen in alone))
 
 
@@ -81,22 +91,6 @@ def depth_maps(gaussians: Gaussians, cameras: Sequence[Camera], backend: str = "
     backend: as `rasterize` takes it.
     """
     return tuple(_alone(gaussians, camera, backend) for camera in cameras)
-
-
-def _rasterize_by(
-    backend: str, gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
-) -> Rendering:
-    """`rasterize` by one of the backends that share no work between a rendering and its layers."""
-    if backend == "reference":
-        from neeco.raster.reference import rasterize_reference
-
-        return rasterize_reference(gaussians, camera, channels, background)
-    if backend == "triton":
-        require_triton(gaussians.means.device)
-        from neeco.raster.triton_backend import rasterize_triton
-
-        return rasterize_triton(gaussians, camera, channels, background)
-    raise NeecoError(f"backend: {backend!r}: unknown; use one of {', '.join(BACKENDS)}")
 
 
 @torch.no_grad()

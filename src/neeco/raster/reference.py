@@ -42,7 +42,11 @@ def rasterize_reference(
     usable = usable_gaussians(gaussians, camera, channels)
     gaussians, channels = _hide(gaussians, channels, ~usable, camera)
     camera_means = gaussians.means @ rotation.T + translation
-    values = torch.cat([_colors(gaussians, camera, camera_means), camera_means[:, 2:]], dim=-1)
+    centre = camera.world_from_camera[:3, 3].to(gaussians.means)
+    colors = sh_colors(gaussians.sh, gaussians.means, centre, gaussians.sh_frames).clamp(min=0)
+    if gaussians.headlight is not None:
+        colors = colors * headlight_factor(gaussians.headlight, camera, camera_means)[:, None]
+    values = torch.cat([colors, camera_means[:, 2:]], dim=-1)
     if channels is not None:
         values = torch.cat([values, channels], dim=-1)
 
@@ -56,7 +60,10 @@ def rasterize_reference(
         color = color + (1 - alpha)[..., None] * background
     covered = alpha > 0
     depth = torch.where(covered, images[..., 3] / torch.where(covered, alpha, torch.ones_like(alpha)), 0.0)
-    radii = _radii(projection, gaussians.opacities, camera)
+    with torch.no_grad():  # 3 standard deviations along the longer axis, px; 0 for Gaussians below 1/255 at every pixel
+        largest = torch.linalg.eigvalsh(projection.covariances)[:, -1]
+        touching = (alphas_at_pixels(projection, gaussians.opacities, camera) >= MIN_ALPHA).any(dim=0)
+        radii = torch.where(touching, 3 * largest.sqrt(), 0.0)
     return Rendering(color, alpha, depth, None if channels is None else images[..., 4:], radii, offsets)
 
 
@@ -121,14 +128,6 @@ def blend_weights(projection: Projection, opacities: Tensor, order: Tensor, came
     return alphas * before
 
 
-def _colors(gaussians: Gaussians, camera: Camera, camera_means: Tensor) -> Tensor:
-    centre = camera.world_from_camera[:3, 3].to(gaussians.means)
-    colors = sh_colors(gaussians.sh, gaussians.means, centre, gaussians.sh_frames).clamp(min=0)
-    if gaussians.headlight is not None:
-        colors = colors * headlight_factor(gaussians.headlight, camera, camera_means)[:, None]
-    return colors
-
-
 def usable_gaussians(gaussians: Gaussians, camera: Camera, channels: Tensor | None) -> Tensor:
     """Return the Gaussians in front of the camera with finite parameters and non-zero quaternions, [N] bool."""
     n = len(gaussians)
@@ -167,14 +166,6 @@ def _hide(
         headlight=light,
     )
     return visible, None if channels is None else but(channels, 0.0)
-
-
-@torch.no_grad()
-def _radii(projection: Projection, opacities: Tensor, camera: Camera) -> Tensor:
-    """Return 3 standard deviations along the longer axis, px; 0 for Gaussians below 1/255 at every pixel."""
-    largest = torch.linalg.eigvalsh(projection.covariances)[:, -1]
-    touching = (alphas_at_pixels(projection, opacities, camera) >= MIN_ALPHA).any(dim=0)
-    return torch.where(touching, 3 * largest.sqrt(), 0.0)
 
 
 SH_C0 = 0.28209479177387814  # the constant harmonic

@@ -37,7 +37,7 @@ def draw_through(camera: Camera, draw: Draw) -> Rendering:
     fine = of_rendered_size(camera)
     source = field_pinhole(fine)
     rendering = draw(source)
-    if camera.is_pinhole and _size(fine) == _size(camera):
+    if camera.is_pinhole and (fine.width, fine.height) == (camera.width, camera.height):
         return rendering
     layers = Layer(rendering.alpha, rendering.depth), *rendering.alone
     planes = [
@@ -92,12 +92,8 @@ def widened(gaussians: Gaussians, camera: Camera) -> Gaussians:
 def of_learned_size(camera: Camera) -> Camera:
     """Return the camera with approximately the learned number of pixels, to be rendered directly."""
     scale = learned_scale(camera)
-    resized = camera.resized(*(max(1, round(size / scale)) for size in _size(camera)))
+    resized = camera.resized(*(max(1, round(size / scale)) for size in (camera.width, camera.height)))
     return replace(resized, learned_fx=None)
-
-
-def _size(camera: Camera) -> tuple[int, int]:
-    return camera.width, camera.height
 
 
 def resampled(image: Tensor, source: Camera, fine: Camera, camera: Camera) -> Tensor:
@@ -108,9 +104,10 @@ def resampled(image: Tensor, source: Camera, fine: Camera, camera: Camera) -> Te
         grid = _sampling_grid(replace(fine, world_from_camera=ORIGIN), pinhole)
         planes = grid_sample(image.permute(2, 0, 1)[None], grid.to(image), align_corners=False)
         image = planes[0].permute(1, 2, 0).contiguous()
-    if _size(fine) == _size(camera):
+    sizes = (fine.width, fine.height), (camera.width, camera.height)
+    if sizes[0] == sizes[1]:
         return image
-    pixels, shares = (table.to(image.device) for table in _covered_pixels(_size(fine), _size(camera)))
+    pixels, shares = (table.to(image.device) for table in _covered_pixels(*sizes))
     reduced = embedding_bag(pixels, image.flatten(0, 1), per_sample_weights=shares.to(image), mode="sum")
     return reduced.view(camera.height, camera.width, -1)
 

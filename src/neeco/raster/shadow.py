@@ -55,7 +55,11 @@ def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw, casters: Gaussian
         return gaussians
     left = None if light.shadow is None else _left_by(light.shadow, gaussians, camera, draw, casters)
     if camera.world_from_lamps is not None:
-        relative = _relative_to_camera(light.falloff, gaussians.means, camera, camera.world_from_lamps)
+        # brightness [N] of the headlight at lamps elsewhere, relative to one at the camera
+        poses, means = (camera.world_from_camera, camera.world_from_lamps), gaussians.means.detach()
+        distances = ((means - pose[:3, 3].detach().to(means)).norm(dim=1) for pose in poses)
+        at_camera, at_lamps = (distance.clamp_min(SHADOWS.min_distance).log() for distance in distances)
+        relative = torch.exp(light.falloff * (at_camera - at_lamps))
         left = relative if left is None else left * relative
     return gaussians if left is None else replace(gaussians, headlight=replace(light, shadow=None, left=left))
 
@@ -71,14 +75,6 @@ def _left_by(
         return None
     shares = blocked(Casting.of(gaussians, casters, camera, others), shadow.width, shadow.offsets, draw, shines)
     return (1 - shadow.strengths @ shares).clamp_min(SHADOWS.min_light) ** (1 / GAMMA)
-
-
-def _relative_to_camera(falloff: Tensor, means: Tensor, camera: Camera, world_from_lamps: Tensor) -> Tensor:
-    """Return the brightness [N] of the headlight at lamps elsewhere, relative to one at the camera."""
-    places = (pose[:3, 3].detach().to(means) for pose in (camera.world_from_camera, world_from_lamps))
-    distances = ((means.detach() - place).norm(dim=1) for place in places)
-    at_camera, at_lamps = (distance.clamp_min(SHADOWS.min_distance).log() for distance in distances)
-    return torch.exp(falloff * (at_camera - at_lamps))
 
 
 @dataclass(frozen=True)

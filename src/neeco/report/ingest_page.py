@@ -25,7 +25,7 @@ from neeco.capture import read_capture
 from neeco.capture.checks import inspect_capture
 from neeco.capture.documents import Problem, errors_only
 from neeco.capture.model import Capture, Frame, evenly_spaced
-from neeco.evaluation.image_metrics import outline
+from neeco.evaluation.image_metrics import outline, to_uint8
 from neeco.geometry.camera import Camera
 from neeco.geometry.projection import project_world
 from neeco.ingest.foreground.rough_shape import RoughShape
@@ -35,6 +35,7 @@ from neeco.ingest.recording.model import Recording
 from neeco.ingest.result import VERDICTS, Assessment, IngestResult, assess_ingest, clock_cost_mm, rms
 from neeco.report.page import (
     MAX_WIDTH,
+    PAGES,
     PALETTE,
     inline_svg,
     jpeg,
@@ -42,7 +43,6 @@ from neeco.report.page import (
     page_style,
     round_ticks,
     split_counts,
-    to_bytes,
     write_page,
 )
 
@@ -50,21 +50,6 @@ AXIS_COLORS = ("#ff5252", "#4cd964", "#4aa8ff")  # x, y, z
 OUTLINE_COLOR = "#ffe14a"
 ORIGIN = np.zeros((1, 3))
 SPLIT_COLORS = {"train": "accent", "test": "good", "unseen": "phase"}
-
-
-@dataclass(frozen=True)
-class FigureSettings:
-    """Sizes of overlays and charts."""
-
-    samples: int = 12  # number of frames shown
-    min_depth_mm: float = 1.0  # minimum depth in mm of points that are drawn
-    axis_share: float = 0.16  # length of the frame axes as a share of the image's width
-    shaft_diameters: float = 30.0  # drawn length of a shaft from video, in diameters
-    bins: int = 24  # bins of a histogram
-    constant: float = 1e-6  # maximum range in mm or deg of a constant value
-
-
-SETTINGS = FigureSettings()
 
 
 def in_view(capture: Capture, name: str) -> float:
@@ -76,7 +61,7 @@ def in_view(capture: Capture, name: str) -> float:
 def shows(frame: Frame, pose: Tensor) -> bool:
     """Return whether the origin of an instrument at `pose`, world_from_instrument [4, 4], lies inside the image."""
     ((x, y),), (depth,) = _project(ORIGIN, pose, frame.camera)
-    return bool(depth > SETTINGS.min_depth_mm and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
+    return bool(depth > PAGES.min_depth_mm and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
 
 
 def posed_picture(
@@ -96,13 +81,13 @@ def posed_picture(
     fx, fy, cx, cy = (scale * value for value in (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy))
     size = (2 * MAX_WIDTH, round(frame.camera.height * scale))
     camera = Camera(frame.camera.world_from_camera, fx, fy, cx, cy, *size)
-    image = Image.fromarray(to_bytes(frame.load_image().numpy())).resize(size, Image.Resampling.BICUBIC)
+    image = Image.fromarray(to_uint8(frame.load_image().numpy() * 255)).resize(size, Image.Resampling.BICUBIC)
     for name, pose in poses.items():
         if name in shapes:  # the outline of the shape's points, each as large as its grid cell
             mask = Image.new("L", image.size)
             painter = ImageDraw.Draw(mask)
             for (x, y), z in zip(*_project(shapes[name].points, pose, camera), strict=True):
-                radius = 0.75 * shapes[name].spacing * camera.fx / z if z > SETTINGS.min_depth_mm else 0.0
+                radius = 0.75 * shapes[name].spacing * camera.fx / z if z > PAGES.min_depth_mm else 0.0
                 if radius and -radius < x < image.width + radius and -radius < y < image.height + radius:
                     painter.ellipse((x - radius, y - radius, x + radius, y + radius), fill=255)
             edge = Image.fromarray(outline(np.asarray(mask) > 0).astype(np.uint8) * 255)
@@ -111,23 +96,23 @@ def posed_picture(
         if name in shafts:  # its two contours, and its end
             diameter = shafts[name]
             z_axis = np.array([0.0, 0.0, 1.0])
-            along = np.linspace(-SETTINGS.shaft_diameters, 0, 61)[:, None] * diameter * z_axis  # [61, 3]
+            along = np.linspace(-PAGES.shaft_diameters, 0, 61)[:, None] * diameter * z_axis  # [61, 3]
             centre = np.linalg.inv(pose.numpy()) @ camera.world_from_camera.double().numpy()[:, 3]  # [4] mm
             aside = np.cross(centre[:3] - along, z_axis)
             aside *= diameter / 2 / np.linalg.norm(aside, axis=1, keepdims=True)
             lines = [
-                [tuple(place) for place, z in zip(places, depths, strict=True) if z > SETTINGS.min_depth_mm]
+                [tuple(place) for place, z in zip(places, depths, strict=True) if z > PAGES.min_depth_mm]
                 for places, depths in (_project(along + side * aside, pose, camera) for side in (-1, 1))
             ]
             for line in (*lines, [line[-1] for line in lines if line]):
                 if len(line) > 1:
                     painter.line(line, fill=OUTLINE_COLOR, width=4)
         pixels, depth = _project(np.concatenate([ORIGIN, length * np.eye(3)]), pose, camera)
-        if depth[0] > SETTINGS.min_depth_mm:  # its frame
+        if depth[0] > PAGES.min_depth_mm:  # its frame
             x, y = start = tuple(pixels[0])
             for width, colors in ((10, ("#000000",) * 3), (6, AXIS_COLORS)):
                 for end, z, color in zip(pixels[1:], depth[1:], colors, strict=True):
-                    if z > SETTINGS.min_depth_mm:
+                    if z > PAGES.min_depth_mm:
                         painter.line([start, tuple(end)], fill=color, width=width)
             painter.ellipse((x - 7, y - 7, x + 7, y + 7), fill="#ffffff", outline="#000000", width=2)
     return jpeg(np.asarray(image))
@@ -137,7 +122,7 @@ def _project(points: np.ndarray, pose: Tensor, camera: Camera) -> tuple[np.ndarr
     """Return px [N, 2] (undefined behind the camera) and depth [N] of points [N, 3] of an instrument at `pose`."""
     world_from_instrument = pose.numpy()
     world = points @ world_from_instrument[:3, :3].T + world_from_instrument[:3, 3]
-    return project_world(world, camera, nearest=SETTINGS.min_depth_mm)
+    return project_world(world, camera, nearest=PAGES.min_depth_mm)
 
 
 def round_length(limit: float) -> float:
@@ -203,7 +188,7 @@ def unvisited(degrees: Sequence[Degree]) -> list[str]:
     for degree in degrees:
         name = f"{degree.instrument} {degree.name}" if several else degree.name
         values = np.sort(degree.of("train"))
-        if len(values) < 2 or np.ptp(values) < SETTINGS.constant:
+        if len(values) < 2 or np.ptp(values) < PAGES.constant:
             continue
         steps = np.diff(values)
         sentences += [
@@ -223,7 +208,7 @@ def histogram(degree: Degree) -> str:
     axes = new_axes((340, 150), 12, 12, 28, 22)
     axes.set_title(f"{degree.name}, {degree.unit}")
     axes.set_yticks([])
-    if high - low < SETTINGS.constant:
+    if high - low < PAGES.constant:
         axes.text(0, 0.5, f"always {_number(low)}", transform=axes.transAxes)
         axes.set_xticks([])
         return inline_svg(axes, label)
@@ -233,7 +218,7 @@ def histogram(degree: Degree) -> str:
     for start, end in [(left, right)] if trained is None else [(left, trained[0]), (trained[1], right)]:
         if end - start > 0.0125 * (right - left):  # thinner ones would look like lines
             axes.axvspan(start, end, color=PALETTE["phase"], alpha=0.13, linewidth=0, gid="beyond")
-    edges, floor = np.linspace(low, high, SETTINGS.bins + 1), np.zeros(SETTINGS.bins)
+    edges, floor = np.linspace(low, high, PAGES.bins + 1), np.zeros(PAGES.bins)
     for name in sorted(set(degree.splits), key=lambda name: [*SPLIT_COLORS, name].index(name)):
         top = floor + np.histogram(degree.of(name), edges)[0]
         axes.stairs(top, edges, baseline=floor, fill=True, color=PALETTE[SPLIT_COLORS.get(name, "soft")])
@@ -281,8 +266,7 @@ class Ingested:
         """Return numbers and the verdict for scripts."""
         if self.result is None or self.assessment is None:
             return {}
-        numbers: dict[str, Any] = finite(self.result.as_json() | self.assessment.as_json())
-        return numbers
+        return finite(self.result.as_json() | self.assessment.as_json())
 
     def lines(self) -> list[str]:
         """Return results, paths and the verdict, for a terminal."""
@@ -355,8 +339,8 @@ def write_ingest_page(result: IngestResult, verdict: Assessment, path: Path, cap
     write_page(
         path,
         "ingest.html",
-        title=f"{result.capture.name}: ingest",
-        name=result.capture.name,
+        result.capture.name,
+        "ingest",
         subtitle=f"from {result.recording}",
         stamps=[result.capture],
         result=result,
@@ -380,8 +364,8 @@ def _frames(result: IngestResult, capture: Capture) -> dict[str, Any]:
     for frame in capture.frames:
         for state in frame.state.instruments.values():
             _, (depth,) = _project(ORIGIN, state.pose, frame.camera)
-            if depth > SETTINGS.min_depth_mm:
-                sizes.append(SETTINGS.axis_share * frame.camera.width / frame.camera.fx * depth)
+            if depth > PAGES.min_depth_mm:
+                sizes.append(PAGES.axis_share * frame.camera.width / frame.camera.fx * depth)
     length = round_length(float(np.median(sizes)) if sizes else 10.0)
     rows = {time: row for row, time in enumerate(np.round(result.selected_times, 6).tolist())}
     start = min(frame.state.time for frame in capture.frames)
@@ -389,7 +373,7 @@ def _frames(result: IngestResult, capture: Capture) -> dict[str, Any]:
     in_video = {item.name: item.from_video for item in capture.instruments}
     shafts = {name: video.shaft_diameter_mm for name, video in in_video.items() if video is not None}
     ordered = sorted(capture.frames, key=lambda frame: frame.state.time)
-    for frame in (ordered[index] for index in evenly_spaced(len(ordered), SETTINGS.samples)):
+    for frame in (ordered[index] for index in evenly_spaced(len(ordered), PAGES.samples)):
         row = rows.get(round(frame.state.time, 6))
         poses = {name: state.pose for name, state in frame.state.instruments.items() if capture.registered}
         before = {}  # world_from_instrument by the trackers alone

@@ -31,25 +31,40 @@ from torch import Tensor
 import neeco
 from neeco.base.files import write_text
 from neeco.capture.model import Capture
-from neeco.evaluation.image_metrics import difference_map, to_uint8
+from neeco.evaluation.image_metrics import difference_map
 from neeco.studies.configurations import ResultTable
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChartSettings:
-    """Sizes and lines of charts."""
+class PageSettings:
+    """Sizes and colours of charts and figures, and how much a page shows."""
 
-    size: tuple[int, int] = (460, 270)  # view box units; the page scales them
+    size: tuple[int, int] = (460, 270)  # view box units of a chart; the page scales them
     small: tuple[int, int] = (420, 190)  # the same, of a chart among others
     colors: int = 7
     # of lines, to distinguish them in grey print
     dashes: tuple[tuple[int, ...], ...] = ((), (7, 3), (2, 3), (10, 3, 2, 3), (14, 4), (5, 2, 1, 2, 1, 2), (1, 2, 6, 2))
+    # pages of a run
+    max_points: int = 300  # limit on the points of a training curve
+    max_frames: int = 60  # maximum number of frames, which limits the page's size
+    spread: int = 24  # number of frames spread over tracked footage
+    least_trusted: int = 12  # number of frames of least trust
+    band: float = 2.0  # half width of the bands of tracked joints in standard deviations
+    # colours of the instruments' outlines
+    outlines: tuple[tuple[int, int, int], ...] = ((255, 230, 0), (0, 230, 255), (255, 90, 200), (120, 255, 80))
+    # page of an ingest
+    samples: int = 12  # number of frames shown
+    min_depth_mm: float = 1.0  # minimum depth in mm of points that are drawn
+    axis_share: float = 0.16  # length of the frame axes as a share of the image's width
+    shaft_diameters: float = 30.0  # drawn length of a shaft from video, in diameters
+    bins: int = 24  # bins of a histogram
+    constant: float = 1e-6  # maximum range in mm or deg of a constant value
 
 
-CHARTS = ChartSettings()
+PAGES = PageSettings()
 MARKS = ("o", "s", "^", "x", "D", "+", "v")
 
-VARIABLES = ("ink", "soft", "edge", "accent", "phase", "good", "bad", *(f"m{order}" for order in range(CHARTS.colors)))
+VARIABLES = ("ink", "soft", "edge", "accent", "phase", "good", "bad", *(f"m{order}" for order in range(PAGES.colors)))
 PALETTE = {name: f"#0101{index:02x}" for index, name in enumerate(VARIABLES)}  # placeholders of CSS variables
 STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
@@ -140,7 +155,7 @@ def line_chart(
     note: str = "",
     logarithmic: bool = False,
     over_logarithmic: bool = False,
-    size: tuple[int, int] = CHARTS.size,
+    size: tuple[int, int] = PAGES.size,
 ) -> str:
     """Return lines and marks over a shared x axis as inline SVG; "" if no series has two points.
 
@@ -164,7 +179,7 @@ def line_chart(
         for line in item.faint:
             _draw_line(axes, item.order, line, linewidth=0.7, alpha=0.55)
     for item in series:  # above all faint elements
-        _draw_line(axes, item.order, item.main, linewidth=2, dashes=CHARTS.dashes[item.order % len(CHARTS.dashes)])
+        _draw_line(axes, item.order, item.main, linewidth=2, dashes=PAGES.dashes[item.order % len(PAGES.dashes)])
     for order, value in levels:
         axes.axhline(value, color=_color(order), linewidth=1.1, dashes=(4, 4), gid="level")
     if over_logarithmic:
@@ -214,7 +229,7 @@ def legend(names: Sequence[str], used: Sequence[str]) -> list[tuple[str, Markup]
         if name in used:
             axes = new_axes((46, 14), 0, 0, 0, 0)
             axes.set_axis_off()
-            _draw_line(axes, order, ((1, 7), (45, 7)), linewidth=2, dashes=CHARTS.dashes[order % len(CHARTS.dashes)])
+            _draw_line(axes, order, ((1, 7), (45, 7)), linewidth=2, dashes=PAGES.dashes[order % len(PAGES.dashes)])
             axes.plot(23, 7, **_mark(order))
             axes.set(xlim=(0, 46), ylim=(0, 14))
             entries.append((name, inline_svg(axes, f"line of {name}")))
@@ -236,7 +251,7 @@ def short(value: float) -> str:
 
 def _color(order: int) -> str:
     """Return a method's colour, as in the style sheet."""
-    return PALETTE[f"m{order % CHARTS.colors}"]
+    return PALETTE[f"m{order % PAGES.colors}"]
 
 
 def _mark(order: int, size: float = 6.4) -> dict[str, Any]:
@@ -306,25 +321,20 @@ class Section:
     facts: Sequence[tuple[str, str]] = ()
 
 
-def write_page(path: Path, template: str, **data: Any) -> Path:
-    """Write one self-contained page and return `path`.
+def write_page(path: Path, template: str, name: str, topic: str, **data: Any) -> Path:
+    """Write one self-contained page on the `topic` of a capture called `name`, and return `path`.
 
-    Every page has `title` and for its header `name`, `subtitle` and `stamps`: facts shown with time and version.
+    Every page has for its header `subtitle` and `stamps`: facts shown with time and version.
     """
+    data |= {"name": name, "title": f"{name}: {topic}", "made_at": f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"}
     page = TEMPLATES.get_template(template)
-    made_at = f"{now():%Y-%m-%d %H:%M %Z}"
-    write_text(path, page.render({"made_at": made_at, "version": neeco.__version__, "stamps": [], **data}) + "\n")
+    write_text(path, page.render({"version": neeco.__version__, **data}) + "\n")
     return path
 
 
 def split_counts(capture: Capture) -> str:
     """Return the number of frames per split, as `40 train, 5 test`."""
     return ", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits)
-
-
-def now() -> datetime:
-    """Return the time stated on a page."""
-    return datetime.now().astimezone()
 
 
 def difference(image: np.ndarray, recorded: np.ndarray, counted: Tensor | None) -> str:
@@ -345,8 +355,3 @@ def _data_uri(image: Image.Image, form: str, **options: Any) -> str:
     stream = io.BytesIO()
     image.save(stream, form, **options)
     return f"data:image/{form.lower()};base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
-
-
-def to_bytes(image: np.ndarray) -> np.ndarray:
-    """Convert an image in [0, 1] to uint8 [H, W, 3]."""
-    return to_uint8(image * 255)

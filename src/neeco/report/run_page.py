@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -18,12 +18,12 @@ from PIL import Image, ImageDraw
 
 from neeco.base.files import read_bytes
 from neeco.capture.model import Capture, Frame, State, evenly_spaced
-from neeco.evaluation.image_metrics import COMPARISON, overlay_outline, overlay_parts, part_color
+from neeco.evaluation.image_metrics import COMPARISON, overlay_outline, overlay_parts, part_color, to_uint8
 from neeco.evaluation.masks import load_reference
 from neeco.geometry.camera import Camera
 from neeco.labels.drawing import draw
 from neeco.report.page import (
-    CHARTS,
+    PAGES,
     REPORT_FILE,
     Series,
     difference,
@@ -31,28 +31,11 @@ from neeco.report.page import (
     line_chart,
     short,
     split_counts,
-    to_bytes,
     write_page,
 )
 from neeco.scene import DrawableScene
 from neeco.studies.configurations import UNKNOWN
 from neeco.tracking.track import Tracked, state_of
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunPageSettings:
-    """Sizes and colours of a run's pages."""
-
-    max_points: int = 300  # limit on the points of a training curve
-    max_frames: int = 60  # maximum number of frames, which limits the page's size
-    spread: int = 24  # number of frames spread over tracked footage
-    least_trusted: int = 12  # number of frames of least trust
-    band: float = 2.0  # half width of the bands of tracked joints in standard deviations
-    # colours of the instruments' outlines
-    outlines: tuple[tuple[int, int, int], ...] = ((255, 230, 0), (0, 230, 255), (255, 90, 200), (120, 255, 80))
-
-
-SETTINGS = RunPageSettings()
 
 
 class Score(NamedTuple):
@@ -130,11 +113,18 @@ def write_report(
         ]
         tables += [(columns, groups)] if columns else []
     config = run_path / "config.yaml"
+    facts = [("capture", str(capture.root)), ("frames", split_counts(capture)), ("method", scene.method)]
+    if rows:
+        facts.append(("iterations", f"{rows[-1]['iteration']:,}"))
+        if isinstance(rows[-1].get("seconds"), int | float):
+            facts.append(("training time", f"{rows[-1]['seconds'] / 60:.1f} min"))
+    several = len({instrument for instrument, _ in scene.label_names}) > 1
+    parts = [f"{instrument} {part}" if several else part for instrument, part in scene.label_names]
     return write_page(
         run_path / REPORT_FILE,
         "run.html",
-        title=f"{capture.root.name}: {scene.method}",
-        name=capture.root.name,
+        capture.root.name,
+        scene.method,
         subtitle=f"learned by {scene.method}",
         stamps=[run_path],
         kind="A radiance field" if scene.num_gaussians is None else "A Gaussian-splatting model",
@@ -147,11 +137,11 @@ def write_report(
         figures=frame_figures(evaluation, capture, scene, kind),
         pose_kind=KIND_NAMES[kind],
         full_scale=COMPARISON.full_scale,
-        tints=_tints(scene),
+        tints=[(part_color(k), name.replace("_", " ")) for k, name in enumerate(parts, 1)],
         curves=[chart for chart in curves if chart],
         verdicts=_verdicts(getattr(scene, "diagnostics", {})),
         playable=playable,
-        facts=_facts(capture, scene, rows),
+        facts=facts,
         config=read_bytes(config, "settings").decode("utf-8", "replace") if config.is_file() else "",
     )
 
@@ -171,8 +161,8 @@ def frame_figures(
             drawing = draw(scene, *_poses(frame, row))
             recorded, image = frame.load_image().numpy(), drawing.image.numpy()
             pictures = [
-                ("recorded image", jpeg(to_bytes(recorded))),
-                ("rendered image", jpeg(to_bytes(image))),
+                ("recorded image", jpeg(to_uint8(recorded * 255))),
+                ("rendered image", jpeg(to_uint8(image * 255))),
                 ("difference of the two", difference(image, recorded, frame.load_mask())),
             ]
             if drawing.parts is not None:
@@ -237,13 +227,6 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
     return tiles
 
 
-def _tints(scene: DrawableScene) -> list[tuple[str, str]]:
-    """Return the colour and name of every part."""
-    several = len({instrument for instrument, _ in scene.label_names}) > 1
-    names = [f"{instrument} {part}" if several else part for instrument, part in scene.label_names]
-    return [(part_color(part), name.replace("_", " ")) for part, name in enumerate(names, 1)]
-
-
 def _verdicts(diagnostics: Mapping[str, Any]) -> list[str]:
     """Return all verdicts in the training diagnostics, as text."""
     return [
@@ -251,16 +234,6 @@ def _verdicts(diagnostics: Mapping[str, Any]) -> list[str]:
         for name, item in diagnostics.items()
         for verdict in (_verdicts(item) if isinstance(item, Mapping) else [str(item)] if name == "verdict" else [])
     ]
-
-
-def _facts(capture: Capture, scene: DrawableScene, rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    facts = [("capture", str(capture.root)), ("frames", split_counts(capture)), ("method", scene.method)]
-    if rows:
-        last = rows[-1]
-        facts.append(("iterations", f"{last['iteration']:,}"))
-        if isinstance(last.get("seconds"), int | float):
-            facts.append(("training time", f"{last['seconds'] / 60:.1f} min"))
-    return facts
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -285,17 +258,14 @@ def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: 
     if len(points) < 2:
         return ""
     # block means, to show the trend of a noisy curve
-    if (run := -(-len(points) // SETTINGS.max_points)) > 1:
+    if (run := -(-len(points) // PAGES.max_points)) > 1:
         groups = [points[start : start + run] for start in range(0, len(points), run)]
         points = [(group[-1][0], sum(y for _, y in group) / len(group)) for group in groups]
     series = [Series(0, tuple(points))]
     note = f"{short(points[-1][1])} at the end"
     changes = [after for before, after in pairwise(rows) if after.get("phase") not in (before.get("phase"), None)]
     starts = [(float(row["iteration"]), f"phase {row['phase']}") for row in changes]
-    return line_chart(title, "iterations", series, starts=starts, note=note, logarithmic=logarithmic, size=CHARTS.small)
-
-
-PAGE = "annotate.html"
+    return line_chart(title, "iterations", series, starts=starts, note=note, logarithmic=logarithmic, size=PAGES.small)
 
 
 def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], capture: Capture, min_trust: float) -> Path:
@@ -306,15 +276,15 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
     """
     ranked = sorted(range(len(records)), key=lambda k: records[k]["trust"]["value"])
     figures = []
-    for k in ranked[: SETTINGS.max_frames]:  # each with the contours of its labels, and its confidence
+    for k in ranked[: PAGES.max_frames]:  # each with the contours of its labels, and its confidence
         record, frame = records[k], capture.frames[k]
         trust, moved = record["trust"], record["moved"]
-        image = Image.fromarray(to_bytes(frame.load_image().numpy()))
+        image = Image.fromarray(to_uint8(frame.load_image().numpy() * 255))
         pen = ImageDraw.Draw(image)
         for number, label in enumerate(record["labels"]):
             for polygon in label.get("polygons", ()):
                 points = [tuple(point) for point in polygon]
-                color = SETTINGS.outlines[number % len(SETTINGS.outlines)]
+                color = PAGES.outlines[number % len(PAGES.outlines)]
                 pen.line([*points, points[0]], fill=color, width=1)
         figures.append(
             {
@@ -329,10 +299,10 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
         )
     written = sum(not record.get("skipped") for record in records)
     return write_page(
-        output / PAGE,
+        output / "annotate.html",
         "annotate.html",
-        title=f"{capture.root.name}: annotated",
-        name=capture.root.name,
+        capture.root.name,
+        "annotated",
         subtitle="recorded frames, labelled with a learned scene",
         stamps=[output],
         tiles=[
@@ -343,7 +313,7 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
         figures=figures,
         total=len(records),
         instruments=[
-            ("#{:02x}{:02x}{:02x}".format(*SETTINGS.outlines[k % len(SETTINGS.outlines)]), item.name)
+            ("#{:02x}{:02x}{:02x}".format(*PAGES.outlines[k % len(PAGES.outlines)]), item.name)
             for k, item in enumerate(capture.instruments)
         ],
     )
@@ -364,13 +334,13 @@ def write_track_page(tracked: Tracked) -> Path:
     records = tracked.records
     frames = sorted(tracked.footage.frames, key=lambda frame: frame.state.time)
     values = [record["trust"]["value"] for record in records]
-    least = sorted(range(len(records)), key=lambda k: values[k])[: SETTINGS.least_trusted]
+    least = sorted(range(len(records)), key=lambda k: values[k])[: PAGES.least_trusted]
     missing = sum(record["how"] == "lost" for record in records)
     return write_page(
         tracked.page,
         "track.html",
-        title=f"{tracked.footage.root.name}: tracked",
-        name=tracked.footage.root.name,
+        tracked.footage.root.name,
+        "tracked",
         subtitle="instruments tracked with a learned scene",
         stamps=[tracked.output],
         verdict=tracked.verdict,
@@ -381,7 +351,7 @@ def write_track_page(tracked: Tracked) -> Path:
             (str(sum(record["how"] in ("beside", "found") for record in records)), "re-detections"),
         ],
         charts=[chart for chart in _tracked_charts(tracked) if chart],
-        strip=[_tracked_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), SETTINGS.spread)],
+        strip=[_tracked_figure(tracked, frames[k], records[k]) for k in evenly_spaced(len(records), PAGES.spread)],
         least_trusted=[_tracked_figure(tracked, frames[k], records[k]) for k in least],
     )
 
@@ -393,8 +363,8 @@ def _tracked_charts(tracked: Tracked) -> list[str]:
     trust = Series(0, tuple(zip(times, (record["trust"]["value"] for record in records), strict=True)))
     misfit = Series(1, tuple((t, r["misfit"]) for t, r in zip(times, records, strict=True) if r["how"] != "lost"))
     charts = [
-        line_chart("trust", "s", [trust], levels=[(1, tracked.min_trust)], note="dashed: minimum", size=CHARTS.small),
-        line_chart("misfit of pixels", "s", [misfit], size=CHARTS.small),
+        line_chart("trust", "s", [trust], levels=[(1, tracked.min_trust)], note="dashed: minimum", size=PAGES.small),
+        line_chart("misfit of pixels", "s", [misfit], size=PAGES.small),
     ]
     rows = [k for k, record in enumerate(records) if record["how"] != "lost"]
     at = [times[k] for k in rows]
@@ -405,19 +375,19 @@ def _tracked_charts(tracked: Tracked) -> list[str]:
             values = [unit(one["joints"][name]) for one in states]
             deviations = [unit(one["deviation"][f"joint.{name}"]) for one in states]
             bands = tuple(
-                tuple((t, v + way * SETTINGS.band * d) for t, v, d in zip(at, values, deviations, strict=True))
+                tuple((t, v + way * PAGES.band * d) for t, v, d in zip(at, values, deviations, strict=True))
                 for way in (-1, 1)
             )
             title = f"{item.name}: {name}, {'mm' if item.slides(name) else 'deg'}"
             line = tuple(zip(at, values, strict=True))
-            charts.append(line_chart(title, "s", [Series(0, line, bands)], size=CHARTS.small))
+            charts.append(line_chart(title, "s", [Series(0, line, bands)], size=PAGES.small))
     return charts
 
 
 def _tracked_figure(tracked: Tracked, frame: Frame, record: dict[str, Any]) -> dict[str, Any]:
     """Return one frame: its image, tinted by the rendered label."""
     image, trust = frame.load_image().numpy(), record["trust"]
-    picture = to_bytes(image)
+    picture = to_uint8(image * 255)
     if record["how"] != "lost":
         parts = draw(tracked.scene, state_of(record), frame.camera).parts
         assert parts is not None

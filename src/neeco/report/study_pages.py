@@ -3,18 +3,23 @@ curves, and predictions on the same frames."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
 
 from neeco.base.errors import counted
-from neeco.capture.model import Capture
-from neeco.evaluation.image_metrics import COMPARISON, PART_COLORS, Pixels, overlay_outline, overlay_parts, psnr
+from neeco.evaluation.image_metrics import (
+    COMPARISON,
+    PART_COLORS,
+    Pixels,
+    overlay_outline,
+    overlay_parts,
+    psnr,
+    to_uint8,
+)
 from neeco.evaluation.masks import load_reference
 from neeco.labels.drawing import draw
 from neeco.report.page import (
@@ -28,7 +33,6 @@ from neeco.report.page import (
     legend,
     line_chart,
     split_counts,
-    to_bytes,
     write_page,
 )
 from neeco.studies.configurations import Table, csv_text
@@ -37,6 +41,7 @@ from neeco.studies.downstream.results import (
     MAIN,
     TITLES,
     Detections,
+    Document,
     Prediction,
     failed_jobs,
     is_synthetic,
@@ -70,11 +75,8 @@ EXPLANATION = (
     "difference about one is reported as a difference. Dashed levels are sets alone, without labelled frames."
 )
 
-Experiment = Mapping[str, Any]
-Row = Mapping[str, Any]
 
-
-def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Path:
+def write_downstream_report(plan: DownstreamPlan, experiment: Document) -> Path:
     """Write `report.html` into the study's folder, and return its path. experiment: the result of `run_downstream`.
     Raises NeecoError if an image cannot be read or the page cannot be written."""
     capture, computer = plan.capture, machine_words(experiment["machine"], "torch_threads")
@@ -102,12 +104,23 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
     sections += [
         Section(title=name, notes=lines) for name, lines in (("Failed trainings", failed), ("Notes", notes)) if lines
     ]
-    sections.append(Section(title="Configuration", facts=_facts(experiment, capture, computer)))
+    labels, machine = experiment["labels"] or "the capture's truth", experiment["machine"]
+    facts = [
+        ("capture", experiment["capture"]),
+        ("frames", split_counts(capture)),
+        ("labelled frames", f"of {experiment['labelled']:,}, different in every fold; labels: {labels}"),
+        *((f"other recording {name}", path) for name, path in experiment["captures"].items()),
+        *((f"set {data['name']}", f"{data['images']:,} images of {data['path']}") for data in experiment["sets"]),
+        ("classes", ", ".join(experiment["classes"])),
+        ("machine", computer),
+        ("versions", f"neeco {experiment['version']}, Python {machine['python']}, torch {machine['torch']}"),
+    ]
+    sections.append(Section(title="Configuration", facts=facts))
     return write_page(
         plan.request.output / REPORT_FILE,
         "study.html",
-        title=f"{capture.root.name}: benefit of synthetic images",
-        name=capture.root.name,
+        capture.root.name,
+        "benefit of synthetic images",
         subtitle="benefit of synthetic images",
         version=experiment["version"],
         stamps=[computer],
@@ -117,7 +130,7 @@ def write_downstream_report(plan: DownstreamPlan, experiment: Experiment) -> Pat
     )
 
 
-def score_chart(model: Row, test: str, rows: list[Row]) -> str:
+def score_chart(model: Document, test: str, rows: list[Document]) -> str:
     """Return the chart of the main score over the number of labelled frames, with intervals; sets alone are levels. The
     lines are named in the legend, because labels would use up a narrow page's width."""
     metric, levels, series = MAIN[model["predicts"]], [], []
@@ -133,7 +146,7 @@ def score_chart(model: Row, test: str, rows: list[Row]) -> str:
     return line_chart(title, "labelled frames", series, levels=levels, over_logarithmic=True) if series else ""
 
 
-def _examples(plan: DownstreamPlan, experiment: Experiment, model: Row, test: str) -> list[Section]:
+def _examples(plan: DownstreamPlan, experiment: Document, model: Document, test: str) -> list[Section]:
     """Return the frames with the largest and smallest gain of the best condition with synthetic images, with its
     predictions and those of its reference; none if a prediction of the first fold is missing."""
     rows = [row for row in rows_of(experiment, model, test) if "against" in row and is_synthetic(row, experiment)]
@@ -187,21 +200,6 @@ def picture(example: Example, prediction: Prediction | None = None) -> Pixels:
     return pixels
 
 
-def _facts(experiment: Experiment, capture: Capture, computer: str) -> list[tuple[str, str]]:
-    labels = experiment["labels"] or "the capture's truth"
-    machine = experiment["machine"]
-    return [
-        ("capture", experiment["capture"]),
-        ("frames", split_counts(capture)),
-        ("labelled frames", f"of {experiment['labelled']:,}, different in every fold; labels: {labels}"),
-        *((f"other recording {name}", path) for name, path in experiment["captures"].items()),
-        *((f"set {data['name']}", f"{data['images']:,} images of {data['path']}") for data in experiment["sets"]),
-        ("classes", ", ".join(experiment["classes"])),
-        ("machine", computer),
-        ("versions", f"neeco {experiment['version']}, Python {machine['python']}, torch {machine['torch']}"),
-    ]
-
-
 def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
     """Write `report.html` into the output and return its path. Every displayed frame is rendered once per
     configuration. Raises NeecoError if a run cannot be opened or the page cannot be written."""
@@ -240,8 +238,8 @@ def write_sweep_report(plan: SweepPlan, rows: Rows) -> Path:
     return write_page(
         plan.request.output / REPORT_FILE,
         "study.html",
-        title=f"{capture.root.absolute().name}: {study.title}",
-        name=capture.root.absolute().name,
+        capture.root.absolute().name,
+        study.title,
         subtitle=study.title,
         stamps=[computer],
         intro=intro,
@@ -275,7 +273,7 @@ def _pictures(plan: SweepPlan, rows: Rows) -> list[Section]:
     frames = [frames[len(frames) // 2] for frames in map(plan.capture.split, plan.splits)]
     images: list[list[Images]] = []
     for frame in frames:
-        recorded, reference = to_bytes(frame.load_image().numpy()), load_reference(plan.capture, frame)
+        recorded, reference = to_uint8(frame.load_image().numpy() * 255), load_reference(plan.capture, frame)
         outline = [] if reference is None else [jpeg(overlay_outline(recorded, reference.mask.numpy()))]
         images.append([Images("recorded image", (jpeg(recorded), *outline), f"recorded image, frame {frame.name}")])
     seeds = {row["configuration"]: row["seed"] for row in reversed(rows) if not row.get("error")}
@@ -289,7 +287,7 @@ def _pictures(plan: SweepPlan, rows: Rows) -> list[Section]:
                     frame.load_image(),
                     frame.load_mask(),
                 )
-                pictures = jpeg(to_bytes(image.numpy())), difference(image.numpy(), target.numpy(), counted)
+                pictures = jpeg(to_uint8(image.numpy() * 255)), difference(image.numpy(), target.numpy(), counted)
                 alt = f"{name}: rendering and difference, frame {frame.name}"
                 row.append(Images(name, pictures, alt, f"{psnr(image, target, counted):.2f} dB"))
     return [

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -89,19 +89,6 @@ RESULT = {"name": str, "method": str, "seed": int, "iterations": int, "seconds":
 RESULT |= {"num_gaussians": (int, None), "phase_1_psnr": (float, None), "lpips_networks": [str]}
 RESULT |= {"splits": {str: dict.fromkeys((*SPLIT_SCORES, *CHECKPOINTS), (float, None))}}
 CURVE_ROW = {"iteration": int, "seconds": float, "progress": float, "split": str, "psnr": (float, None)}
-
-
-@dataclass(frozen=True)
-class CurveSettings:
-    """Settings of the curve of held-out PSNR over a training."""
-
-    shares: tuple[float, ...] = tuple(step / 10 for step in range(1, 11))  # shares of the run with a point
-    frames: int = 4  # number of evenly spaced frames per split; the complete split is scored at the end
-    late: float = 0.75  # share of phase 1 from which its training PSNR is averaged
-
-
-CURVE = CurveSettings()
-FIELD_CURVE = CurveSettings(shares=(0.2, 0.6, 1.0), frames=2)  # a field renders an image in seconds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,7 +213,7 @@ def phase_1_psnr(folder: Path) -> float | None:
     last row; None if phase 1, or the run, was shorter than a row (50 steps)."""
     rows = read_rows(folder / "metrics.jsonl", {"iteration": int, "phase": int, "psnr": float})
     rows = [row for row in rows if row["phase"] == 1]
-    late = [row["psnr"] for row in rows if row["iteration"] > CURVE.late * rows[-1]["iteration"]]
+    late = [row["psnr"] for row in rows if row["iteration"] > Curve.late * rows[-1]["iteration"]]
     return round(sum(late) / len(late), 4) if late else None
 
 
@@ -240,14 +227,19 @@ class Curve:
     """Held-out PSNR over a training, in curve.jsonl, for a few frames of every split, fewer for a `field`. Seconds are
     the session's, summed over starts, without the rendering of these frames."""
 
+    shares_of_run: ClassVar[tuple[float, ...]] = tuple(step / 10 for step in range(1, 11))  # with a point each
+    n_frames: ClassVar[int] = 4  # evenly spaced frames per split; the complete split is scored at the end
+    field_shares, n_field_frames = (0.2, 0.6, 1.0), 2  # the same of a field, which renders an image in seconds
+    late: ClassVar[float] = 0.75  # share of phase 1 from which its training PSNR is averaged
+
     def __init__(self, file: Path, capture: Capture, splits: Sequence[str], *, field: bool = False) -> None:
         self.file = file
-        settings = FIELD_CURVE if field else CURVE
-        self.shares = settings.shares
+        self.shares = self.field_shares if field else self.shares_of_run
+        count = self.n_field_frames if field else self.n_frames
         self.rows: list[dict[str, Any]] | None = None  # None before the first step of this start
         self.frames: dict[str, list[tuple[Frame, Tensor, Tensor | None]]] = {}
         for split in splits:
-            chosen = [capture.split(split)[at] for at in evenly_spaced(len(capture.split(split)), settings.frames)]
+            chosen = [capture.split(split)[at] for at in evenly_spaced(len(capture.split(split)), count)]
             self.frames[split] = [(frame, frame.load_image(), frame.load_mask()) for frame in chosen]
 
     def after_step(self, session: Session) -> None:

@@ -39,7 +39,6 @@ from neeco.training.run import GaussianRun
 
 N_REFERENCE_FRAMES = 16  # training frames from which the usual errors are estimated
 FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # the start is close: no coarse level
-NOT_TRUSTED = "not trusted"
 MAX_UNRECORDED_SHARE = 0.01  # share of a pixel outside the recorded image, above which the pixel is ignored
 
 
@@ -166,7 +165,7 @@ class _Annotator:
         scene, names, output = self.folder.scene, self.folder.labeller.names, self.folder.output
         if trust.value < self.min_trust:
             facts["labels"] = labels_of(scene, drawing, annotate(scene, drawing, names))
-            return skipped_sample(index, {NOT_TRUSTED: 1}, facts).write(output)
+            return skipped_sample(index, {"not trusted": 1}, facts).write(output)
         drawing, missing = self._as_written(drawing, image)
         labels = annotate(scene, drawing, names)
         if missing is not None:  # no keypoints in pixels without image content

@@ -50,41 +50,48 @@ def augment(planes: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     planes' device.
     """
     count, _, height, width = planes.shape
-    random = _Random(rng, count, planes.device)
+    device = planes.device
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:  # [B, *shape] in [low, high)
+        return low + (high - low) * torch.rand((count, *shape), generator=rng, device=device)
+
+    def some(chance: float) -> Tensor:  # [B]: 1 with this probability, else 0
+        return (uniform(0, 1) < chance).float()
+
     # flips, rotations, zooms and shifts [B, 2, 3]
     aspect = width / height
-    placed = random.some(CHANGES.placed)
-    flip = 1 - 2 * random.some(0.5)
-    turn, zoom = placed * random.uniform(-CHANGES.turn, CHANGES.turn), CHANGES.zoom ** (placed * random.uniform(-1, 1))
+    placed = some(CHANGES.placed)
+    flip = 1 - 2 * some(0.5)
+    turn, zoom = placed * uniform(-CHANGES.turn, CHANGES.turn), CHANGES.zoom ** (placed * uniform(-1, 1))
     cosine, sine = turn.cos() / zoom, turn.sin() / zoom
-    shift = placed[:, None] * random.uniform(-2 * CHANGES.shift, 2 * CHANGES.shift, 2)
+    shift = placed[:, None] * uniform(-2 * CHANGES.shift, 2 * CHANGES.shift, 2)
     numbers = (cosine * flip, -sine / aspect, shift[:, 0], sine * aspect * flip, cosine, shift[:, 1])
     given_from_made = torch.stack(numbers, 1).reshape(-1, 2, 3)
     grid = functional.affine_grid(given_from_made, [count, 1, height, width], align_corners=False)
     planes = functional.grid_sample(planes, grid, align_corners=False)
     colors, labels = planes[:, :3], planes[:, 3:]
-    relit = random.some(CHANGES.relit)[:, None, None, None] > 0  # in exposure, gamma, tint, saturation and lamps
-    angle, slope = random.uniform(-math.pi, math.pi), random.some(0.5) * random.uniform(0, CHANGES.slope)
+    relit = some(CHANGES.relit)[:, None, None, None] > 0  # in exposure, gamma, tint, saturation and lamps
+    angle, slope = uniform(-math.pi, math.pi), some(0.5) * uniform(0, CHANGES.slope)
     across, down = (torch.linspace(-0.5, 0.5, side, device=colors.device) for side in (width, height))
     ramp = (slope * angle.cos())[:, None, None] * across + (slope * angle.sin())[:, None, None] * down[:, None]
-    gain = 2 ** random.uniform(-CHANGES.exposure, CHANGES.exposure)
-    tint = random.uniform(1 - CHANGES.tint, 1 + CHANGES.tint, 3) * gain[:, None]
+    gain = 2 ** uniform(-CHANGES.exposure, CHANGES.exposure)
+    tint = uniform(1 - CHANGES.tint, 1 + CHANGES.tint, 3) * gain[:, None]
     grey = colors.mean(1, keepdim=True)
-    saturation = random.uniform(1 - CHANGES.saturation, 1 + CHANGES.saturation)
+    saturation = uniform(1 - CHANGES.saturation, 1 + CHANGES.saturation)
     lit = grey + (colors - grey) * saturation[:, None, None, None]
     lit = (lit * tint[..., None, None] * (1 + ramp[:, None])).clamp(1e-4, 1)
-    lit = lit ** (2 ** random.uniform(-CHANGES.gamma, CHANGES.gamma))[:, None, None, None]
+    lit = lit ** (2 ** uniform(-CHANGES.gamma, CHANGES.gamma))[:, None, None, None]
     colors = torch.where(relit, lit, colors)
-    colors = _blur(colors, random.some(0.3) * random.uniform(0.2, CHANGES.blur))
-    noise = torch.randn(colors.shape, generator=rng, device=planes.device)
-    strength = random.some(0.5) * random.uniform(0, CHANGES.noise)
+    colors = _blur(colors, some(0.3) * uniform(0.2, CHANGES.blur))
+    noise = torch.randn(colors.shape, generator=rng, device=device)
+    strength = some(0.5) * uniform(0, CHANGES.noise)
     colors = (colors + noise * strength[:, None, None, None]).clamp(0, 1)
-    inside, chosen = [], random.some(0.5) > 0  # a rectangle in every second image
+    inside, chosen = [], some(0.5) > 0  # a rectangle in every second image
     for side in (height, width):
-        places = (torch.arange(side, device=random.device) + 0.5) / side
-        inside.append((places - random.uniform(0, 1, 1)).abs() < random.uniform(0.1, CHANGES.cut, 1) / 2)
+        places = (torch.arange(side, device=device) + 0.5) / side
+        inside.append((places - uniform(0, 1, 1)).abs() < uniform(0.1, CHANGES.cut, 1) / 2)
     cut = (inside[0][:, :, None] & inside[1][:, None] & chosen[:, None, None])[:, None]  # [B, 1, h, w]
-    colors = torch.where(cut, random.uniform(0, 1, 3)[..., None, None], colors)
+    colors = torch.where(cut, uniform(0, 1, 3)[..., None, None], colors)
     valid = labels[:, -1:] * ~cut
     return torch.cat([colors, labels[:, :-1], valid], 1), given_from_made
 
@@ -116,23 +123,6 @@ def moved(outlines: Sequence[Outline], given_from_made: np.ndarray) -> tuple[Out
         if len(inside):
             visible.append((number, inside))
     return tuple(visible)
-
-
-@dataclass(frozen=True)
-class _Random:
-    """Random numbers of each image of a batch."""
-
-    rng: torch.Generator
-    count: int
-    device: torch.device
-
-    def uniform(self, low: float, high: float, *shape: int) -> Tensor:
-        """Return [B, *shape] in [low, high)."""
-        return low + (high - low) * torch.rand((self.count, *shape), generator=self.rng, device=self.device)
-
-    def some(self, chance: float) -> Tensor:
-        """Return [B]: 1 with this probability, else 0."""
-        return (self.uniform(0, 1) < chance).float()
 
 
 def _blur(colors: Tensor, deviations: Tensor) -> Tensor:

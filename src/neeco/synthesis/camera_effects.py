@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -31,23 +31,8 @@ from neeco.labels.drawing import LayeredDrawing, keypoint_arrays, to_numpy
 from neeco.scene import GaussianScene, Recorded
 from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
 
-SoftMasks = Literal["mid", "mean"]
 SOFT_MASKS = "soft_masks"
 SMOKE_MM = 100.0  # distance for which `smoke` is stated
-
-
-@dataclass(frozen=True, kw_only=True)
-class EffectSettings:
-    """Sampling of an exposure, and defaults of effects."""
-
-    max_subframes: int = 64
-    subframe_px: float = 1.0  # maximum motion between two subframes of an exposure
-    tissue_step_px: int = 40  # spacing of tracked points on the tissue
-    max_gap_s: float = 0.5  # maximum time between recorded frames for estimating speeds
-    smoke_grey: float = 0.6  # brightness of smoke if the file does not state it
-
-
-SETTINGS = EffectSettings()
 
 
 @dataclass(frozen=True)
@@ -92,7 +77,11 @@ class CameraEffects:
     it."""
 
     ranges: Mapping[str, Range]
-    soft_masks: SoftMasks = "mid"
+    soft_masks: Literal["mid", "mean"] = "mid"
+    smoke_grey: ClassVar[float] = 0.6  # brightness of smoke if the file does not state it
+    max_subframes: ClassVar[int] = 64  # of an exposure
+    subframe_px: ClassVar[float] = 1.0  # maximum motion between two subframes
+    tissue_step_px: ClassVar[int] = 40  # spacing of tracked points on the tissue
 
     def draw(self, rng: Generator) -> dict[str, float]:
         """Sample the effects of one image by name. The number of random numbers is constant, so that a value is
@@ -123,27 +112,24 @@ def read_effects(path: Path) -> CameraEffects:
         raise NeecoError(f"{path}: {SOFT_MASKS}: {soft!r} is neither mid nor mean")
     if unknown := sorted(set(map(str, lines)) - set(EFFECTS)):
         raise NeecoError(f"{path}: {unknown[0]}: no such effect; there are {', '.join([*EFFECTS, SOFT_MASKS])}")
+    ranges = {}
     with faults_in(path):
-        return CameraEffects(
-            {name: _range(Node(value, field=name), EFFECTS[name]) for name, value in lines.items()}, soft
-        )
-
-
-def _range(node: Node, effect: Effect) -> Range:
-    value, share = node.value, 1.0
-    if isinstance(value, dict):
-        if not set(value) <= {"range", "share"} or "range" not in value:
-            node.fail("give a number, [LOW, HIGH], or {range: [LOW, HIGH], share: S}")
-        value, share = value["range"], node.given("share", Node.number, 1.0)
-    ends = [as_float(end) for end in (value if isinstance(value, list) else [value, value])]
-    if len(ends) != 2 or ends[0] is None or ends[1] is None:
-        node.fail(f"{value!r} is no range; give a number or [LOW, HIGH]")
-    if not effect.lowest <= ends[0] <= ends[1] <= effect.highest:
-        limits = f"{effect.lowest:g} to {effect.highest:g} ({effect.meaning})"
-        node.fail(f"{value} is out of range; give LOW <= HIGH within {limits}")
-    if not 0 <= share <= 1:
-        node.fail(f"share: {share:g} is not a share of the images; give 0 to 1")
-    return Range(ends[0], ends[1], share)
+        for name, value in lines.items():
+            node, effect, share = Node(value, field=name), EFFECTS[name], 1.0
+            if isinstance(value, dict):
+                if not set(value) <= {"range", "share"} or "range" not in value:
+                    node.fail("give a number, [LOW, HIGH], or {range: [LOW, HIGH], share: S}")
+                value, share = value["range"], node.given("share", Node.number, 1.0)
+            ends = [as_float(end) for end in (value if isinstance(value, list) else [value, value])]
+            if len(ends) != 2 or ends[0] is None or ends[1] is None:
+                node.fail(f"{value!r} is no range; give a number or [LOW, HIGH]")
+            if not effect.lowest <= ends[0] <= ends[1] <= effect.highest:
+                limits = f"{effect.lowest:g} to {effect.highest:g} ({effect.meaning})"
+                node.fail(f"{value} is out of range; give LOW <= HIGH within {limits}")
+            if not 0 <= share <= 1:
+                node.fail(f"share: {share:g} is not a share of the images; give 0 to 1")
+            ranges[name] = Range(ends[0], ends[1], share)
+    return CameraEffects(ranges, soft)
 
 
 def srgb_to_linear(image: np.ndarray) -> np.ndarray:
@@ -177,7 +163,7 @@ def apply_effects(image: np.ndarray, depth: np.ndarray, values: Mapping[str, flo
     if (density := values.get("smoke", 0.0)) > 0:  # homogeneous (Beer-Lambert): it attenuates and emits light
         far = np.where(depth > 0, depth, depth.max(initial=SMOKE_MM))
         transmission = ((1 - density) ** (far / SMOKE_MM)).astype(np.float32)[..., None]
-        smoke = srgb_to_linear(np.full(3, values.get("smoke_grey", SETTINGS.smoke_grey)))
+        smoke = srgb_to_linear(np.full(3, values.get("smoke_grey", CameraEffects.smoke_grey)))
         light = light * transmission + smoke * (1 - transmission)
     if values.get("lens_blur_px", 0) > 0:
         light = cv2.GaussianBlur(light, (0, 0), values["lens_blur_px"])
@@ -241,13 +227,15 @@ class RecordedMotion:
     including its camera's, of an arbitrary frame of its own.
     """
 
+    max_gap_s: ClassVar[float] = 0.5  # maximum time between recorded frames for estimating speeds
+
     def __init__(self, recorded: Recorded, instruments: Sequence[Recorded] = ()) -> None:
         order = sorted(range(len(recorded.states)), key=lambda k: recorded.states[k].time)
         self._motions = list[Motion]()
         states = []
         for first, second in pairwise(order):
             a, b = recorded.states[first], recorded.states[second]
-            if 0 < b.time - a.time <= SETTINGS.max_gap_s and set(a.instruments) == set(b.instruments):
+            if 0 < b.time - a.time <= self.max_gap_s and set(a.instruments) == set(b.instruments):
                 seconds, twists, joints = b.time - a.time, {}, {}  # at constant speeds
                 for name, item in a.instruments.items():
                     later = b.instruments[name]
@@ -284,11 +272,11 @@ def subframes(
     for side in (-1, 1):
         state, camera = motion.advanced(drawing.state, drawing.camera, side * shutter_s / 2)
         points = [point for ends in working_ends_of(keypoint_arrays(scene, state)).values() for point in ends]
-        points += list(surface_points(drawing.tissue_depth, drawing.camera, SETTINGS.tissue_step_px))
+        points += list(surface_points(drawing.tissue_depth, drawing.camera, CameraEffects.tissue_step_px))
         places.append([place_in_image(point, camera) for point in points])
     moved = [np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in zip(*places, strict=True) if a and b]
-    apart = float(max(moved, default=0.0))
-    count = 2 * int(np.clip(np.ceil(apart / SETTINGS.subframe_px / 2), 0, SETTINGS.max_subframes // 2 - 1)) + 1
+    steps = np.ceil(float(max(moved, default=0.0)) / CameraEffects.subframe_px / 2)
+    count = 2 * int(np.clip(steps, 0, CameraEffects.max_subframes // 2 - 1)) + 1
     times = ((np.arange(count) + 0.5) / count - 0.5) * shutter_s
     return [motion.advanced(drawing.state, drawing.camera, float(time)) for time in times]
 

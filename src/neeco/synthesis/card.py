@@ -30,7 +30,6 @@ from neeco.synthesis.settings import ImageSettings, Settings
 from neeco.synthesis.writers import Record, split_of, stem
 from neeco.synthesis.writers.hub import SPLITS, ImageFolder, WebDataset
 
-CARD = "README.md"
 MARK = "<!-- Written by neeco, which writes it anew with --resume. Remove this line to keep your own text. -->"
 SIZES = {"n<1K": 10**3, "1K<n<10K": 10**4, "10K<n<100K": 10**5, "100K<n<1M": 10**6, "1M<n<10M": 10**7}
 TASKS = ["image-segmentation", "object-detection", "keypoint-detection", "depth-estimation"]
@@ -44,7 +43,7 @@ def write_card(root: Path, info: Mapping[str, Any], formats: Mapping[str, str]) 
 
     The same data set has the same card: no date, no host. Raises NeecoError.
     """
-    path = root / CARD
+    path = root / "README.md"
     if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
         return
     annotated, adapted = "annotates" in info["settings"], "footage" in info["settings"]

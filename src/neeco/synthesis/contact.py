@@ -6,7 +6,6 @@ Distances are those to planes through the nearest surface points (Hoppe et al., 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
@@ -32,37 +31,29 @@ from neeco.synthesis.writers import CONTACT as FIELDS
 NONE, TOUCHING, GRASPING = "none", "touching", "grasping"
 
 
-@dataclass(frozen=True, kw_only=True)
-class ContactSettings:
-    """Thresholds of contact labels, chosen on rendered worlds with contact between instruments and tissue."""
-
-    n_views: int = 12  # recorded cameras that observe the surface
-    spacing_mm: float = 1.0  # of surface points
-    n_nearest: int = 8  # surface points per plane
-    reach_mm: float = 10.0  # radius of the tissue around a contact; also the maximum distance measured
-    end_mm: float = 15.0  # radius of the working end around the tips
-    n_measured: int = 100  # Gaussians sampled per working end
-    quantile: float = 0.97  # quantile of their depths, robust to single outliers
-    touching_mm: float = -1.5  # depth at which contact has probability 1/2; tissue learned during contact is indented
-    depth_sd_mm: float = 6.0  # standard deviation of a depth, calibrated for correct confidences
-    joint_quantiles: tuple[float, float] = (0.05, 0.95)  # quantiles of recorded values: a range without outliers
-    closed_share: float = 0.25  # share of the recorded range of the jaws' opening, below which they are closed
-
-
-CONTACT = ContactSettings()
-
-
 class RestingTissue:
-    """Surface of a scene's undeformed tissue (world, mm), and the parts of its instruments that may touch it."""
+    """Surface of a scene's undeformed tissue (world, mm), and the parts of its instruments that may touch it; and the
+    thresholds of contact labels, chosen on rendered worlds with contact between instruments and tissue."""
 
+    n_views: ClassVar[int] = 12  # recorded cameras that observe the surface
+    spacing_mm: ClassVar[float] = 1.0  # of surface points
+    n_nearest: ClassVar[int] = 8  # surface points per plane
+    reach_mm: ClassVar[float] = 10.0  # radius of the tissue around a contact; also the maximum distance measured
+    end_mm: ClassVar[float] = 15.0  # radius of the working end around the tips
+    n_measured: ClassVar[int] = 100  # Gaussians sampled per working end
+    quantile: ClassVar[float] = 0.97  # quantile of their depths, robust to single outliers
+    touching_mm: ClassVar[float] = -1.5  # where contact has probability 1/2; tissue learned in contact is indented
+    depth_sd_mm: ClassVar[float] = 6.0  # standard deviation of a depth, calibrated for correct confidences
+    joint_quantiles: ClassVar[tuple[float, float]] = (0.05, 0.95)  # a range of recorded values without outliers
+    closed_share: ClassVar[float] = 0.25  # share of the range of the jaws' opening, below which they are closed
     of: ClassVar[WeakKeyDictionary[GaussianScene, RestingTissue]] = WeakKeyDictionary()  # cache
 
     def __init__(self, scene: GaussianScene) -> None:
         recorded, tissue = scene.recorded, tissue_gaussians(scene)
-        chosen = evenly_spaced(len(recorded.cameras), CONTACT.n_views, floor=True)
+        chosen = evenly_spaced(len(recorded.cameras), RestingTissue.n_views, floor=True)
         cameras = [recorded.cameras[k].scaled(recorded.scale) for k in chosen]
         seen = np.concatenate([surface_points(surface_depth(rasterize(tissue, view)), view, 1) for view in cameras])
-        self.points = seen[np.unique(np.floor(seen / CONTACT.spacing_mm), axis=0, return_index=True)[1]]  # [P, 3]
+        self.points = seen[np.unique(np.floor(seen / RestingTissue.spacing_mm), axis=0, return_index=True)[1]]  # [P, 3]
         self.tree = cKDTree(self.points)
         self.eye = np.mean([to_numpy(view.world_from_camera)[:3, 3] for view in cameras], axis=0)
         posed, keypoints = scene.at(recorded.states[0]), keypoint_arrays(scene, recorded.states[0])
@@ -72,16 +63,16 @@ class RestingTissue:
             of_instrument = scene.canonical.bodies == 1 + bodies.index(name)
             solid = (of_instrument & (posed.opacities > LABELS.surface_alpha)).nonzero()[:, 0]
             tips = [point for key, point in points.items() if key.startswith("tip")] or list(points.values())[-1:]
-            near = cdist(to_numpy(posed.means[solid]), tips).min(1) < CONTACT.end_mm
+            near = cdist(to_numpy(posed.means[solid]), tips).min(1) < RestingTissue.end_mm
             if near.any():
                 rows = solid[torch.from_numpy(near).to(solid.device)]
-                self.rows[name] = rows[evenly_spaced(len(rows), CONTACT.n_measured)]
+                self.rows[name] = rows[evenly_spaced(len(rows), RestingTissue.n_measured)]
         self.closed: dict[str, tuple[str, float, float]] = {}  # joint, its values at closed and at open jaws
         for item in scene.instruments:
             jaws = [joint for joint in item.joints if "jaw" in joint or "grip" in joint] or list(item.joints)
             if len(jaws) == 1:  # the end of its range nearer to 0 is closed
                 values = [float(state.instruments[item.name].joints[jaws[0]]) for state in recorded.states]
-                low, high = np.quantile(values, CONTACT.joint_quantiles).tolist()
+                low, high = np.quantile(values, RestingTissue.joint_quantiles).tolist()
                 self.closed[item.name] = (jaws[0], *sorted((low, high), key=abs))
 
 
@@ -107,29 +98,29 @@ def contact_of(scene: GaussianScene, drawing: LayeredDrawing, name: str) -> dict
     state, posed, rows = drawing.state.instruments[name], drawing.posed, tissue.rows[name]
     points = to_numpy(posed.means[rows])
     axes = to_numpy(quat_to_matrix(posed.quats[rows]) * posed.scales[rows, None])  # columns, one standard deviation
-    distances, nearest = tissue.tree.query(points, CONTACT.n_nearest, distance_upper_bound=CONTACT.reach_mm)
+    distances, nearest = tissue.tree.query(points, RestingTissue.n_nearest, distance_upper_bound=RestingTissue.reach_mm)
     measured = np.isfinite(distances).all(1)
     planes = tissue.points[nearest[measured]]  # [M, n_nearest, 3]
     offsets = planes - (middles := planes.mean(1))[:, None]
-    normals, depths = np.zeros_like(points), np.full(len(points), -CONTACT.reach_mm)
+    normals, depths = np.zeros_like(points), np.full(len(points), -RestingTissue.reach_mm)
     across = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))[1][..., 0]
     normals[measured] = across * np.sign(((middles - tissue.eye) * across).sum(1, keepdims=True))
     depths[measured] = ((points[measured] - middles) * normals[measured]).sum(1)
     depths += np.linalg.norm(np.einsum("mij,mi->mj", axes, normals), axis=1)
-    deepest = np.argsort(depths)[round(CONTACT.quantile * (len(depths) - 1))]
-    depth, point, normal, deviations = depths[deepest], points[deepest], normals[deepest], [CONTACT.depth_sd_mm]
+    deepest = np.argsort(depths)[round(RestingTissue.quantile * (len(depths) - 1))]
+    depth, point, normal, deviations = depths[deepest], points[deepest], normals[deepest], [RestingTissue.depth_sd_mm]
     if state.uncertainty is not None:  # translations in the camera's axes, rotations about the instrument's
         pose, along = to_numpy(state.pose), drawing.camera.camera_from_world[:3, :3] @ normal
         turned = np.cross(point - pose[:3, 3], normal) @ pose[:3, :3]  # mm/rad
         shifts, turns = state.uncertainty.translation_mm, np.radians(state.uncertainty.rotation_deg)
         deviations += [*(along * shifts), *(turned * turns)]
-    touches = float(ndtr((depth - CONTACT.touching_mm) / np.linalg.norm(deviations)))
+    touches = float(ndtr((depth - RestingTissue.touching_mm) / np.linalg.norm(deviations)))
     contact, box = NONE, None
     if touches > 0.5:
         joint, closed, opened = tissue.closed.get(name, ("", 0.0, 0.0))
         opening = (float(state.joints[joint]) - closed) / (opened - closed) if opened != closed else np.inf
-        contact = GRASPING if opening <= CONTACT.closed_share else TOUCHING
-        reached = tissue.points[tissue.tree.query_ball_point(point, CONTACT.reach_mm)]
+        contact = GRASPING if opening <= RestingTissue.closed_share else TOUCHING
+        reached = tissue.points[tissue.tree.query_ball_point(point, RestingTissue.reach_mm)]
         pixels = project_world(reached, drawing.camera, nearest=drawing.camera.near)[0]
         ends = np.floor(pixels.min(0)), np.ceil(pixels.max(0))
         low, high = np.clip(ends, 0, (drawing.camera.width, drawing.camera.height))

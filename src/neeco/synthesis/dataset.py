@@ -11,7 +11,7 @@ import hashlib
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from neeco.synthesis.generator import (
     draw_in_workers,
     format_counts,
 )
-from neeco.synthesis.samplers import SAMPLING, states_file
+from neeco.synthesis.samplers import SimilarFrames, states_file
 from neeco.synthesis.settings import (
     DEFAULT_FORMATS,
     SAMPLERS,
@@ -123,7 +123,7 @@ def synthesize(
     identity = settings.identity() | {
         **settings.image_identity(recorded.width, recorded.height),
         "states_sha256": states_sha256,
-        "similar_views": SAMPLING.n_similar,
+        "similar_views": SimilarFrames.n_similar,
         "camera_effects": effects,
         **folders,
     }
@@ -282,7 +282,6 @@ class DataSetFolder:
             writer(name)().write(written)
         if images:
             write_preview(output, images, names, self.scene.skeleton())
-        thresholds = self.labeller.thresholds if isinstance(self.labeller, ThresholdLabels) else None
         info = self.info | {
             "complete": complete,
             "images": len(images),
@@ -292,7 +291,7 @@ class DataSetFolder:
             "classes": {name: self.class_names.get(name, name) for name in instruments_of(names)},
             "keypoints": list(keypoints),
             "depth": {"mm_per_count": DEPTH_MM_PER_COUNT, "none": 0},
-            "delta_thresholds": None if thresholds is None else asdict(thresholds),
+            "delta_thresholds": self.labeller.thresholds if isinstance(self.labeller, ThresholdLabels) else None,
             "refused": refusals(records),
             "skipped": skipped(records),
         }

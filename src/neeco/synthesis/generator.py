@@ -13,7 +13,7 @@ import tempfile
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import lru_cache
 from itertools import combinations, product
 from pathlib import Path
@@ -32,7 +32,7 @@ from neeco.capture.model import State, evenly_spaced
 from neeco.geometry.camera import Camera
 from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends_of
 from neeco.labels.drawing import LayeredDrawing, draw_layers
-from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
+from neeco.labels.labellers import DELTAS, CompositedLabels, Labeller, ThresholdLabels
 from neeco.labels.settings import LABELS
 from neeco.raster.devices import readable_failures
 from neeco.raster.native import keep_freed_memory, set_threads, threads
@@ -55,9 +55,9 @@ from neeco.synthesis.tissue_replacement import (
     Appearance,
     Appearances,
     ImageFolder,
-    MixedSampler,
     Mixture,
     split,
+    with_colors,
 )
 from neeco.synthesis.writers import Encoded, Record, encoded_sample, skipped_sample
 
@@ -65,20 +65,6 @@ from neeco.synthesis.writers import Encoded, Record, encoded_sample, skipped_sam
 EFFECTS_STREAM, APPEARANCE_STREAM = 1, 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class AcceptanceSettings:
-    """Thresholds of acceptable states."""
-
-    buried_share: float = 0.05  # share of an instrument's pixels that may be deeper, as edges are uncertain
-    tolerance_range_mm: tuple[float, float] = (2.0, 5.0)  # range of tolerances estimated from the recording
-    n_tolerance_states: int = 12  # recorded states for estimating the tolerance
-    # surfaces of two instruments nearer than about a shaft's thickness: the instruments intersect
-    min_gap_mm: float = 6.0
-    min_crossing_px: int = 5  # minimum number of such pixels for an intersection
-    max_unobserved_share: float = 0.25  # maximum share of an image's pixels
-
-
-ACCEPTED = AcceptanceSettings()
 LEAVES_IMAGE, ENTERS_TISSUE, ENTERS_ANOTHER = "leaves the image", "enters the tissue", "enters another"
 UNOBSERVED_TISSUE = "stands before tissue that no frame saw"
 UNOBSERVED_SIDE = "shows sides that no frame saw"
@@ -117,6 +103,14 @@ class Acceptance:
     tolerance_mm: float | None
     max_unobserved: float = 1.0
     recorded_together: tuple[frozenset[str], ...] = ()
+    _: KW_ONLY
+    buried_share: float = 0.05  # share of an instrument's pixels that may be deeper, as edges are uncertain
+    # surfaces of two instruments nearer than about a shaft's thickness: the instruments intersect
+    min_gap_mm: float = 6.0
+    min_crossing_px: int = 5  # minimum number of such pixels for an intersection
+    max_unobserved_share: float = 0.25  # maximum share of an image's pixels
+    tolerance_range_mm: tuple[float, float] = (2.0, 5.0)  # range of tolerances estimated from the recording
+    n_tolerance_states: int = 12  # recorded states for estimating the tolerance
 
     def refusal(self, drawing: LayeredDrawing) -> str | None:
         """Return the reason to refuse the drawing, or None."""
@@ -129,7 +123,7 @@ class Acceptance:
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
         unobserved = drawing.unobserved.numpy() > LABELS.max_unobserved
-        if unobserved.mean(dtype=np.float32) > ACCEPTED.max_unobserved_share:
+        if unobserved.mean(dtype=np.float32) > self.max_unobserved_share:
             return UNOBSERVED_TISSUE
         labelled = drawing.parts.numpy() > 0
         if labelled.any() and unobserved[labelled].mean(dtype=np.float32) > self.max_unobserved:
@@ -138,8 +132,8 @@ class Acceptance:
             for a, b in product(group & drawing.layers.keys(), rivals & drawing.layers.keys()):
                 first, second = drawing.layers[a], drawing.layers[b]
                 both = first.mask & second.mask & (first.depth > 0) & (second.depth > 0)
-                near = np.abs(first.depth - second.depth)[both] < ACCEPTED.min_gap_mm
-                if int(near.sum()) >= ACCEPTED.min_crossing_px:  # in this camera, they must intersect
+                near = np.abs(first.depth - second.depth)[both] < self.min_gap_mm
+                if int(near.sum()) >= self.min_crossing_px:  # in this camera, they must intersect
                     return ENTERS_ANOTHER
         return None
 
@@ -150,7 +144,7 @@ class SampleGenerator:
 
     scene: GaussianScene
     labeller: Labeller
-    sampler: Sampler | MixedSampler
+    sampler: Sampler | Mixture
     acceptance: Acceptance
     settings: Settings
     effects: CameraEffects | None = None
@@ -164,7 +158,7 @@ class SampleGenerator:
         """Return the generator that `settings` describe, of `scene` or of its tissue under the instruments of
         `instrument_scenes`. Raises NeecoError where the scenes do not support them."""
         cameras = DrawnCameras.of(settings, scene.recorded, scene.recorded.cameras)
-        sampler: Sampler | MixedSampler
+        sampler: Sampler | Mixture
         groups: tuple[frozenset[str], ...] = ()
         gains: tuple[tuple[float, float, float], ...] = ()
         tissue = scene
@@ -179,7 +173,7 @@ class SampleGenerator:
             labeller = CompositedLabels(scene, settings.label_threshold)
         else:
             deltas = settings.delta_thresholds
-            labeller = ThresholdLabels(scene, None if deltas is None else DeltaThresholds(*deltas))
+            labeller = ThresholdLabels(scene, None if deltas is None else dict(zip(DELTAS, deltas, strict=True)))
         effects, motion = None, None
         if settings.camera_effects is not None:
             effects = read_effects(Path(settings.camera_effects))
@@ -257,7 +251,7 @@ class SampleGenerator:
             owners = self.labeller.owners(state, gaussians)
             image = appearance.over_background(split(gaussians, owners, camera, image, share))
         colors = appearance.colors
-        return image if colors is None else torch.from_numpy(colors.given_to(image.numpy()))
+        return image if colors is None else torch.from_numpy(with_colors(image.numpy(), *colors))
 
     @torch.no_grad()
     def _through_camera(
@@ -306,9 +300,9 @@ def find_tolerance(scene: GaussianScene, labeller: Labeller) -> float:
     recorded = scene.recorded
     depths = [
         buried_depth(draw_layers(scene, labeller, recorded.states[k], recorded.cameras[k], min_component=0.0))
-        for k in evenly_spaced(len(recorded.states), ACCEPTED.n_tolerance_states, floor=True)
+        for k in evenly_spaced(len(recorded.states), Acceptance.n_tolerance_states, floor=True)
     ]
-    return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *ACCEPTED.tolerance_range_mm)) / 100)
+    return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *Acceptance.tolerance_range_mm)) / 100)
 
 
 def buried_depth(drawing: LayeredDrawing) -> float:
@@ -324,7 +318,7 @@ def buried_depth(drawing: LayeredDrawing) -> float:
         behind = surface[visible]
         below = np.where(behind > 0, layer.depth[visible] - behind, 0.0)
         if len(below):
-            deepest = max(deepest, float(np.quantile(below, 1 - ACCEPTED.buried_share)))
+            deepest = max(deepest, float(np.quantile(below, 1 - Acceptance.buried_share)))
         for point in keypoints.get(name, []):
             if place := place_in_image(point, drawing.camera):
                 x, y, z = place

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -245,19 +245,6 @@ def with_joints(state: State, value: Callable[[str, str], float]) -> State:
     return replace(state, instruments=instruments)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SamplerSettings:
-    """Settings of the samplers of views."""
-
-    n_similar: int = 10  # recorded frames whose cameras are candidates for a sampled state
-    max_view_attempts: int = 50  # maximum number of views sampled until one contains the instrument
-    still_degrees: float = 1.0  # perturbation of views of a still scope, which observed one side only
-    still_mm: float = 1.0  # the same, of their positions
-    n_surface_views: int = 5  # recorded views that determine the centre of the surface
-
-
-SAMPLING = SamplerSettings()
-
 StateSampler = Callable[[int, Generator], State]  # (index, its random numbers) -> state
 # Draws a camera for a state; intrinsics and image size are always those of a recorded camera.
 ViewSampler = Callable[[State, Generator], Camera]
@@ -266,6 +253,8 @@ ViewSampler = Callable[[State, Generator], Camera]
 class SimilarFrames:
     """Selects one of `count` recorded frames (its index): among the `n_similar` ones with the most similar states, or
     any if all states are equal. states: of the frames; empty: unknown."""
+
+    n_similar: ClassVar[int] = 10  # recorded frames whose cameras are candidates for a sampled state
 
     def __init__(self, states: Sequence[State], count: int, joints: bool) -> None:
         common = set.intersection(*(set(state.instruments) for state in states)) if states else set()
@@ -281,12 +270,12 @@ class SimilarFrames:
         """Return a frame whose state is similar to `state`."""
         if self._recorded is None or not set(self._recorded.instruments) <= set(state.instruments):
             return self.any(rng)
-        nearest = np.argsort(self._recorded.distances(state), kind="stable")[: SAMPLING.n_similar]
+        nearest = np.argsort(self._recorded.distances(state), kind="stable")[: self.n_similar]
         return int(nearest[rng.integers(len(nearest))])
 
 
 class RecordedViews:
-    """The camera of a recorded frame, one of the SAMPLING.n_similar with the most similar states.
+    """The camera of a recorded frame, one of those with the most similar states.
 
     A camera that followed its instrument recorded it there: instruments are positioned in the image as in recorded
     ones, which a detector learns. states: the recorded frames'; empty: any camera.
@@ -312,6 +301,7 @@ class PerturbedViews:
     recorded: RecordedViews
     degrees: float = 3.0
     mm: float = 3.0
+    of_still: ClassVar[tuple[float, float]] = (1.0, 1.0)  # degrees, mm for a still scope, which saw one side
 
     def __call__(self, state: State, rng: Generator) -> Camera:
         camera = self.recorded(state, rng)
@@ -343,6 +333,7 @@ class OrbitViews:
     recorded: RecordedViews
     centre: np.ndarray  # [3] mm
     degrees: float = 20.0
+    n_views: ClassVar[int] = 5  # recorded views that determine the centre
 
     def __call__(self, state: State, rng: Generator) -> Camera:
         camera = self.recorded(state, rng)
@@ -363,6 +354,7 @@ class Sampler:
     views: ViewSampler
     cameras: tuple[Camera | None, ...] = (None,)  # prescribed with the states, in turn; None: by the view sampler
     prescribed: bool = False  # whether the state of an index is prescribed, not random
+    max_view_attempts: ClassVar[int] = 50  # maximum number of views sampled until one contains the instrument
 
     def fixed(self, index: int) -> bool:
         """Return whether both state and camera of image `index` are prescribed: resampling would not change them."""
@@ -372,7 +364,7 @@ class Sampler:
         """Return the next (state, camera) for image `index`.
 
         Most views of a moving camera do not contain the instrument, and rendering is slow: views are sampled until one
-        does, at most SAMPLING.max_view_attempts times.
+        does, at most `max_view_attempts` times.
         """
         state = self.states(index, rng)
         prescribed = self.cameras[index % len(self.cameras)]
@@ -380,7 +372,7 @@ class Sampler:
             return state, prescribed
         points = working_ends_or_origins(self.scene, state)
         camera = self.views(state, rng)
-        for _ in range(SAMPLING.max_view_attempts):
+        for _ in range(self.max_view_attempts):
             if any_in_image(camera, points):
                 break
             camera = self.views(state, rng)
@@ -394,13 +386,13 @@ def make_sampler(scene: GaussianScene, states: str, margin: float, views: Views,
     view_sampler: ViewSampler = recorded
     still = scene.recorded.still
     if views == "perturbed":
-        view_sampler = PerturbedViews(recorded, *((SAMPLING.still_degrees, SAMPLING.still_mm) if still else ()))
+        view_sampler = PerturbedViews(recorded, *(PerturbedViews.of_still if still else ()))
     if views == "rolled":
         view_sampler = RolledViews(recorded)
     if views == "orbit":
         if still:
             raise NeecoError("--views orbit: the scope was still, which shows only one side; use recorded or perturbed")
-        chosen = evenly_spaced(len(scene.recorded.cameras), SAMPLING.n_surface_views, floor=True)
+        chosen = evenly_spaced(len(scene.recorded.cameras), OrbitViews.n_views, floor=True)
         with torch.no_grad():
             seen = [(scene.at(scene.recorded.states[k]), scene.recorded.cameras[k]) for k in chosen]
             points = [surface_points(surface_depth(rasterize(*view)), view[1]) for view in seen]

@@ -16,7 +16,6 @@ from neeco.labels.settings import LABELS
 
 LabelWay = Literal["composited", "threshold"]
 Views = Literal["recorded", "perturbed", "rolled", "orbit"]
-ImageFormat = Literal["png", "jpg"]
 PUBLIC_SETS = ("endovis2017-parts", "endovis2018", "sar-rarp50")  # class ids of these
 FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder", *PUBLIC_SETS)  # of our own writers
 DEFAULT_FORMATS = ("coco", "yolo", "imagefolder")  # the last for `datasets.load_dataset` of the folder
@@ -75,7 +74,7 @@ class ImageSettings(SizeSettings):
 
     lens: bool = False
     """Render with the recording's own distortion and round border, labels too; else undistorted."""
-    image_format: ImageFormat = "png"
+    image_format: Literal["png", "jpg"] = "png"
     """Of the images; labels and depth are PNG always."""
     quality: int = JPEG_QUALITY
     """Of JPEG images, 1 to 100."""

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -44,8 +44,8 @@ from neeco.synthesis.settings import Settings
 
 
 @dataclass(frozen=True, kw_only=True)
-class BackgroundSettings:
-    """Settings of background images, and of colour transfer from other images."""
+class ReplacementSettings:
+    """Settings of background images, of colour transfer from other images, and of mixed scenes."""
 
     min_crop: float = 0.7  # minimum side of a crop, relative to the largest crop of this shape
     min_side_px: int = 32  # minimum side of an image: smaller ones are icons
@@ -58,9 +58,15 @@ class BackgroundSettings:
     dark: float = 1e-3  # minimum mean light, of white
     adaptation_range: tuple[float, float] = (0.25, 4.0)  # range of gains computed from other images
     shadow_range: tuple[float, float] = (0.2, 1.1)  # range of the light left in a shadow; above 1: rendering errors
+    # mixed scenes
+    depth_scale: float = 0.25  # scale of the image for looking up the depth of tissue
+    n_recorded_frames: int = 24  # number of frames created for the mixed scene's recording
+    # range of colour gains: beyond it, the shafts are of different materials
+    gain_range: tuple[float, float] = (0.6, 1.6)
+    min_shaft_opacity: float = 0.5  # minimum opacity of Gaussians that determine a shaft's colour
 
 
-IMAGES = BackgroundSettings()
+IMAGES = ReplacementSettings()
 
 
 @dataclass(frozen=True)
@@ -106,29 +112,22 @@ class ImageFolder:
 _decoded = lru_cache(maxsize=IMAGES.cached_images)(read_image_bytes)
 
 
-@dataclass(frozen=True)
-class Colors:
-    """Mean [3] and standard deviation [3] of the stored colours of an image, without its black border."""
-
-    mean: np.ndarray
-    deviation: np.ndarray
-
-    @classmethod
-    def of(cls, image: np.ndarray) -> Colors:
-        """Return the colours of an image [H, W, 3] in [0, 1]."""
-        lit = image[image.max(2) > IMAGES.border]
-        if not len(lit):
-            lit = image.reshape(-1, 3)
-        return cls(lit.mean(0), lit.std(0))
-
-    def given_to(self, image: np.ndarray) -> np.ndarray:
-        """Return an image [H, W, 3] with these colours (Reinhard et al., "Color transfer", 2001, in RGB)."""
-        colors = Colors.of(image)
-        gains = np.clip(self.deviation / np.maximum(colors.deviation, IMAGES.dark), *IMAGES.adaptation_range)
-        return np.clip((image - colors.mean) * gains + self.mean, 0, 1).astype(np.float32)
+def colors_of(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean [3] and standard deviation [3] of an image [H, W, 3] in [0, 1], without its black border."""
+    lit = image[image.max(2) > IMAGES.border]
+    if not len(lit):
+        lit = image.reshape(-1, 3)
+    return lit.mean(0), lit.std(0)
 
 
-_colors_of = lru_cache(maxsize=4096)(lambda file: Colors.of(read_image_bytes(file).astype(np.float32) / 255))
+def with_colors(image: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Return an image [H, W, 3] with these colours (Reinhard et al., "Color transfer", 2001, in RGB)."""
+    own_mean, own_deviation = colors_of(image)
+    gains = np.clip(deviation / np.maximum(own_deviation, IMAGES.dark), *IMAGES.adaptation_range)
+    return np.clip((image - own_mean) * gains + mean, 0, 1).astype(np.float32)
+
+
+_colors_of = lru_cache(maxsize=4096)(lambda file: colors_of(read_image_bytes(file).astype(np.float32) / 255))
 
 
 @dataclass(frozen=True)
@@ -143,7 +142,7 @@ class Appearance:
     source: str | None = None
     background: Tensor | None = None  # [H, W, 3] in [0, 1]
     adaptation: float = 0.0  # in [0, 1]
-    colors: Colors | None = None
+    colors: tuple[np.ndarray, np.ndarray] | None = None  # of `colors_of`
 
     def over_background(self, layers: Layers) -> Tensor:
         """Return the image [H, W, 3] of these layers over the background."""
@@ -229,22 +228,11 @@ def _smoothed(plane: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MixingSettings:
-    """Settings of mixed scenes."""
-
-    depth_scale: float = 0.25  # scale of the image for looking up the depth of tissue
-    n_recorded_frames: int = 24  # number of frames created for the mixed scene's recording
-    # range of colour gains: beyond it, the shafts are of different materials
-    gain_range: tuple[float, float] = (0.6, 1.6)
-    min_shaft_opacity: float = 0.5  # minimum opacity of Gaussians that determine a shaft's colour
-
-
-MIXING = MixingSettings()
-
-
-@dataclass(frozen=True, kw_only=True)
 class Mixture:
-    """A scene of one run's tissue and other runs' instruments, and the placement of these."""
+    """A scene of one run's tissue and other runs' instruments, and the placement of these.
+
+    As a sampler of (state, camera): a recorded camera of the tissue's run, with a placed sample of every instrument
+    scene (`sampler`)."""
 
     scene: GaussianScene
     tissue: GaussianScene
@@ -253,6 +241,8 @@ class Mixture:
     min_depth: Mapping[str, float]  # mm from the lens, by instrument: the minimum recorded depth of working ends
     tissue_alone: Gaussians  # of `tissue`
     own_tissue_alone: tuple[Gaussians, ...]  # of every instrument scene
+    samplers: tuple[Sampler, ...] = ()  # of every instrument scene
+    prescribed: ClassVar[bool] = False
 
     @classmethod
     def of(cls, tissue: GaussianScene, instrument_scenes: Sequence[GaussianScene]) -> Mixture:
@@ -274,7 +264,7 @@ class Mixture:
             gain = torch.ones(3)
             if tissue is not scene and tissue.instruments:  # assuming that both shafts have the same grey
                 ratio = _shaft_color(tissue) / _shaft_color(scene).clamp_min(1e-3)
-                gain = ratio.clamp(*MIXING.gain_range)
+                gain = ratio.clamp(*IMAGES.gain_range)
             gains.append((float(gain[0]), float(gain[1]), float(gain[2])))
         depths = []
         for recorded, scene in ((scene.recorded, scene) for scene in instrument_scenes):
@@ -296,8 +286,8 @@ class Mixture:
         mixture.scene.recorded = mixture._recorded()
         return mixture
 
-    def sampler(self, settings: Settings) -> MixedSampler:
-        """Return the sampler of placed instruments, each from its own run's sampler."""
+    def sampler(self, settings: Settings) -> Mixture:
+        """Return the mixture as a sampler of placed instruments, each from its own run's sampler."""
         if settings.states not in ("interpolate", "extrapolate"):
             fitting = "with --instruments use interpolate or extrapolate"
             raise NeecoError(f"--states: {settings.states}: states of one recording; {fitting}")
@@ -305,7 +295,20 @@ class Mixture:
             raise NeecoError("--views: orbit is about one recording's tissue; with --instruments use another")
         states, margin, count = settings.states, settings.margin, settings.count
         samplers = (make_sampler(scene, states, margin, "recorded", count) for scene in self.instrument_scenes)
-        return MixedSampler(self, tuple(samplers))
+        return replace(self, samplers=tuple(samplers))
+
+    def fixed(self, index: int) -> bool:
+        """Return False: every sample differs."""
+        return False
+
+    def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
+        """Return the next (state, camera) for image `index`."""
+        cameras = self.tissue.recorded.cameras
+        camera = cameras[int(rng.integers(len(cameras)))]
+        placed: dict[str, InstrumentState] = {}
+        for scene, sampler in zip(self.instrument_scenes, self.samplers, strict=True):
+            placed |= self.place(scene, *sampler(index, rng), camera)
+        return State(placed, 0.0), camera
 
     def place(self, scene: GaussianScene, state: State, seen_by: Camera, camera: Camera) -> dict[str, InstrumentState]:
         """Return the instruments of instrument scene `scene`, in `state` relative to `seen_by`, placed relative to
@@ -330,7 +333,7 @@ class Mixture:
     def _recorded(self) -> Recorded:
         """Return frames at the tissue's cameras, with the instruments' recorded states placed there."""
         cameras = self.tissue.recorded.cameras
-        count = min(MIXING.n_recorded_frames, len(cameras))
+        count = min(IMAGES.n_recorded_frames, len(cameras))
         chosen, states = [], []
         for k in range(count):
             camera = cameras[round(k * (len(cameras) - 1) / max(1, count - 1))]
@@ -345,29 +348,6 @@ class Mixture:
         return Recorded(
             names, ("train",) * count, tuple(states), tuple(chosen), lens=self.tissue.recorded.lens, still=still
         )
-
-
-@dataclass(frozen=True)
-class MixedSampler:
-    """Samples (state, camera): a recorded camera of the tissue's run, with a placed sample of every instrument
-    scene."""
-
-    mixture: Mixture
-    samplers: tuple[Sampler, ...]
-    prescribed: bool = False
-
-    def fixed(self, index: int) -> bool:
-        """Return False: every sample differs."""
-        return False
-
-    def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
-        """Return the next (state, camera) for image `index`."""
-        cameras = self.mixture.tissue.recorded.cameras
-        camera = cameras[int(rng.integers(len(cameras)))]
-        placed: dict[str, InstrumentState] = {}
-        for scene, sampler in zip(self.mixture.instrument_scenes, self.samplers, strict=True):
-            placed |= self.mixture.place(scene, *sampler(index, rng), camera)
-        return State(placed, 0.0), camera
 
 
 def _working_end(scene: GaussianScene, state: State, camera: Camera) -> np.ndarray:
@@ -390,7 +370,7 @@ def tissue_depth(tissue: Gaussians, camera: Camera, point: np.ndarray) -> float:
 
     Beyond the image border, that of the nearest pixel.
     """
-    coarse = camera.scaled(MIXING.depth_scale)
+    coarse = camera.scaled(IMAGES.depth_scale)
     rendering = rasterize(tissue, coarse)
     x, y = project(point, coarse.fx, coarse.fy, coarse.cx, coarse.cy, nearest=camera.near)
     row, column = (int(np.clip(value, 0, size - 1)) for value, size in ((y, coarse.height), (x, coarse.width)))
@@ -442,6 +422,6 @@ def _shaft_color(scene: GaussianScene) -> Tensor:
     """Return the mean colour [3], at 100 mm, of the solid Gaussians of the instruments' shafts."""
     labels = scene.label_channels()
     shaft = [k for k, (_, part) in enumerate(scene.label_names) if part in ("shaft", "instrument")]
-    weight = labels[:, shaft].sum(1) * (torch.sigmoid(scene.canonical.opacity_logits) > MIXING.min_shaft_opacity)
+    weight = labels[:, shaft].sum(1) * (torch.sigmoid(scene.canonical.opacity_logits) > IMAGES.min_shaft_opacity)
     color = (scene.canonical.sh_dc[:, 0] * SH_C0 + 0.5).clamp(0, 1)
     return (weight[:, None] * color).sum(0) / weight.sum().clamp_min(1e-6)

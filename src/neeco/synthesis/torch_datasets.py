@@ -146,7 +146,18 @@ class LabelledImages(Dataset[Sample]):
         self._spec: GeneratorSpec | None = None  # opened for the first sample of another process
 
     def __getstate__(self) -> dict[str, Any]:
-        spec = self._spec or _spec(self._opened, self._settings)
+        spec = self._spec
+        if spec is None:  # the generator of these scenes, for another process
+            device = str(self._opened[0][0].center.device)
+            paths = [path for _, path in self._opened if path is not None]
+            if len(paths) == len(self._opened):
+                spec = GeneratorSpec(tuple(paths), self._settings, device)
+            else:
+                with tempfile.TemporaryDirectory() as folder:
+                    paths = [Path(folder) / f"{k}.safetensors" for k in range(len(self._opened))]
+                    for (scene, _), path in zip(self._opened, paths, strict=True):
+                        save_scene(scene, path)
+                    spec = GeneratorSpec(tuple(paths), self._settings, device).packed()
         return vars(self) | {"_opened": [], "_spec": spec, "_generator": None}
 
     def __repr__(self) -> str:
@@ -194,16 +205,3 @@ def _opened(source: SceneLike) -> tuple[GaussianScene, Path | None]:
     folder = getattr(run, "path", None)  # a run has one
     gaussians = require_gaussians(getattr(scene, "learned", scene), ASKED_BY)
     return gaussians, None if folder is None else Path(folder) / SCENE_FILE
-
-
-def _spec(opened: Sequence[tuple[GaussianScene, Path | None]], settings: Settings) -> GeneratorSpec:
-    """The generator of these scenes, for another process."""
-    device = str(opened[0][0].center.device)
-    paths = [path for _, path in opened if path is not None]
-    if len(paths) == len(opened):
-        return GeneratorSpec(tuple(paths), settings, device)
-    with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / f"{k}.safetensors" for k in range(len(opened))]
-        for (scene, _), path in zip(opened, paths, strict=True):
-            save_scene(scene, path)
-        return GeneratorSpec(tuple(paths), settings, device).packed()

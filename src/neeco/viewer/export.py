@@ -74,11 +74,6 @@ def export_page(run: Path, output: Path, sh_degree: int, device: torch.device) -
     return f"{output}: {len(page) / 1e6:.2f} MB, {trained.scene.num_gaussians:,} Gaussians; open it in any browser"
 
 
-def embedded_page(run: TrainedRun) -> str | None:
-    """Return the page of a run for a frame in its report; None if unsupported."""
-    return None if why_not(run.scene) else page_of_run(run, EXPORT.embedded_degree)
-
-
 def page_of_run(run: TrainedRun, sh_degree: int) -> str:
     """Return the page of a run, harmonics up to `sh_degree`. Raises NeecoError if unsupported (`why_not`)."""
     scene, packed = run.scene, pack(run.scene, sh_degree)

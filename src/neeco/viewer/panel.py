@@ -6,7 +6,6 @@ import html
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,30 +13,14 @@ import numpy as np
 
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.synthesis.samplers import JointRange, Shaft
-from neeco.viewer.runs import FrameScore, LoadedRun, Timeline
-from neeco.viewer.views import IMAGE, Controls, InstrumentControls, Picture, slider_ranges, views_of
+from neeco.viewer.runs import VIEWER, FrameScore, LoadedRun, Timeline
+from neeco.viewer.views import IMAGE, Controls, InstrumentControls, Overlays, Picture, slider_ranges, views_of
 
 if TYPE_CHECKING:
     import viser
 
-    from neeco.viewer.views import Overlays
-
-
-@dataclass(frozen=True, kw_only=True)
-class PanelSettings:
-    """Settings of the panel's sliders and plots."""
-
-    slide_mm: float = 30.0  # range in mm of position sliders, to either side
-    yaw_deg: float = 45.0  # range in degrees of yaw and pitch sliders, to either side
-    plots_every_s: float = 0.5  # minimum s between two plots while scores arrive
-    plot_height: int = 140  # height of the plot in px
-    line: int = 80  # maximum length of a name or message
-
-
-PANEL = PanelSettings()
 
 NONE_CHOSEN = "—"
-PLOT_COLOR = "#228be6"
 
 
 class Panel:
@@ -108,7 +91,7 @@ class Panel:
         """Plot the PSNR of the frames scored so far, and list the worst."""
         so_far = timeline, timeline.count
         now = time.perf_counter()
-        if so_far == self._plotted or (not timeline.done and now - self._plotted_at < PANEL.plots_every_s):
+        if so_far == self._plotted or (not timeline.done and now - self._plotted_at < VIEWER.plots_every_s):
             return
         self._plotted, self._plotted_at = so_far, now
         names, splits = self._loaded.recorded.names, self._loaded.recorded.splits
@@ -120,8 +103,8 @@ class Panel:
         if self._plot is not None:
             self._plot.data = data
         else:
-            label = f"{self._loaded.name} (dB)"[: PANEL.line]
-            line = {"label": label, "stroke": PLOT_COLOR, "width": 1.5, "points": {"show": False}}
+            label = f"{self._loaded.name} (dB)"[: VIEWER.line]
+            line = {"label": label, "stroke": "#228be6", "width": 1.5, "points": {"show": False}}
             with self._timeline_folder:
                 self._plot = self._gui.add_uplot(
                     data,
@@ -129,7 +112,7 @@ class Panel:
                     scales={"x": {"time": False}, "y": {"auto": True}},
                     axes=({"size": 32}, {"size": 34}),
                     legend={"show": False},
-                    height=PANEL.plot_height,
+                    height=VIEWER.plot_height,
                     padding=(6, 8, 0, 0),
                 )
         if self.worst.value == NONE_CHOSEN:
@@ -181,11 +164,11 @@ class InstrumentPanel:
                 begin = min(max(0.0, lower), upper)
                 self._joints[joint] = gui.add_slider(f"{joint} ({unit})", lower, upper, step, begin)
             about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
-            end, angle = "About the shaft's end.", PANEL.yaw_deg
+            end, angle = "About the shaft's end.", VIEWER.yaw_deg
             self._moves = [  # slide in mm; roll, yaw and pitch in degrees
                 gui.add_slider(label, -most, most, step, 0.0, hint=hint)
                 for label, most, step, hint in (
-                    ("along shaft (mm)", PANEL.slide_mm, 0.5, f"Along {about}."),
+                    ("along shaft (mm)", VIEWER.slide_mm, 0.5, f"Along {about}."),
                     ("roll (°)", 180.0, 1.0, f"About {about}."),
                     ("yaw (°)", angle, 0.5, end),
                     ("pitch (°)", angle, 0.5, end),
@@ -276,15 +259,15 @@ def status_html(
         lines.append("still scope: views far from the recorded one show what no frame saw")
     height, width = picture.depth.shape
     lines.append(f"{seconds * 1e3:.0f} ms at {width} × {height}")
-    return _block([*lines, *(_text(note, 3 * PANEL.line) for note in notes if note)])
+    return _block([*lines, *(_text(note, 3 * VIEWER.line) for note in notes if note)])
 
 
 def message_html(text: str) -> str:
     """HTML of one message."""
-    return _block([_text(text, 4 * PANEL.line)]) if text else ""
+    return _block([_text(text, 4 * VIEWER.line)]) if text else ""
 
 
-def _text(text: str, most: int = PANEL.line) -> str:
+def _text(text: str, most: int = VIEWER.line) -> str:
     """Text on one line, at most `most` characters, escaped."""
     line = " ".join(str(text).split())
     return html.escape(line if len(line) <= most else line[: most - 1] + "…")

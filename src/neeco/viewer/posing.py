@@ -12,12 +12,12 @@ import json
 import math
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from urllib.parse import unquote
 
 import cv2
@@ -41,35 +41,26 @@ from neeco.labels.drawing import draw
 from neeco.training.run import load_run
 from neeco.viewer.access import HOST, MAX_MESSAGE, PORT, Access, family_of, quiet
 
-RUN_FILE = "config.yaml"  # tells a run from a capture
 STATE = {"index": int, "roll": float, "joints": {str: float}}  # degrees
 # what a page may ask, and its fields: by GET, and over the web socket
 IMAGES: dict[str, dict[str, Any]] = {"picture": {"index": int, "small": bool}, "ghost": STATE}
 QUESTIONS: dict[str, dict[str, Any]] = {"overview": {}, "frame": {"index": int}, "save": STATE, "undo": {}}
 
 
-@dataclass(frozen=True, kw_only=True)
-class PictureSettings:
-    """Pictures of a frame along the shaft."""
-
-    before: float = 0.6  # length before the shaft's end, as a share of the working length
-    beyond: float = 1.4  # length beyond the shaft's end, as that share
-    aside: float = 0.65  # width to either side, as that share
-    width: int = 1000  # width of a picture in px
-    thumbnail_width: int = 160  # width of a thumbnail in px
-    ghost_width: int = 500  # width of a ghost in px
-    jpeg_quality: int = 90
-    joint_range_deg: tuple[float, float] = (0.0, 120.0)  # of a slider, where the capture states no limits
-
-
-PICTURES = PictureSettings()
-
-
 class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
     """A running server on one capture; `address` is what to open. Use as a context manager, or call `stop`.
 
-    Any thread may call it: one or more browsers pose the capture.
+    Any thread may call it: one or more browsers pose the capture. Pictures are of frames along the shaft.
     """
+
+    before: ClassVar[float] = 0.6  # length before the shaft's end, as a share of the working length
+    beyond: ClassVar[float] = 1.4  # length beyond the shaft's end, as that share
+    aside: ClassVar[float] = 0.65  # width to either side, as that share
+    picture_width: ClassVar[int] = 1000  # width of a picture in px
+    thumbnail_width: ClassVar[int] = 160  # width of a thumbnail in px
+    ghost_width: ClassVar[int] = 500  # width of a ghost in px
+    jpeg_quality: ClassVar[int] = 90
+    joint_range_deg: ClassVar[tuple[float, float]] = (0.0, 120.0)  # of a slider, where the capture states no limits
 
     def __init__(self, root: Path, host: str = HOST, port: int = PORT) -> None:
         """root: a capture, or a run of one, whose scene then appears as a ghost. port: or the next that is free. Raises
@@ -79,7 +70,7 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
         except ImportError:
             raise NeecoError(f"view: needs viser; {install_hint('view')}") from None
         # posing changes the capture's states, so that a run of it is always of an earlier one
-        run = load_run(root, force=True) if (root / RUN_FILE).exists() else None
+        run = load_run(root, force=True) if (root / "config.yaml").exists() else None
         self.scene = None if run is None else run.scene
         self.posed = PosedCapture(root if run is None else run.capture().root)
         self._lock, self._drawing = threading.Lock(), threading.Lock()
@@ -218,7 +209,7 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
     def picture(self, instrument: str, index: int, small: bool) -> tuple[bytes, str]:
         """A frame along the shaft, which points to the right, and its media type. Raises NeecoError."""
         pixels = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
-        width, quality = PICTURES.thumbnail_width if small else PICTURES.width, PICTURES.jpeg_quality
+        width, quality = self.thumbnail_width if small else self.picture_width, self.jpeg_quality
         along = self._along_shaft(instrument, index, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), width)
         return cv2.imencode(".jpeg", along, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes(), "image/jpeg"
 
@@ -240,7 +231,7 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
             raise NeecoError("ghost: the run's scene does not tell instruments from tissue; train method kinematic")
         color = (drawing.image.numpy()[..., ::-1] * 255).round().astype(np.uint8)
         pixels = np.dstack([color, (drawing.parts.numpy() > 0).astype(np.uint8) * 255])
-        along = self._along_shaft(instrument, index, pixels, PICTURES.ghost_width)
+        along = self._along_shaft(instrument, index, pixels, self.ghost_width)
         return cv2.imencode(".png", along)[1].tobytes(), "image/png"
 
     def _along_shaft(self, instrument: str, index: int, pixels: np.ndarray, width: int) -> np.ndarray:
@@ -285,7 +276,7 @@ class PosingServer(contextlib.AbstractContextManager["PosingServer"]):
             "length": posing.shafts.working_length_mm,
             "radius": posing.shafts.diameter_mm / 2,
             "joints": {
-                name: PICTURES.joint_range_deg if span is None else [math.degrees(end) for end in span]
+                name: self.joint_range_deg if span is None else [math.degrees(end) for end in span]
                 for name, span in limits.items()
             },
         }
@@ -301,7 +292,7 @@ def page() -> bytes:
 
 def _window(posing: SolvedPosing) -> list[float]:
     """Left, right (mm along the shaft), top and bottom (across) of a picture."""
-    shares = (-PICTURES.before, PICTURES.beyond, -PICTURES.aside, PICTURES.aside)
+    shares = (-PosingServer.before, PosingServer.beyond, -PosingServer.aside, PosingServer.aside)
     return [share * posing.shafts.working_length_mm for share in shares]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,11 +12,11 @@ import numpy as np
 
 from neeco.base.errors import NeecoError
 from neeco.capture import read_capture
-from neeco.capture.model import Capture, Frame
+from neeco.capture.model import Frame
 from neeco.labels.drawing import to_numpy
 from neeco.viewer.access import HOST, PORT
 from neeco.viewer.panel import message_html
-from neeco.viewer.runs import VIEW, median_distance
+from neeco.viewer.runs import VIEWER, median_distance
 from neeco.viewer.server import ViserPage
 from neeco.viewer.views import Overlays, aspect_of, browser_camera, fitting_view, jump, stands_at, wxyz_of
 
@@ -25,18 +24,6 @@ if TYPE_CHECKING:
     import viser
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecordingViewSettings:
-    """Settings of how a recording is shown."""
-
-    image_px: int = 720  # high at most, of the image behind the scene
-    axis_share: float = 0.1  # length of an axis, of the distance from which the scene is viewed
-    # RGB, of the instruments in turn
-    track_colors: tuple[tuple[int, int, int], ...] = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167))
-
-
-RECORDING = RecordingViewSettings()
-AXIS_UNITS = RECORDING.axis_share * VIEW.distance_units
 UNREGISTERED = "instruments are not shown: their poses are not in the cameras' frame"
 
 
@@ -52,22 +39,21 @@ class RecordingServer(ViserPage):
             (frame.camera, middle or [to_numpy(item.pose)[:3, 3] for item in frame.state.instruments.values()])
             for frame in frames
         )
-        self.unit = VIEW.distance_units / self.distance
+        self.unit = VIEWER.distance_units / self.distance
         super().__init__(host, port, [frame.camera for frame in frames], self.distance, self.unit)
         self.sessions: dict[int, RecordingSession] = {}
-
-        def connect(client: viser.ClientHandle) -> None:
-            self.sessions[client.client_id] = RecordingSession(client, self.capture, self.unit, self.distance)
-
-        self._server.on_client_connect(connect)
+        self._server.on_client_connect(
+            lambda client: self.sessions.update({client.client_id: RecordingSession(client, self)})
+        )
         self._server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
 
 
 class RecordingSession:
     """One browser's view of a capture. viser draws everything over the image of the frame whose camera it stands at."""
 
-    def __init__(self, client: viser.ClientHandle, capture: Capture, unit: float, distance: float) -> None:
-        self._client, self._capture, self._unit, self._distance = client, capture, unit, distance
+    def __init__(self, client: viser.ClientHandle, server: RecordingServer) -> None:
+        capture, unit = server.capture, server.unit
+        self._client, self._capture, self._unit, self._distance = client, capture, unit, server.distance
         self._lock, self._shown = threading.RLock(), (-1, 0.0)
         gui, scene, cameras = client.gui, client.scene, [frame.camera for frame in capture.frames]
         overlays = Overlays(client, cameras, capture.points, unit, self.go_to, lambda: None)
@@ -85,11 +71,13 @@ class RecordingSession:
             tracked = [frame.state.instruments.get(name) for frame in capture.frames]
             places = [to_numpy(item.pose)[:3, 3] * unit for item in tracked if item is not None]
             path = np.array(places, np.float32).reshape(-1, 3)
-            color = RECORDING.track_colors[number % len(RECORDING.track_colors)]
+            color = VIEWER.track_colors[number % len(VIEWER.track_colors)]
             ends = np.stack([path[:-1], path[1:]], 1)
             if len(ends):
                 scene.add_line_segments(f"/tracks/{number}", ends, color, thickness=2, thickness_units="screen")
-            self.axes[name] = scene.add_frame(f"/axes/{number}", axes_length=AXIS_UNITS, axes_radius=AXIS_UNITS / 25)
+            self.axes[name] = scene.add_frame(
+                f"/axes/{number}", axes_length=VIEWER.axis_units, axes_radius=VIEWER.axis_units / 25
+            )
         paths.on_update(lambda _: setattr(tracks, "visible", paths.value))
         for handle in (cones, points):
             handle.on_update(lambda _: overlays.show(cones.value, points.value))
@@ -127,7 +115,7 @@ class RecordingSession:
             index, window = self._index, self._client.camera
             frame, aspect = self._capture.frames[index], aspect_of(window)
             with contextlib.suppress(ValueError):  # a camera that is none
-                if not stands_at(browser_camera(window, self._unit, RECORDING.image_px), frame.camera, self._distance):
+                if not stands_at(browser_camera(window, self._unit, VIEWER.image_px), frame.camera, self._distance):
                     aspect = 0.0
             if (index, aspect) == self._shown:
                 return
@@ -147,8 +135,8 @@ def image_behind(frame: Frame, aspect: float) -> np.ndarray:
     viser has it. Raises NeecoError."""
     camera = frame.camera
     image = (frame.load_image().numpy() * 255).round().astype(np.uint8)
-    focal = RECORDING.image_px / 2 / np.tan(fitting_view(camera, aspect) / 2)
-    size = max(1, round(RECORDING.image_px * aspect)), RECORDING.image_px
+    focal = VIEWER.image_px / 2 / np.tan(fitting_view(camera, aspect) / 2)
+    size = max(1, round(VIEWER.image_px * aspect)), VIEWER.image_px
     across, down = focal / camera.fx, focal / camera.fy
     place = np.array([[across, 0, size[0] / 2 - across * camera.cx], [0, down, size[1] / 2 - down * camera.cy]])
     place[:, 2] += (place[:, :2].sum(1) - 1) / 2  # OpenCV counts from the first pixel's centre

@@ -40,18 +40,54 @@ from neeco.training.run import SCENE_FILE, checkpoint_path, read_checkpoint, rea
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunViewSettings:
-    """Settings of the view of a run."""
+class ViewerSettings:
+    """Settings of what the viewer of a run or a capture renders, places in the scene and lists, and when."""
 
+    # runs
     assumed_mm: float = 100.0  # distance in mm from a camera to what it sees, where none looks at the scene's centre
     distance_units: float = 10.0  # distance from a recorded camera to what it looks at, in viser's units of length
     watch_s: float = 2.0  # s between two checks of the run folder
     timeline_width: int = 320  # limit on the width in px of the images that a timeline compares
     field_width: int = 48  # the same limit for a radiance field, which takes a hundred times as long
     worst: int = 8  # number of frames that a timeline lists
+    # rendering
+    settled_s: float = 0.15  # s without a request after which a sharp picture is rendered
+    idle_s: float = 0.5  # maximum s between two checks for requests
+    moving_px: int = 256  # maximum height in px during motion
+    sharp_px: int = 720  # maximum height in px of a sharp rendering
+    min_px: int = 32  # minimum height in px
+    moving_s: float = 0.15  # maximum s of a rendering during motion
+    sharp_s: float = 0.4  # maximum s of a sharp rendering
+    remembered: int = 3  # number of timed renderings, robust to one that computed something first
+    jpeg_moving: int = 80  # JPEG quality during motion
+    jpeg_sharp: int = 92  # JPEG quality of a sharp rendering
+    played_per_s: float = 10.0  # frames per s of `play`
+    status_every_s: float = 0.25  # minimum s between two updates of the status during motion
+    # the browser's camera, and what is placed in the scene
+    max_aspect: float = 8.0  # of a window's width to its height, or the reverse
+    narrowest: float = 0.01  # rad, field of view
+    widest: float = 3.0  # rad, field of view
+    same_place: float = 2e-4  # of the distance to what is looked at
+    same_turn: float = 1e-3  # rad
+    max_frusta: int = 24  # of cameras
+    max_points: int = 20_000  # of a sparse cloud
+    frustum_units: float = 0.06 * distance_units  # size of a camera's frustum
+    gizmo_units: float = 0.2 * distance_units  # length of axes
+    point_units: float = 0.005 * distance_units  # size of a point
+    axis_units: float = 0.1 * distance_units  # length of the axes of a recording's instruments
+    frustum_color: tuple[int, int, int] = (255, 200, 0)
+    # RGB, of the tracks of a recording's instruments in turn
+    track_colors: tuple[tuple[int, int, int], ...] = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167))
+    image_px: int = 720  # high at most, of the recorded image behind the scene
+    # panel
+    slide_mm: float = 30.0  # range in mm of position sliders, to either side
+    yaw_deg: float = 45.0  # range in degrees of yaw and pitch sliders, to either side
+    plots_every_s: float = 0.5  # minimum s between two plots while scores arrive
+    plot_height: int = 140  # height of the plot in px
+    line: int = 80  # maximum length of a name or message
 
 
-VIEW = RunViewSettings()
+VIEWER = ViewerSettings()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -99,7 +135,7 @@ def median_distance(looked_at: Iterable[tuple[Camera, Sequence[np.ndarray]]]) ->
         pose = to_numpy(camera.world_from_camera)
         depths += [float((place - pose[:3, 3]) @ pose[:3, 2]) for place in places]
     ahead = [depth for depth in depths if depth > 0]
-    return float(np.median(ahead)) if ahead else VIEW.assumed_mm
+    return float(np.median(ahead)) if ahead else VIEWER.assumed_mm
 
 
 class ViewedRun:
@@ -114,7 +150,7 @@ class ViewedRun:
         self.loaded = self._load()  # replaced as a whole: a reader never sees half of a change
         self.trouble = ""
         self.distance = self.loaded.distance  # mm
-        self.unit = VIEW.distance_units / self.distance  # viser's units per mm
+        self.unit = VIEWER.distance_units / self.distance  # viser's units per mm
         self.timeline = Timeline(self.loaded)
         self.ended = threading.Event()  # of `watch`
 
@@ -142,7 +178,7 @@ class ViewedRun:
         no longer be read; until `ended` is set."""
 
         def look() -> None:
-            while not self.ended.wait(VIEW.watch_s):
+            while not self.ended.wait(VIEWER.watch_s):
                 trouble = self.trouble
                 if self.refresh() or trouble != self.trouble:
                     changed()
@@ -254,19 +290,19 @@ class Timeline:
 
     def worst(self) -> list[int]:
         """The worst known frames, worst first; of similar neighbours only the worst."""
-        frames, apart = self.known, max(1, len(self.psnr) // (4 * VIEW.worst))
+        frames, apart = self.known, max(1, len(self.psnr) // (4 * VIEWER.worst))
         chosen: list[int] = []
         for frame in frames[np.argsort(self.psnr[frames], kind="stable")].tolist():
             if all(abs(frame - other) >= apart for other in chosen):
                 chosen.append(frame)
-        return chosen[: VIEW.worst]
+        return chosen[: VIEWER.worst]
 
 
 @torch.no_grad()
 def coarse_psnr(loaded: LoadedRun, index: int) -> float:
     """PSNR in dB of one frame, rendered and recorded at no more than `timeline_width` px. Raises NeecoError."""
     frame = loaded.frames[index]
-    width = VIEW.timeline_width if loaded.scene.has_gaussians else VIEW.field_width
+    width = VIEWER.timeline_width if loaded.scene.has_gaussians else VIEWER.field_width
     camera = frame.camera.scaled(min(1.0, width / frame.camera.width))
     size = camera.width, camera.height
     image = cv2.resize(frame.load_image().numpy(), size, interpolation=cv2.INTER_AREA)
@@ -277,22 +313,14 @@ def coarse_psnr(loaded: LoadedRun, index: int) -> float:
     return psnr(rendered, torch.from_numpy(image), mask)
 
 
-FOLDER = "kept"  # of the run
-STATES, SAMPLES = "states.jsonl", "samples"
-
-
 class SavedStates:
     """Writes into one run's folder `kept/`, whoever of several users asks. Any thread may call it. size: of images."""
 
     def __init__(self, run: Path, size: SizeSettings = RECORDED_SIZE) -> None:
         self.size = size
-        self.folder = Path(run) / FOLDER
+        self.folder = Path(run) / "kept"
+        self.states_path = self.folder / "states.jsonl"  # for `synthesize --states`
         self._lock = threading.Lock()
-
-    @property
-    def states_path(self) -> Path:
-        """File for `synthesize --states`."""
-        return self.folder / STATES
 
     def add(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> int:
         """Add a state and the camera [4, 4] that sees it (OpenCV axes, mm); returns how many are saved. Raises
@@ -319,7 +347,7 @@ class SavedStates:
         with scene.torch_threads(), torch.no_grad():
             drawing = draw_layers(scene, labeller, state, camera, Settings.min_component)
             labels = labels_of(scene, drawing, annotate(scene, drawing, labeller.names))
-        root = self.folder / SAMPLES
+        root = self.folder / "samples"
         with self._lock, own_folder(root, wait_s=LOCK_WAIT_S):
             index = 0
             while record_path(root, index).exists() and load_record(root, index) is not None:

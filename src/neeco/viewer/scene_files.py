@@ -22,7 +22,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from zstandard import ZstdCompressor
 from neeco.base.errors import NeecoError, install_hint
 from neeco.base.files import write_atomically
 from neeco.capture.model import Camera, InstrumentState, State
+from neeco.capture.points import encoded_ply
 from neeco.capture.readers import read_states
 from neeco.evaluation.image_metrics import to_uint8
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply, quat_to_matrix, rotate_about, spread_directions
@@ -43,8 +44,6 @@ from neeco.raster.types import Gaussians
 from neeco.scene import GaussianScene
 from neeco.scene.drawable import ArticulatedMotion
 
-Format = Literal["ply", "spz"]
-SpzVersion = Literal[3, 4]
 DIRECTIONS = 64  # by which harmonics are rotated: four times as many as there are harmonics
 MIN_SCALE = 1e-30  # mm: the logarithm of 0 is no number of a file
 SPZ_MAGIC = 0x5053474E
@@ -107,12 +106,6 @@ def splats_of(scene: GaussianScene, state: State, camera: Camera, *, moving: boo
     return Splats(*(tensor.float().cpu().numpy() for tensor in tensors))
 
 
-def write_splats(splats: Splats, path: Path, format: Format, spz_version: SpzVersion = 4) -> None:
-    """Write a file of that format. Raises NeecoError where the format cannot hold them, or the disk refuses."""
-    data = ply_bytes(splats) if format == "ply" else spz_bytes(splats, spz_version)
-    write_atomically(path, lambda temporary: temporary.write_bytes(data))
-
-
 def ply_bytes(splats: Splats) -> bytes:
     """The file that 3D Gaussian splatting's own code writes (Kerbl et al. 2023), binary, little-endian."""
     count, coefficients = splats.sh.shape[:2]
@@ -122,12 +115,10 @@ def ply_bytes(splats: Splats) -> bytes:
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     columns = [splats.means, np.zeros_like(splats.means), splats.sh[:, 0], rest, splats.logits[:, None]]
     table = np.concatenate([*columns, splats.log_scales, splats.quats], 1).astype("<f4")
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [*(f"property float {name}" for name in names), "end_header", ""]
-    return "\n".join(lines).encode() + table.tobytes()
+    return encoded_ply(table.view([(name, "<f4") for name in names])[:, 0])
 
 
-def spz_bytes(splats: Splats, version: SpzVersion = 4) -> bytes:
+def spz_bytes(splats: Splats, version: Literal[3, 4] = 4) -> bytes:
     """Niantic's SPZ: about a tenth of the size of PLY; version 4 is compressed by Zstandard, 3 by gzip. Raises
     NeecoError where positions leave its range."""
     turn = np.array([1, -1, -1], np.float32)
@@ -181,18 +172,6 @@ def _in_world(posed: Gaussians) -> Tensor:
     return torch.einsum("nkl,nlc->nkc", turned[which], posed.sh)
 
 
-@dataclass(frozen=True, kw_only=True)
-class MovingSettings:
-    """Settings of scenes that move."""
-
-    frame_s: float = 1 / 15  # between states without increasing times
-    least_weight: float = 0.9  # of a link, below which a Gaussian blends links
-    meters_per_unit: float = 0.001  # of OpenUSD's stage
-    extent_sd: float = 3.0  # standard deviations to which a Gaussian counts for the extent
-    codes_per_second: float = 1000.0  # time codes: states keep their times to the ms
-
-
-MOVING = MovingSettings()
 EXTENSION, SCHEMA = "KHR_gaussian_splatting", "ParticleField3DGaussianSplat"  # of glTF, of OpenUSD
 Unit = Literal["m", "cm", "mm"]
 UNITS: Mapping[Unit, float] = {"m": 1e-3, "cm": 0.1, "mm": 1.0}  # of the file, per mm
@@ -221,6 +200,11 @@ class MovingScene:
     nodes: tuple[MovingNode, ...]  # parents before their children
     times: np.ndarray  # [T] s, from 0 on; `frame_s` apart where the states have none that increase
     blended: float  # share of the instruments' Gaussians that blend links: right in the first state only
+    frame_s: ClassVar[float] = 1 / 15  # between states without increasing times
+    least_weight: ClassVar[float] = 0.9  # of a link, below which a Gaussian blends links
+    meters_per_unit: ClassVar[float] = 0.001  # of OpenUSD's stage
+    extent_sd: ClassVar[float] = 3.0  # standard deviations to which a Gaussian counts for the extent
+    codes_per_second: ClassVar[float] = 1000.0  # time codes: states keep their times to the ms
 
 
 def exported_states(scene: GaussianScene, first: State, states: Path | None) -> list[State]:
@@ -243,7 +227,7 @@ def moving_scene(scene: GaussianScene, states: Sequence[State], camera: Camera) 
     splats = splats_of(scene, states[0], camera, moving=motion is not None)
     times = np.array([float(state.time) for state in states])
     if not (np.diff(times) > 0).all():
-        times = MOVING.frame_s * np.arange(len(states))
+        times = MovingScene.frame_s * np.arange(len(states))
     times = (times - times[0]).astype(np.float32)
     if motion is None:
         return MovingScene((MovingNode(name="tissue", splats=splats),), times, 0.0)
@@ -281,7 +265,7 @@ def moving_scene(scene: GaussianScene, states: Sequence[State], camera: Camera) 
                 local = local_splats(splats, link_rows[parts == part], bodies[0] @ poses[0])
                 facts = {"instrument": instrument.name, "part": name, "link": link}
                 nodes.append(MovingNode(name=name, parent=body, poses=poses, splats=local, facts=facts))
-    blended = [weights.max(1).values < MOVING.least_weight for weights, _ in motion.links]
+    blended = [weights.max(1).values < MovingScene.least_weight for weights, _ in motion.links]
     share = float(torch.cat(blended).float().mean()) if blended else 0.0
     return MovingScene(tuple(nodes), times, share)
 
@@ -313,7 +297,6 @@ def _link_pose(motion: ArticulatedMotion, number: int, link: int, state: Instrum
 class _Document:
     """JSON and binary chunk while they are put together."""
 
-    per_mm: float  # units of the file
     content: dict[str, Any] = field(default_factory=lambda: {"accessors": [], "bufferViews": [], "meshes": []})
     nodes: list[dict[str, Any]] = field(default_factory=list)
     binary: bytearray = field(default_factory=bytearray)
@@ -345,20 +328,11 @@ class _Document:
             self.nodes[parent].setdefault("children", []).append(len(self.nodes) - 1)
         return len(self.nodes) - 1
 
-    def packed(self) -> bytes:
-        """Return the file."""
-        self.content["buffers"] = [{"byteLength": len(self.binary)}]
-        text = json.dumps(self.content | {"nodes": self.nodes}, separators=(",", ":"), allow_nan=False).encode()
-        text += b" " * (-len(text) % 4)
-        size = 12 + 8 + len(text) + 8 + len(self.binary)
-        chunks = struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(self.binary), b"BIN\0")
-        return struct.pack("<4sII", b"glTF", 2, size) + b"".join(chunks) + bytes(self.binary)
-
 
 def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") -> None:
     """Write the scene and its camera as glTF, lengths in `unit`: the root turns the capture's world (right, down,
     front) by 180 degrees about z to glTF's axes. Raises NeecoError where the disk refuses."""
-    document = _Document(UNITS[unit])
+    document, per_mm = _Document(), UNITS[unit]
     root = document.node("neeco", rotation=TURN.tolist())
     clock: int | None = None
     channels: list[dict[str, Any]] = []
@@ -369,7 +343,7 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") 
         if item.poses is not None:  # the first at rest, all of them as an animation
             if clock is None and len(scene.times) > 1:
                 clock = document.add(scene.times, bounds=True)
-            rotations, places = _rotations(item.poses), (item.poses[:, :3, 3] * document.per_mm).astype(np.float32)
+            rotations, places = _rotations(item.poses), (item.poses[:, :3, 3] * per_mm).astype(np.float32)
             document.nodes[node] |= {"rotation": rotations[0].tolist(), "translation": places[0].tolist()}
             for target, values in (("rotation", rotations), ("translation", places)):
                 if clock is not None and np.ptp(values, axis=0).max() > 0:
@@ -377,11 +351,11 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") 
                     channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": target}})
         if (splats := item.splats) is not None:  # in the node's frame
             colors = np.concatenate([splats.sh[:, 0] * SH_C0 + 0.5, splats.opacities[:, None]], 1)
-            columns = {"SCALE": np.exp(splats.log_scales) * document.per_mm, "OPACITY": splats.opacities}
+            columns = {"SCALE": np.exp(splats.log_scales) * per_mm, "OPACITY": splats.opacities}
             for degree in range(splats.degree + 1):
                 for order in range(2 * degree + 1):
                     columns[f"SH_DEGREE_{degree}_COEF_{order}"] = splats.sh[:, degree**2 + order]
-            attributes = {"POSITION": document.add((splats.means * document.per_mm).astype(np.float32), bounds=True)}
+            attributes = {"POSITION": document.add((splats.means * per_mm).astype(np.float32), bounds=True)}
             attributes["COLOR_0"] = document.add(to_uint8(255 * colors))
             turned = np.rint(splats.quats[:, [1, 2, 3, 0]] * np.iinfo(np.int16).max).astype(np.int16)  # to 0.002 deg
             attributes[f"{EXTENSION}:ROTATION"] = document.add(turned)
@@ -395,18 +369,24 @@ def write_glb(scene: MovingScene, camera: Camera, path: Path, unit: Unit = "m") 
     lens = {
         "yfov": 2 * math.atan(camera.height / (2 * camera.fy)),
         "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
-        "znear": document.per_mm,  # 1 mm
+        "znear": per_mm,  # 1 mm
     }
     document.content["cameras"] = [{"name": "laparoscope", "type": "perspective", "perspective": lens}]
     rotation = _rotations((pose[:3, :3] @ CAMERA_TURN).numpy()[None])
-    place = (pose[:3, 3] * document.per_mm).tolist()
+    place = (pose[:3, 3] * per_mm).tolist()
     # glTF cannot state a principal point off the image's centre
     document.node("laparoscope", root, camera=0, rotation=rotation[0].tolist(), translation=place)
     document.content |= {"asset": {"version": "2.0", "generator": "neeco"}, "extensionsUsed": [EXTENSION]}
     document.content |= {"scene": 0, "scenes": [{"nodes": [root]}]}
     if channels:
         document.content["animations"] = [{"name": "states", "channels": channels, "samplers": samplers}]
-    write_atomically(path, lambda temporary: temporary.write_bytes(document.packed()))
+    document.content["buffers"] = [{"byteLength": len(document.binary)}]
+    text = json.dumps(document.content | {"nodes": document.nodes}, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + len(document.binary)
+    chunks = struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(document.binary), b"BIN\0")
+    data = struct.pack("<4sII", b"glTF", 2, size) + b"".join(chunks) + document.binary
+    write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
 def _rotations(poses: np.ndarray) -> np.ndarray:
@@ -439,11 +419,11 @@ def write_usd(scene: MovingScene, path: Path) -> None:
     require_usd()
     from pxr import Gf, Tf, Usd, UsdGeom, UsdSemantics, UsdVol, Vt
 
-    codes = scene.times * MOVING.codes_per_second
+    codes = scene.times * scene.codes_per_second
     stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageMetersPerUnit(stage, MOVING.meters_per_unit)
+    UsdGeom.SetStageMetersPerUnit(stage, scene.meters_per_unit)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    stage.SetTimeCodesPerSecond(MOVING.codes_per_second)
+    stage.SetTimeCodesPerSecond(scene.codes_per_second)
     stage.SetStartTimeCode(float(codes[0]))
     stage.SetEndTimeCode(float(codes[-1]))
     root = UsdGeom.Xform.Define(stage, "/Scene")
@@ -461,7 +441,7 @@ def write_usd(scene: MovingScene, path: Path) -> None:
             splats = node.splats  # in its own frame
             prim = getattr(UsdVol, SCHEMA).Define(stage, places[-1])
             scales = np.exp(splats.log_scales)
-            reach = MOVING.extent_sd * scales.max(1, keepdims=True)
+            reach = scene.extent_sd * scales.max(1, keepdims=True)
             extent = np.stack([(splats.means - reach).min(0), (splats.means + reach).max(0)])
             quats = np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])  # w last
             coefficients = np.ascontiguousarray(splats.sh.reshape(-1, 3))

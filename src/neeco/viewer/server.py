@@ -16,7 +16,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -31,7 +30,7 @@ from neeco.labels.drawing import to_numpy
 from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 from neeco.viewer.access import HOST, PORT, Access, controlled_sockets
 from neeco.viewer.panel import Panel, message_html, status_html
-from neeco.viewer.runs import LoadedRun, SavedStates, ViewedRun, score_frame
+from neeco.viewer.runs import VIEWER, LoadedRun, SavedStates, ViewedRun, score_frame
 from neeco.viewer.views import (
     Overlays,
     aspect_of,
@@ -44,32 +43,12 @@ from neeco.viewer.views import (
     pose_of,
     render_run,
     stands_at,
-    upward,
 )
 
 if TYPE_CHECKING:
     import viser
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewerSettings:
-    """Settings of what a viewer renders, and when."""
-
-    settled_s: float = 0.15  # s without a request after which a sharp picture is rendered
-    idle_s: float = 0.5  # maximum s between two checks for requests
-    moving_px: int = 256  # maximum height in px during motion
-    sharp_px: int = 720  # maximum height in px of a sharp rendering
-    min_px: int = 32  # minimum height in px
-    moving_s: float = 0.15  # maximum s of a rendering during motion
-    sharp_s: float = 0.4  # maximum s of a sharp rendering
-    remembered: int = 3  # number of timed renderings, robust to one that computed something first
-    jpeg_moving: int = 80  # JPEG quality during motion
-    jpeg_sharp: int = 92  # JPEG quality of a sharp rendering
-    played_per_s: float = 10.0  # frames per s of `play`
-    status_every_s: float = 0.25  # minimum s between two updates of the status during motion
-
-
-VIEWER = ViewerSettings()
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 
@@ -201,38 +180,29 @@ def _attempted(work: Callable[[], T], otherwise: T) -> T:
 class ClientSession:
     """One browser: its panel, its picture and the overlays.
 
-    Made when the browser connects. sharp_px: height of sharp pictures, where a user asked for one. `render` and `tick`
-    belong to the render thread, the rest to any. connected: is it still there?
+    Made when the browser connects. `render` and `tick` belong to the render thread, the rest to any.
     """
 
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        run: ViewedRun,
-        saved: SavedStates,
-        thread: RenderThread,
-        connected: Callable[[], bool],
-        sharp_px: int | None = None,
-    ) -> None:
+    def __init__(self, client: viser.ClientHandle, server: ViewerServer) -> None:
         self.key = client.client_id
         self.status_at = 0.0  # time.perf_counter() of the last status; 0: no picture was sent yet
-        self._client, self._run, self._saved, self._thread, self._connected = client, run, saved, thread, connected
-        self._resolution = AdaptiveResolution(sharp_px)
+        self._client, self._server, self._run = client, server, server.run
+        self._resolution = AdaptiveResolution(server.sharp_px)
         self._saving = False
-        self._request = partial(thread.request, self.key)
+        self._request = partial(server.render_thread.request, self.key)
         self._played_at: float | None = None
         self._shape = 0.0  # of the window, width by height
         self._camera_frame = 0  # whose camera the window was sent to last
         self._followed: int | None = 0  # the frame that the camera went along to
         client.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self._loaded = run.loaded
-        self._build(run.loaded)
+        self._loaded = self._run.loaded
+        self._build(self._loaded)
         self._go_to(0)
         client.camera.on_update(lambda _: self._request())
 
     def render(self, sharp: bool) -> None:
         """Render the requested picture: coarse, or sharp with its scores."""
-        if not self._connected():
+        if not self._server.has(self.key):
             return
         began, current = time.perf_counter(), self._run.loaded
         if current.signature != self._loaded.signature:
@@ -266,7 +236,7 @@ class ClientSession:
             return
         seconds = time.perf_counter() - began
         self._resolution.record(seconds, picture.depth.size)
-        if not self._connected():
+        if not self._server.has(self.key):
             return
         depth = None
         if self.overlays.shown:  # 0 means empty: far away, not at the eye
@@ -291,7 +261,7 @@ class ClientSession:
     def tick(self, now: float) -> float | None:
         """Advance playback, and show new scores of frames. now: of time.perf_counter(); return when to call again, or
         None: nothing moves by itself."""
-        if not self._connected():
+        if not self._server.has(self.key):
             return None
         self._panel.show_timeline(self._run.timeline)
         if not self._panel.play.value:
@@ -316,8 +286,8 @@ class ClientSession:
         self._panel: Panel = Panel(self._client, loaded, self._request, self._go_to, self._toggle_gizmo)
 
         def keep() -> str:
-            count = self._saved.add(self._loaded, self._state(), self._pose())
-            return f"kept: {count} in {self._saved.states_path}"
+            count = self._server.saved.add(self._loaded, self._state(), self._pose())
+            return f"kept: {count} in {self._server.saved.states_path}"
 
         self._panel.keep.on_click(lambda _: self._report(keep))
         self._panel.save.on_click(lambda _: self._save_image())
@@ -358,12 +328,12 @@ class ClientSession:
 
         def save() -> None:
             try:
-                self._report(lambda: f"written: {self._saved.save_image(self._loaded, state, pose)}")
+                self._report(lambda: f"written: {self._server.saved.save_image(self._loaded, state, pose)}")
             finally:
                 self._saving = False
 
         # in the render thread: the rasteriser uses all cores
-        self._thread.run_job(save)
+        self._server.render_thread.run_job(save)
 
     def _report(self, task: Callable[[], str]) -> None:
         """Run something, and report its result."""
@@ -409,7 +379,9 @@ class ViserPage(contextlib.AbstractContextManager["ViserPage"]):
             raise NeecoError(f"view: viser {viser.__version__} is too old or too new; {install_hint('view')}")
         pose = to_numpy(cameras[0].world_from_camera)
         scene, initial = self._server.scene, self._server.initial_camera
-        scene.set_up_direction(tuple(upward(cameras)))
+        up = -np.mean([to_numpy(camera.world_from_camera)[:3, 1] for camera in cameras], axis=0)  # of most images
+        length = float(np.linalg.norm(up))
+        scene.set_up_direction(tuple(up / length if length > 1e-6 else np.array([0.0, -1.0, 0.0])))
         scene.world_axes.visible = False
         initial.position = tuple(pose[:3, 3] * unit)
         initial.look_at = tuple((pose[:3, 3] + distance * pose[:3, 2]) * unit)
@@ -440,11 +412,11 @@ class ViewerServer(ViserPage):
         self.run = ViewedRun(run, device)
         cameras = self.run.loaded.recorded.cameras
         height = size.of(cameras[0].width, cameras[0].height)[1]
-        self._sharp_px = None if size == RECORDED_SIZE else height
+        self.sharp_px = None if size == RECORDED_SIZE else height  # of sharp pictures, where a user asked for it
         self.saved = SavedStates(run, size)
         self.render_thread = RenderThread(lambda: self.run.timeline.advance())
         super().__init__(host, port, cameras, self.run.distance, self.run.unit)
-        self._server.on_client_connect(self._connect)
+        self._server.on_client_connect(lambda client: self.render_thread.add(ClientSession(client, self)))
         self._server.on_client_disconnect(lambda client: self.render_thread.remove(client.client_id))
         self.render_thread.start()
         self.run.watch(self.render_thread.request)
@@ -455,9 +427,6 @@ class ViewerServer(ViserPage):
         self.render_thread.stop()
         super().stop()
 
-    def _connect(self, client: viser.ClientHandle) -> None:
-        def connected() -> bool:
-            return client.client_id in self._server.get_clients()
-
-        session = ClientSession(client, self.run, self.saved, self.render_thread, connected, self._sharp_px)
-        self.render_thread.add(session)
+    def has(self, key: int) -> bool:
+        """Return whether a browser is connected."""
+        return key in self._server.get_clients()

@@ -26,46 +26,18 @@ from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.labels.labellers import composited_labels, threshold_of
 from neeco.raster import rasterize
 from neeco.raster.devices import readable_failures
-from neeco.raster.types import Rendering
 from neeco.scene import DrawableScene
 from neeco.scene.gaussian_scene import is_gaussian
 from neeco.synthesis.samplers import JointRange, Shaft, interpolate_state, joint_ranges, turn_about
-from neeco.viewer.runs import VIEW, LoadedRun
+from neeco.viewer.runs import VIEWER, LoadedRun
 
 if TYPE_CHECKING:
     import viser
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneSettings:
-    """Sizes and limits of what the viewer places in a scene."""
-
-    max_aspect: float = 8.0  # of a window's width to its height, or the reverse
-    narrowest: float = 0.01  # rad, field of view
-    widest: float = 3.0  # rad, field of view
-    same_place: float = 2e-4  # of the distance to what is looked at
-    same_turn: float = 1e-3  # rad
-    max_frusta: int = 24  # of cameras
-    max_points: int = 20_000  # of a sparse cloud
-    frustum_units: float = 0.06 * VIEW.distance_units  # size of a camera's frustum
-    gizmo_units: float = 0.2 * VIEW.distance_units  # length of axes
-    point_units: float = 0.005 * VIEW.distance_units  # size of a point
-    frustum_color: tuple[int, int, int] = (255, 200, 0)
-
-
-SCENE = SceneSettings()
-
-
 def aspect_of(window: viser.CameraHandle) -> float:
     """Width of the window by its height, within reason: a browser may say anything."""
-    return min(max(float(window.aspect), 1 / SCENE.max_aspect), SCENE.max_aspect) if window.aspect > 0 else 1.0
-
-
-def upward(cameras: Sequence[Camera]) -> np.ndarray:
-    """The direction [3] that is up in most recorded images; orbiting keeps it up."""
-    up = -np.mean([to_numpy(camera.world_from_camera)[:3, 1] for camera in cameras], axis=0)
-    length = float(np.linalg.norm(up))
-    return up / length if length > 1e-6 else np.array([0.0, -1.0, 0.0])
+    return min(max(float(window.aspect), 1 / VIEWER.max_aspect), VIEWER.max_aspect) if window.aspect > 0 else 1.0
 
 
 def wxyz_of(pose: np.ndarray) -> np.ndarray:
@@ -86,7 +58,7 @@ def field_of_view(camera: Camera) -> float:
 def browser_camera(window: viser.CameraHandle, unit: float, height: int) -> Camera:
     """The camera of the browser's window, rendered `height` px high."""
     width = max(1, round(height * aspect_of(window)))
-    focal = height / 2 / math.tan(min(max(window.fov, SCENE.narrowest), SCENE.widest) / 2)
+    focal = height / 2 / math.tan(min(max(window.fov, VIEWER.narrowest), VIEWER.widest) / 2)
     pose = torch.from_numpy(pose_of(window.wxyz, window.position, unit))
     return Camera(pose, focal, focal, width / 2, height / 2, width=width, height=height)
 
@@ -97,7 +69,7 @@ def stands_at(window: Camera, recorded: Camera, distance: float) -> bool:
     one, two = to_numpy(window.world_from_camera), to_numpy(recorded.world_from_camera)
     apart = float(np.linalg.norm(one[:3, 3] - two[:3, 3]))
     turned = Rotation.from_matrix(one[:3, :3].T @ two[:3, :3]).magnitude()
-    return apart <= SCENE.same_place * distance and turned <= SCENE.same_turn
+    return apart <= VIEWER.same_place * distance and turned <= VIEWER.same_turn
 
 
 def fitting_view(camera: Camera, aspect: float) -> float:
@@ -133,7 +105,7 @@ class Overlays:
         self._scene, self._unit, self._dragged = client.scene, unit, dragged
         self.cameras = self._scene.add_frame("/cameras", show_axes=False, visible=False)
         poses = [to_numpy(camera.world_from_camera) for camera in cameras]
-        spread = evenly_spaced(len(cameras), SCENE.max_frusta)  # some from everywhere, none twice in one place
+        spread = evenly_spaced(len(cameras), VIEWER.max_frusta)  # some from everywhere, none twice in one place
         places = np.unique([poses[frame].round(3) for frame in spread], axis=0, return_index=True)[1]
         for frame in (spread[place] for place in places.tolist()):
             camera, pose = cameras[frame], poses[frame]
@@ -141,22 +113,22 @@ class Overlays:
                 f"/cameras/{frame}",
                 fov=field_of_view(camera),
                 aspect=camera.width / camera.height,
-                scale=SCENE.frustum_units,
+                scale=VIEWER.frustum_units,
                 thickness=1.5,
                 thickness_units="screen",
-                color=SCENE.frustum_color,
+                color=VIEWER.frustum_color,
                 wxyz=wxyz_of(pose),
                 position=pose[:3, 3] * unit,
             )
             frustum.on_click(lambda _, frame=frame: clicked(frame))
         self.points: Any = None
         if points is not None and len(points.positions):
-            chosen = evenly_spaced(len(points.positions), SCENE.max_points)
+            chosen = evenly_spaced(len(points.positions), VIEWER.max_points)
             self.points = self._scene.add_point_cloud(
                 "/points",
                 (points.positions[chosen] * unit).astype(np.float32),
                 points.colors[chosen].astype(np.float32),
-                point_size=SCENE.point_units,
+                point_size=VIEWER.point_units,
                 point_shape="circle",
                 precision="float32",
                 visible=False,
@@ -178,7 +150,7 @@ class Overlays:
         """Show the gizmo of an instrument that stands at `pose` [4, 4] mm."""
         gizmo = self._scene.add_transform_controls(
             f"/gizmos/{number}",
-            scale=SCENE.gizmo_units,
+            scale=VIEWER.gizmo_units,
             wxyz=wxyz_of(pose),
             position=pose[:3, 3] * self._unit,
             depth_test=False,
@@ -317,7 +289,17 @@ def views_of(scene: DrawableScene, has_images: bool) -> tuple[str, ...]:
 def picture(scene: DrawableScene, state: State, camera: Camera, view: str, labels: Tensor | None = None) -> Picture:
     """One of VIEWS but DIFFERENCE of `state` as `camera` sees it. labels [N, L]: the scene's label channels, where
     they are at hand; they take time."""
-    rendering = _rendering(scene, state, camera, view, labels)
+    learned = scene.recorded.as_learned(camera)
+    if learned.learned_fx is not None and camera.fx > learned.learned_fx:  # averaging smaller ones would take too long
+        camera = learned
+    if view in LABELLED and labels is None:
+        rendering = scene.render(state, camera, labels=True)
+    elif view not in (*LABELLED, UNOBSERVED) or not is_gaussian(scene):
+        rendering = scene.render(state, camera)
+    else:
+        gaussians = scene.at(state)
+        channels = labels if view in LABELLED else scene.unobserved(gaussians, camera)[:, None]
+        rendering = rasterize(gaussians, camera, channels=channels)
     color, depth = rendering.color.clamp(0, 1).cpu().numpy(), surface_depth(rendering)
     if view in LABELLED:
         parts = composited_labels(rendering, threshold_of(scene))[0].cpu().numpy()
@@ -371,16 +353,3 @@ def render_run(loaded: LoadedRun, controls: Controls, camera: Camera, view: str)
         plain = picture(scene, state, camera, IMAGE)  # darkened, since it is not what was asked for
     note = ONLY_RECORDED if view == DIFFERENCE else f"{view}: a scene of method {scene.method} has none"
     return Picture(to_uint8(plain.pixels * DIMMED), plain.depth, note), as_recorded
-
-
-def _rendering(scene: DrawableScene, state: State, camera: Camera, view: str, labels: Tensor | None) -> Rendering:
-    learned = scene.recorded.as_learned(camera)
-    if learned.learned_fx is not None and camera.fx > learned.learned_fx:  # averaging smaller ones would take too long
-        camera = learned
-    if view in LABELLED and labels is None:
-        return scene.render(state, camera, labels=True)
-    if view not in (*LABELLED, UNOBSERVED) or not is_gaussian(scene):
-        return scene.render(state, camera)
-    gaussians = scene.at(state)
-    channels = labels if view in LABELLED else scene.unobserved(gaussians, camera)[:, None]
-    return rasterize(gaussians, camera, channels=channels)

@@ -275,7 +275,7 @@ def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray, inside: np.ndarray)
 class MotionEvidence:
     """Moving pixels of all frames as rays, each with points at several depths, and how well poses explain them."""
 
-    recorded: np.ndarray  # float32 [R, D, F] evidence of the poses as recorded; set by `with_recorded`
+    recorded: np.ndarray  # float32 [R, D, F] evidence of the poses as recorded; set by `of_instrument`
     thinned: MotionEvidence  # a subset of rays and depths for a first comparison
 
     @classmethod
@@ -380,21 +380,20 @@ class MotionEvidence:
         """Return True if the rays come from enough frames."""
         return len(np.unique(ray_views)) >= SETTINGS.min_frames
 
-    def with_recorded(self, poses: np.ndarray) -> MotionEvidence:
-        """The same for an instrument whose recorded poses are these, [F, 4, 4]."""
-        rays = self._subset(slice(None))
+    def of_instrument(self, poses: np.ndarray, others: list[np.ndarray]) -> MotionEvidence | None:
+        """Return the rays for an instrument whose recorded poses are these, [F, 4, 4], without those that poses of
+        other instruments, each [F, 4, 4], explain better: the motion of one arm may resemble the mirrored motion of
+        another. None if too few remain."""
+        remaining = np.ones(len(self.ray_views), dtype=bool)
+        if others:
+            all_frames = np.ones(len(poses), dtype=bool)
+            explained, *by_others = (self.explained(self.evidence(one), all_frames) for one in (poses, *others))
+            remaining = np.max(by_others, axis=0) <= np.maximum(explained, SETTINGS.min_ray_evidence)
+            if not self.enough(self.ray_views[remaining]):
+                return None
+        rays = self._subset(remaining)
         rays.recorded, rays.thinned = rays.evidence(poses), rays._subset(slice(None, None, 4), slice(None, None, 2))
         return rays
-
-    def without(self, others: list[np.ndarray], poses: np.ndarray) -> MotionEvidence | None:
-        """Return the rays that poses of other instruments, each [F, 4, 4], do not explain better than `poses`: the
-        motion of one arm may resemble the mirrored motion of another. None if too few remain."""
-        if not others:
-            return self
-        all_frames = np.ones(len(poses), dtype=bool)
-        explained, *by_others = (self.explained(self.evidence(one), all_frames) for one in (poses, *others))
-        remaining = np.max(by_others, axis=0) <= np.maximum(explained, SETTINGS.min_ray_evidence)
-        return self._subset(remaining) if self.enough(self.ray_views[remaining]) else None
 
     def _subset(self, rays: np.ndarray | slice, depths: slice = slice(None)) -> MotionEvidence:
         few = copy.copy(self)

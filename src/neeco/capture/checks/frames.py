@@ -12,7 +12,7 @@ import torch
 
 from neeco.base.errors import NeecoError
 from neeco.base.files import read_json, require_inside, visible_entries
-from neeco.base.plausible import PLAUSIBLE, Fault, exceeds_limits, joint_fault, limits_fault
+from neeco.base.plausible import PLAUSIBLE, Fault, exceeds_limits, joint_fault
 from neeco.capture.checks.evidence import Picture
 from neeco.capture.checks.settings import SETTINGS
 from neeco.capture.documents import Node, printable
@@ -193,8 +193,9 @@ def check_states(parsed: Parsed) -> None:
 
 def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
     limits, slides = instrument.joints[joint], instrument.slides(joint)
-    if limits is not None and (fault := limits_fault(limits, slides)) is not None:
-        parsed.header("instruments").error(f"limits of joint {printable(joint)} are {fault[0]}", fault[1])
+    if limits is not None and not slides and max(map(abs, limits)) > 2 * PLAUSIBLE.full_turn:
+        message = f"limits of joint {printable(joint)} are {limits[0]:g} .. {limits[1]:g} rad: degrees?"
+        parsed.header("instruments").error(message, "give radians")
     worst: tuple[float, Fault, Node] | None = None
     for state_place, state in parsed.states_of(instrument.name):
         place = state_place.child("joints").child(joint)

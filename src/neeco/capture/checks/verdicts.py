@@ -122,11 +122,10 @@ class ImageVerdicts:
         recorded, root_from_recorded = poses[instrument]
         roots = recorded @ root_from_recorded
         other_paths = [(other @ back)[rows] for name, (other, back) in poses.items() if name != instrument]
-        motion = self._motion.without(other_paths, roots[rows])
+        motion = self._motion.of_instrument(roots[rows], other_paths)
         if motion is None:
             return Verdict("undecided")
         name = printable(instrument)
-        motion = motion.with_recorded(roots[rows])
         if (mistake := self._mistake(name, recorded, root_from_recorded, motion)) is not None:
             return Verdict.of(mistake, POSES, STATES)
         evidence = motion.mean(roots[rows])
@@ -286,9 +285,6 @@ def camera_candidates(poses: np.ndarray) -> Iterator[Candidate]:
         yield replace(candidate, poses=swap_camera_axes(candidate.poses), margin=SETTINGS.camera)
 
 
-ALL_IN_MM = "give all lengths in mm"
-
-
 def check_placement(parsed: Parsed, verdicts: ImageVerdicts) -> None:
     """Check points, cameras against points, then instruments against both (unless the cameras are wrong)."""
     report = parsed.places[0].report
@@ -338,7 +334,7 @@ def _check_cameras(parsed: Parsed, points: np.ndarray, verdicts: ImageVerdicts) 
     too_near = bool(parsed.instruments) and distance < SETTINGS.min_distance_mm
     if too_near or distance > SETTINGS.far_distance * radius:
         message = f"cameras are {distance:.4g} mm from the points, which span {2 * radius:.4g} mm: probably metres"
-        matrices.error(message, ALL_IN_MM)
+        matrices.error(message, "give all lengths in mm")
     elif visible.mean() < SETTINGS.min_visible and (verdict := verdicts.cameras).wrong_poses:
         matrices.error(f"points are outside the images: {verdict.message}", verdict.remedy)
     elif not visible.any():

@@ -18,26 +18,17 @@ from neeco.capture.documents import Node, ProblemReport, errors_only
 from neeco.capture.model import Capture, Instrument, State, share_lamps
 from neeco.capture.points import points_in_view
 from neeco.capture.readers._colmap import find_models, parse_colmap
-from neeco.capture.readers._states import StateLine, read_states
+from neeco.capture.readers._transforms import StateLine as StateLine
 from neeco.capture.readers._transforms import is_blender, load_document, parse_transforms
-from neeco.capture.readers.cameras import parse_lens
-from neeco.capture.readers.endonerf import is_endonerf_folder, parse_endonerf
-from neeco.capture.readers.kinematics import kinematics_of, parse_kinematics, read_dvrk_tool, read_urdf
+from neeco.capture.readers._transforms import read_states as read_states
+from neeco.capture.readers.cameras import parse_lens as parse_lens
+from neeco.capture.readers.endonerf import POSES_FILE, parse_endonerf
+from neeco.capture.readers.kinematics import kinematics_of as kinematics_of
+from neeco.capture.readers.kinematics import parse_kinematics as parse_kinematics
+from neeco.capture.readers.kinematics import read_dvrk_tool as read_dvrk_tool
+from neeco.capture.readers.kinematics import read_urdf as read_urdf
 from neeco.capture.readers.parsed import Parsed, inside
 from neeco.geometry.lens import Lens
-
-__all__ = [
-    "StateLine",
-    "capture_of",
-    "kinematics_of",
-    "parse_capture",
-    "parse_kinematics",
-    "parse_lens",
-    "read_capture",
-    "read_dvrk_tool",
-    "read_states",
-    "read_urdf",
-]
 
 
 def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:
@@ -160,7 +151,7 @@ def _parse(path: Path, report: ProblemReport, transforms: str, background: float
         return parse_transforms(documents, path, background, blender=True, as_source=as_source)
     if models := find_models(path):
         return parse_colmap(models, path, report, as_source=as_source)
-    if is_endonerf_folder(path):
+    if (path / POSES_FILE).is_file():
         return parse_endonerf(path, report)
     content = "transforms.json, transforms_train.json, a COLMAP model or poses_bounds.npy"
     report.error(str(path), "", *misplaced(path, "the folder of a capture", content))

@@ -33,11 +33,6 @@ FIRST_TEST = 1  # frames 1, 9, 17, ... test, as in EndoGaussian, SurgicalGaussia
 MAX_STILL_CHANGE = 1e-6  # maximum change of any entry of a still camera's pose
 
 
-def is_endonerf_folder(root: Path) -> bool:
-    """Return True if a folder has EndoNeRF's poses."""
-    return (root / POSES_FILE).is_file()
-
-
 def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
     """Read an EndoNeRF folder; problems and missing data go to `report`. Lengths are in the folder's unit.
 

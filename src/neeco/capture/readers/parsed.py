@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from neeco.base.errors import NeecoError
-from neeco.base.files import follows_links
+from neeco.base.files import FOLLOW_LINKS
 from neeco.capture.documents import Node, Problem, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, Instrument, InstrumentState
@@ -73,7 +73,7 @@ def inside(root: Path, folder: Path, text: str) -> Path:
     """Return the path `text`, relative to `folder`, which must be inside `root` after resolving symbolic links.
 
     Raises NeecoError (the caller adds the field) if it is absolute, outside `root` or not a path. A link in the folder
-    may point outside if the user allows it (`follows_links`).
+    may point outside if the user allows it (`--follow-links`).
     """
     if os.path.isabs(text) or PureWindowsPath(text).is_absolute():
         raise NeecoError(f"{printable(text)} is absolute; give a path relative to the capture's folder")
@@ -83,7 +83,7 @@ def inside(root: Path, folder: Path, text: str) -> Path:
     except (OSError, RuntimeError, ValueError):
         raise NeecoError(f"{printable(text)} is not a usable path; repair it") from None
     if outside and path.is_relative_to(os.path.normpath(root)):
-        if follows_links():
+        if os.environ.get(FOLLOW_LINKS, "") not in ("", "0"):  # workers inherit it
             return path
         raise NeecoError(
             f"{printable(text)} is a link, or lies in one, that leaves the capture's folder; copy its target "

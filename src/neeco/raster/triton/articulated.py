@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from neeco.raster.triton.geometry import put_four, put_three, quadruple, triple
+from neeco.raster.triton.geometry import put_four, put_sum, put_sums, put_three, quadruple, triple
 from neeco.raster.triton.ready import working_on
 
 # offsets into the numbers of a body
@@ -218,11 +218,6 @@ def pose_kernel(
 
 
 @triton.jit
-def put_sum(at, value, inside):
-    tl.store(at, tl.sum(tl.where(inside, value, 0.0), axis=0))
-
-
-@triton.jit
 def turn_backward(
     pivot, axis, angle, sums_pivot, sums_axis, inside, x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy, hz
 ):
@@ -248,9 +243,7 @@ def turn_backward(
     mx = cosine * gx + sine * (gy * nz - gz * ny) + rest * to_along * nx
     my = cosine * gy + sine * (gz * nx - gx * nz) + rest * to_along * ny
     mz = cosine * gz + sine * (gx * ny - gy * nx) + rest * to_along * nz
-    put_sum(sums_pivot, gx - mx, inside)
-    put_sum(sums_pivot + 1, gy - my, inside)
-    put_sum(sums_pivot + 2, gz - mz, inside)
+    put_sums(sums_pivot, gx - mx, gy - my, gz - mz, inside)
     return x, y, z, qw, qx, qy, qz, mx, my, mz, hw, hx, hy, hz, to_angle
 
 
@@ -294,9 +287,7 @@ def pose_backward_kernel(
         )
         tw, tx, ty, tz = product(hw, hx, hy, hz, qw, 0.0 - qx, 0.0 - qy, 0.0 - qz)
         put_sum(block + SPIN_END, tw, inside)
-        put_sum(block + SPIN_END + 1, tx, inside)
-        put_sum(block + SPIN_END + 2, ty, inside)
-        put_sum(block + SPIN_END + 3, tz, inside)
+        put_sums(block + SPIN_END + 1, tx, ty, tz, inside)
         _, a, b, c, d, length = pose_row(numbers)
         hw, hx, hy, hz = product(a / length, 0.0 - b / length, 0.0 - c / length, 0.0 - d / length, hw, hx, hy, hz)
         shared = 0.0 * gx  # sum over links of share times dL/d share
@@ -309,9 +300,7 @@ def pose_backward_kernel(
                 x, y, z = slide(own_numbers + 3, 0.0 - amount, x, y, z)
                 nx, ny, nz = three(own_numbers + 3)
                 to_amount = nx * gx + ny * gy + nz * gz
-                put_sum(to_numbers + 3, amount * gx, inside)
-                put_sum(to_numbers + 4, amount * gy, inside)
-                put_sum(to_numbers + 5, amount * gz, inside)
+                put_sums(to_numbers + 3, amount * gx, amount * gy, amount * gz, inside)
             else:
                 x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy, hz, to_amount = turn_backward(
                     own_numbers, own_numbers + 3, amount, to_numbers, to_numbers + 3, inside, x, y, z, qw, qx, qy, qz,
@@ -345,9 +334,7 @@ def pose_backward_kernel(
 
 @triton.jit
 def put_pose_row(at, gradient, x, y, z, inside):
-    put_sum(at, gradient * x, inside)
-    put_sum(at + 1, gradient * y, inside)
-    put_sum(at + 2, gradient * z, inside)
+    put_sums(at, gradient * x, gradient * y, gradient * z, inside)
     put_sum(at + 3, gradient, inside)
 
 

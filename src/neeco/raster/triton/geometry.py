@@ -305,3 +305,17 @@ def _cubic(sh, to_sh, inside, seen, x, y, z, to_red, to_green, to_blue, WANTED: 
     gx += w * (-3 * SH33) * (xx - yy)
     gy += w * (6 * SH33) * xy
     return gx, gy, gz
+
+
+@triton.jit
+def put_sum(at, value, counted):
+    """Store the sum over lanes that count."""
+    tl.store(at, tl.sum(tl.where(counted, value, 0.0), axis=0))
+
+
+@triton.jit
+def put_sums(at, a, b, c, counted):
+    """Store three consecutive sums over lanes that count."""
+    put_sum(at, a, counted)
+    put_sum(at + 1, b, counted)
+    put_sum(at + 2, c, counted)

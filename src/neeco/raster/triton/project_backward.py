@@ -13,6 +13,7 @@ from neeco.raster.triton.geometry import (
     direction,
     headlight,
     projected,
+    put_sums,
     quadruple,
     quadruple_at,
     sh_gradient,
@@ -72,14 +73,6 @@ def put_three(at, a, b, c, inside, seen):
     put(at, a, inside, seen)
     put(at + 1, b, inside, seen)
     put(at + 2, c, inside, seen)
-
-
-@triton.jit
-def put_sums(at, a, b, c, seen):
-    """Store three consecutive sums over visible lanes."""
-    tl.store(at, tl.sum(tl.where(seen, a, 0.0), axis=0))
-    tl.store(at + 1, tl.sum(tl.where(seen, b, 0.0), axis=0))
-    tl.store(at + 2, tl.sum(tl.where(seen, c, 0.0), axis=0))
 
 
 @triton.jit

@@ -68,6 +68,7 @@ FILE, TABLE = "downstream.json", "downstream.csv"
 JOB_SCHEMA = "neeco-downstream-job/3"
 JOB_FILE = "job.json"
 PREFIX = "frame_"  # of frame names in files of predictions
+_read = lru_cache(maxsize=8)(read_capture)  # for all jobs of this process
 
 
 def steps_of(request: DownstreamRequest, kind: type[TorchModel]) -> int:
@@ -247,12 +248,6 @@ def read_predictions(job: Path, test: str) -> dict[str, Prediction]:
         name: array if array.dtype == np.uint8 else Detections(array[:, :4], array[:, 4].astype(np.int64), array[:, 5])
         for name, array in arrays.items()
     }
-
-
-@lru_cache(maxsize=8)
-def _read(path: Path, transforms: str) -> Capture:
-    """Read a capture, cached for all jobs of this process."""
-    return read_capture(path, transforms)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -26,18 +26,6 @@ TITLES = {"iou": "IoU", "dice": "Dice", "boundary_f": "boundary F", "ap": "AP50-
 HELPS, HURTS, NONE_SHOWN, ONE_FOLD = "helps", "hurts", "no difference shown", "one fold gives no verdict"
 
 Document = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class IntervalSettings:
-    """Bootstrap of the intervals."""
-
-    confidence: float = 0.95
-    resamples: int = 2000
-    blocks: int = 10  # blocks of neighbouring frames, whose errors are correlated, that are resampled
-
-
-INTERVALS = IntervalSettings()
 
 
 @dataclass(frozen=True)
@@ -164,6 +152,10 @@ class Scores:
     All arms use the same resampled seeds and frames, so that differences are paired.
     """
 
+    confidence: ClassVar[float] = 0.95  # of the intervals, by bootstrap
+    resamples: ClassVar[int] = 2000
+    blocks: ClassVar[int] = 10  # blocks of neighbouring frames, whose errors are correlated, that are resampled
+
     def __init__(self, jobs: Sequence[Document]) -> None:
         self.jobs: dict[Arm, dict[int, Document]] = {}
         for job in jobs:
@@ -195,7 +187,7 @@ class Scores:
             means = means - self._means(against, test, metric, folds)
         if not len(means):
             return Estimate(len(folds), mean, None, None)
-        tail = (1 - INTERVALS.confidence) / 2
+        tail = (1 - self.confidence) / 2
         low, high = np.nanquantile(means, [tail, 1 - tail])
         return Estimate(len(folds), mean, float(low), float(high))
 
@@ -221,17 +213,17 @@ def seed_weights(seeds: int) -> np.ndarray:
     """Return resampling counts of each seed [R, seeds], with one draw fewer than seeds, because as many draws would
     underestimate the variance of few (Rao and Wu, "Resampling inference with complex survey data", 1988)."""
     times, rng = max(seeds - 1, 1), np.random.default_rng(1)
-    return rng.multinomial(times, np.full(seeds, 1 / seeds), INTERVALS.resamples).astype(np.float64)
+    return rng.multinomial(times, np.full(seeds, 1 / seeds), Scores.resamples).astype(np.float64)
 
 
 @cache
 def block_weights(frames: int) -> np.ndarray:
     """Return resampling counts of each frame [R, frames], in circular blocks of neighbours (Politis and Romano, "A
     circular block-resampling procedure", 1992)."""
-    length = -(-frames // INTERVALS.blocks)
-    starts = np.random.default_rng(2).integers(frames, size=(INTERVALS.resamples, -(-frames // length)))
-    ends = np.zeros((INTERVALS.resamples, 2 * frames + 1))
-    rows = np.arange(INTERVALS.resamples)[:, None]
+    length = -(-frames // Scores.blocks)
+    starts = np.random.default_rng(2).integers(frames, size=(Scores.resamples, -(-frames // length)))
+    ends = np.zeros((Scores.resamples, 2 * frames + 1))
+    rows = np.arange(Scores.resamples)[:, None]
     np.add.at(ends, (rows, starts), 1)
     np.add.at(ends, (rows, starts + length), -1)
     covered = ends.cumsum(1)

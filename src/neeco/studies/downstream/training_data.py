@@ -4,7 +4,7 @@ Learn", 2017), and batches at the input size."""
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -85,10 +85,15 @@ def labelled_frames(frames: int, count: int, fold: int) -> list[int]:
     return np.flatnonzero(~free).tolist()
 
 
-@dataclass(frozen=True, kw_only=True)
-class PasteSettings:
-    """Number of cut-and-paste images, and ranges of their random transforms."""
+@dataclass(frozen=True)
+class Backgrounds:
+    """Images without an instrument: files, else the labelled frames with their instruments replaced, for a still camera
+    by each pixel's median over the frames that observe it, otherwise by inpainting (Telea, 2004); and how many images
+    are pasted over them, and the ranges of their random transforms."""
 
+    samples: tuple[RecordedSample, ...]
+    files: tuple[Path, ...] = ()
+    _: KW_ONLY
     images: int = 400
     margin: float = 0.02  # margin around an instrument (shadow, blur) that is inpainted, relative to the longer side
     fill_side: int = 160  # px, longer side at which holes are inpainted, because the result is smooth
@@ -97,16 +102,6 @@ class PasteSettings:
     max_zoom: float = 1.25  # limit on the zoom, as a ratio up or down
     max_shift: float = 0.15  # limit on the shift, as a share of a side
     max_gain: float = 0.2  # limit on the relative change of the pasted instrument's brightness
-
-
-@dataclass(frozen=True)
-class Backgrounds:
-    """Images without an instrument: files, else the labelled frames with their instruments replaced, for a still camera
-    by each pixel's median over the frames that observe it, otherwise by inpainting (Telea, 2004)."""
-
-    samples: tuple[RecordedSample, ...]
-    files: tuple[Path, ...] = ()
-    settings: PasteSettings = PasteSettings()
 
     def __len__(self) -> int:
         return len(self.files or self.samples)
@@ -126,7 +121,7 @@ class Backgrounds:
         if not hole.any() or hole.all():
             return image
         height, width = hole.shape
-        scale = min(1.0, self.settings.fill_side / max(height, width))
+        scale = min(1.0, self.fill_side / max(height, width))
         small = max(1, round(width * scale)), max(1, round(height * scale))
         mask = cv2.resize(hole.astype(np.uint8), small, interpolation=cv2.INTER_NEAREST)
         mask = cv2.dilate(mask, np.ones((3, 3), np.uint8))
@@ -135,7 +130,7 @@ class Backgrounds:
 
     def _covered(self, example: Example) -> np.ndarray:
         """Return the mask of an example's instruments with a margin, bool [H, W]."""
-        reach = round(self.settings.margin * max(example.classes.shape))
+        reach = round(self.margin * max(example.classes.shape))
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         return cv2.dilate((example.classes > 0).astype(np.uint8), kernel) > 0
 
@@ -171,7 +166,7 @@ class PastedSample:
     def load(self) -> Example:
         """Raises NeecoError if a frame cannot be read."""
         rng = np.random.default_rng(np.random.SeedSequence([self.seed, self.number]))
-        sources, settings = self.backgrounds.samples, self.backgrounds.settings
+        sources, settings = self.backgrounds.samples, self.backgrounds
         source = CACHE.load(sources[rng.integers(len(sources))])
         size = source.classes.shape[::-1]
         background = self.backgrounds.image(int(rng.integers(len(self.backgrounds))), size)
@@ -195,7 +190,7 @@ def pasted_samples(samples: Sequence[RecordedSample], folder: Path | None, seed:
     """Return images of these labelled frames' instruments. folder: of backgrounds; None: the inpainted frames."""
     backgrounds = Backgrounds(tuple(samples), () if folder is None else background_files(folder))
     key = hash((tuple(sample.key for sample in samples), folder))
-    return tuple(PastedSample(backgrounds, number, seed, key) for number in range(backgrounds.settings.images))
+    return tuple(PastedSample(backgrounds, number, seed, key) for number in range(backgrounds.images))
 
 
 def background_files(folder: Path) -> tuple[Path, ...]:

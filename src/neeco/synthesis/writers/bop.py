@@ -27,7 +27,6 @@ from neeco.labels.annotation import bounding_box
 from neeco.labels.drawing import extended_silhouettes
 from neeco.synthesis.writers import DEPTH_MM_PER_COUNT, Record, Writer, WrittenImages, link, stem
 
-SCENE = "000000"
 NOWHERE = [-1, -1, -1, -1]
 
 
@@ -43,7 +42,7 @@ class Bop(Writer):
         root, instruments = images.root, images.instruments
         write_json(root / self.format / "objects.json", {str(k): name for k, name in enumerate(instruments, 1)})
         for split in sorted({record["split"] for record in images.records}):
-            folder = root / self.format / split / SCENE
+            folder = root / self.format / split / "000000"
             cameras, infos = {}, {}
             poses: dict[str, list[dict[str, Any]]] = {}
             for record in (record for record in images.records if record["split"] == split):
@@ -60,14 +59,9 @@ class Bop(Writer):
                 }
                 poses[key] = []
                 for label in record["labels"]:
-                    pose = np.array(label["camera_from_instrument"])
-                    poses[key].append(
-                        {
-                            "cam_R_m2c": pose[:3, :3].ravel().tolist(),
-                            "cam_t_m2c": pose[:3, 3].tolist(),
-                            "obj_id": instruments.index(label["name"]) + 1,
-                        }
-                    )
+                    pose, number = np.array(label["camera_from_instrument"]), instruments.index(label["name"]) + 1
+                    rotation, translation = pose[:3, :3].ravel().tolist(), pose[:3, 3].tolist()
+                    poses[key].append({"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": number})
                 infos[key] = _masks(images, folder, record)
             write_json(folder / "scene_camera.json", cameras)
             write_json(folder / "scene_gt.json", poses)
