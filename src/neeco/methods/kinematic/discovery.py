@@ -17,8 +17,7 @@ from neeco.geometry.projection import project_world
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
 from neeco.methods.kinematic.hinges import STATE_LINKS, STICKS, Hinges, start_hinges
-from neeco.methods.kinematic.link_registration import correct_poses
-from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
+from neeco.methods.kinematic.link_search import align_to_links, correct_poses, readings_of, start_links
 from neeco.methods.kinematic.wrist_search import WRISTS, search_wrist
 from neeco.methods.tissue_fit import carved_shape, fit_tissue, tissue_evidence
 from neeco.raster.reference import SH_C0
