@@ -229,13 +229,10 @@ class NPS(PlaceNetwork):
             deformed = Posed(means, quats, (canonical.log_scales + SHAPE_UNIT * change[:, 7:]).exp())
         return self._carried(deformed, members(canonical), state) if self.settings.membership else deformed
 
-    def _motions(self, state: State) -> Tensor:
-        """Return the motion [I, 4, 4] mm of each instrument from the state of rest, world frame."""
-        return self._poses(state) @ self.rest.inverse()
-
     def _carried(self, deformed: Posed, shares: Tensor, state: State) -> Posed:
         """Return the static geometry and that moved with each instrument, blended by shares [N, 1 + I]."""
-        means, quats, carried = deformed.means, deformed.quats, self._motions(state)
+        means, quats = deformed.means, deformed.quats
+        carried = self._poses(state) @ self.rest.inverse()  # [I, 4, 4] mm, motions from the state of rest, world frame
         turns = matrix_to_quat(carried[:, :3, :3])  # [I, 4]
         turns = torch.where(turns[:, :1] < 0, -turns, turns)
         frames = [turns.new_tensor([1.0, 0.0, 0.0, 0.0]), *turns]

@@ -46,11 +46,6 @@ def moved_camera(camera: Camera, increment: Tensor) -> Camera:
     return replace(camera, world_from_camera=moved_pose(camera.world_from_camera, increment))
 
 
-def precision_of(deviations: Tensor) -> Tensor:
-    """Return the precision [P, P] of a prior with independent standard deviations [P] about zero."""
-    return torch.diag(deviations**-2)
-
-
 def sds_of(sizes: tuple[float, ...], slides: Sequence[bool] | np.ndarray) -> np.ndarray:
     """Return the standard deviations [6 + J] of an instrument's two tilts and roll (rad), two shifts across the view
     and one in depth (mm), and joints, of which `slides` [J] are prismatic; sizes: tilt, roll, across, depth, joint

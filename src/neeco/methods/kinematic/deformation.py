@@ -327,7 +327,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             case "judge_states":
                 judge_states(session, self)
             case "size_states":
-                size_states(session, self)
+                judge_states(session, self, refit=False)
             case "judge_states_again":
                 judge_states_again(session, self)
             case "fit_states":
@@ -402,20 +402,18 @@ def _fits_states(session: GaussianSession) -> bool:
 
 
 @torch.no_grad()
-def judge_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Estimate the size of state errors over all training frames, and search for gross errors."""
-    if _corrects_states(session) and not session.refinement.error_scale:
-        search = _search(session, articulated)
-        misfits = Misfits.of(search)
-        large = _size_errors(session, search, misfits.outliers)
+def judge_states(session: GaussianSession, articulated: ArticulatedInstruments, *, refit: bool = True) -> None:
+    """Estimate the size of state errors over all training frames, unless they were large before, and report whether
+    they exceed a tracker's; with `refit`, search for gross errors, too."""
+    if not _corrects_states(session) or session.refinement.error_scale:
+        return
+    search = _search(session, articulated)
+    misfits = Misfits.of(search) if refit else None
+    large = search.size_errors(() if misfits is None else misfits.outliers)
+    if large:
+        session.report("the states' errors are larger than a tracker's: they are corrected by the images")
+    if misfits is not None:
         refit_outliers(search, SEARCH.scale if large else SEARCH.large, misfits)
-
-
-@torch.no_grad()
-def size_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Estimate the size of state errors over all training frames, unless they were large before."""
-    if _corrects_states(session) and not session.refinement.error_scale:
-        _size_errors(session, _search(session, articulated), ())
 
 
 @torch.no_grad()
@@ -459,11 +457,3 @@ def carve_from_states(session: GaussianSession, articulated: ArticulatedInstrume
 def _search(session: GaussianSession, articulated: ArticulatedInstruments) -> StateSearch:
     shafts = [articulation.shaft()[1].detach().cpu().double() for articulation in articulated.articulations]
     return StateSearch.of(session.scene, session.refinement, session.full_views.frames, shafts)
-
-
-def _size_errors(session: GaussianSession, search: StateSearch, outliers: Sequence[int]) -> bool:
-    """Estimate the size of the errors of all states except `outliers`, and report whether it exceeds a tracker's."""
-    large = search.size_errors(outliers)
-    if large:
-        session.report("the states' errors are larger than a tracker's: they are corrected by the images")
-    return large

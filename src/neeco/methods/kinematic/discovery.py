@@ -82,12 +82,9 @@ def _unstated_wrists(
             )
         else:
             trees[instrument.name] = tree
-            session.report(f"{instrument.name}: images show its links: {_words(tree)}; if that is wrong, {STATE_LINKS}")
+            words = ", ".join(f"{link.name} turned by {' and '.join(link.value)}" for link in tree.links if link.value)
+            session.report(f"{instrument.name}: images show its links: {words}; if that is wrong, {STATE_LINKS}")
     return trees
-
-
-def _words(tree: KinematicTree) -> str:
-    return ", ".join(f"{link.name} turned by {' and '.join(link.value)}" for link in tree.links if link.value)
 
 
 def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:

@@ -428,20 +428,14 @@ class _Volumes:
         self.evidence = evidence.subset(torch.arange(0, len(readings), step))
         self.camera_from_instrument = camera_from_instrument(self.evidence, name)  # [F, 4, 4]
         generator = torch.Generator().manual_seed(seed)
-        self.points = [self._about(link, generator) for link in range(1, links.link_count)]
-
-    def _about(self, link: int, generator: torch.Generator) -> Tensor:
-        """Sample points [`check_points`, 3] mm about a link at rest."""
-        radius = float(self.links.radius)
-        centers, half = (
-            part.cpu()
-            for part in _extent_of(
-                self.links, link, LINKS.check_reach_radii * radius, LINKS.check_margin_radii * radius
-            )
-        )
-        which = torch.randint(len(centers), (LINKS.check_points,), generator=generator)
-        away = 2 * torch.rand(LINKS.check_points, 3, generator=generator) - 1
-        return (centers[which] + away * half[which, None]).to(self.evidence.device)
+        radius = float(links.radius)
+        reach, margin = LINKS.check_reach_radii * radius, LINKS.check_margin_radii * radius
+        self.points: list[Tensor] = []  # [`check_points`, 3] mm about every link at rest
+        for link in range(1, links.link_count):
+            centers, half = (part.cpu() for part in _extent_of(links, link, reach, margin))
+            which = torch.randint(len(centers), (LINKS.check_points,), generator=generator)
+            away = 2 * torch.rand(LINKS.check_points, 3, generator=generator) - 1
+            self.points.append((centers[which] + away * half[which, None]).to(self.evidence.device))
 
     def motions(self, change: Callable[[Readings], Readings]) -> Tensor:
         """Return the poses [F, L, 4, 4] of all links in the camera's frame after `change` of the readings."""
