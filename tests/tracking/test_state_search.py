@@ -20,7 +20,6 @@ from wristed_world import make_driver
 from neeco.capture.model import InstrumentState, State, Uncertainty
 from neeco.methods.kinematic import discovery
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.methods.kinematic.deformation import judge_states_again
 from neeco.scene import Recorded
 from neeco.scene.training_views import TrainingViews
 from neeco.states.contradictions import (
@@ -384,7 +383,7 @@ def test_states_are_judged_again_where_errors_are_large(size: float, tmp_path: P
     mirrored = mirrored_state(search_of(right), 4, right.recorded.states[4])
     session = driver_session(tmp_path, {4: mirrored})
     session.refinement.error_scale.fill_(size)
-    judge_states_again(session, cast(ArticulatedInstruments, session.scene.deformation))
+    session.scene.deformation.act(session, "judge_states_again")
     assert contradicting(session.refinement) == ({4: Verdict.REFITTED} if size else {})
 
 

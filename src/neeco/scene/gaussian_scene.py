@@ -130,6 +130,10 @@ class GaussianScene(DrawableScene):
         canonical = self.canonical
         posed = self.deformation.pose(canonical, self.registered(state), perturbation)
         tissue, instruments = canonical.counts[0], len(canonical) - canonical.counts[0]
+        shadow = None
+        if self.casts_shadow:
+            strengths = self.shadow_strengths.clamp(0.0, 1.0)
+            shadow = Shadow(canonical.of_instruments, self.shadow_offsets, strengths, self.shadow_width)
         falloff = torch.cat([self.falloff[:1].expand(tissue), self.falloff[1:].expand(instruments)])
         return Gaussians(
             means=posed.means,
@@ -138,7 +142,7 @@ class GaussianScene(DrawableScene):
             opacities=torch.sigmoid(canonical.opacity_logits),
             sh=canonical.spherical_harmonics(self.sh_degree),
             sh_frames=posed.sh_frames,
-            headlight=Headlight(falloff, self.vignette, self._shadow()),
+            headlight=Headlight(falloff, self.vignette, shadow),
             background=canonical.means.new_full((3,), self.background) if self.background else None,
         )
 
@@ -159,12 +163,6 @@ class GaussianScene(DrawableScene):
     def casts_shadow(self) -> bool:
         """Whether a lamp next to the lens was found, and there are instruments to cast its shadow."""
         return self._shines(self.shadow_strengths) and len(self.canonical) > self.canonical.counts[0]
-
-    def _shadow(self) -> Shadow | None:
-        if not self.casts_shadow:
-            return None
-        strengths = self.shadow_strengths.clamp(0.0, 1.0)
-        return Shadow(self.canonical.of_instruments, self.shadow_offsets, strengths, self.shadow_width)
 
     def registered(self, state: State) -> State:
         """Return `state` with the learned corrections of states, bases and of tracker to world.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -142,7 +142,12 @@ class GaussianSession(Session):
             self._use_views(self.full_views.scaled(scale), scale)
         scene.sh_degree = self.schedule.sh_degree(self.iteration)
         scene.deformation.warming_up = progress < scene.deformation.warm_up
-        chosen = [self._next_frame() for _ in range(views)]
+        chosen = []
+        for _ in range(views):
+            if not self.queue or self.queue_phase != self.phase:
+                self.queue = self.schedule.frames(self.pose_order, self.rng)
+            self.queue_phase = self.phase
+            chosen.append(self.queue.pop(0))
         terms: list[Tensor] = []
         for index, following in zip(chosen, [*chosen[1:], *self.queue[:1], None], strict=False):
             terms += self._accumulate(index, progress, following)
@@ -208,13 +213,6 @@ class GaussianSession(Session):
         # float32, rounded down: other roundings would select other frames and change runs
         return [int(order[int(place)]) for place in torch.linspace(0, len(order) - 1, min(count, len(order)))]
 
-    def _next_frame(self) -> int:
-        phase = self.schedule.phase
-        if not self.queue or self.queue_phase != phase:
-            self.queue = self.schedule.frames(self.pose_order, self.rng)
-        self.queue_phase = phase
-        return self.queue.pop(0)
-
     def _update(self, progress: float) -> None:
         """Take an optimiser step on everything that has a gradient; shadows have none before one is detected."""
         scene, optimizer = self.scene, self.config.optimizer
@@ -260,12 +258,13 @@ class GaussianSession(Session):
 
     def _control_density(self, progress: float) -> None:
         settings, config, scene = self.schedule.density(), self.config, self.scene
-        prunes = self._due(config.density.prune_interval)
+        reached = partial(due, before=self.iteration - self.batch_size, now=self.iteration)
+        prunes = reached(config.density.prune_interval)
         if prunes:
             self.refinement.center()
         if self.iteration < self.schedule.scaled(config.density_start):
             return
-        grows = self._due(settings.interval) and progress < config.growth_stop
+        grows = reached(settings.interval) and progress < config.growth_stop
         if grows or (prunes and progress < config.density.prune_stop):
             instruments = len(scene.canonical.counts) - 1
             tissue, instrument = self.limits
@@ -282,12 +281,8 @@ class GaussianSession(Session):
                 unsupported=scene.deformation.prune_mask(scene.canonical, [camera for _, camera in self.given]),
             )
             self.begin_statistics()
-        if settings.opacity_reset and self._due(settings.opacity_reset) and progress < config.growth_stop:
+        if settings.opacity_reset and reached(settings.opacity_reset) and progress < config.growth_stop:
             reset_opacity(scene.canonical, self.adam, config.density.reset_opacity)
-
-    def _due(self, interval: int) -> bool:
-        """Return whether this step reached a multiple of `interval` iterations."""
-        return due(interval, self.iteration - self.batch_size, self.iteration)
 
     def between_steps(self, before: float) -> None:
         """Run the method's own hook, then the events of the schedule that the last step passed."""

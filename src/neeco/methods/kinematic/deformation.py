@@ -308,7 +308,9 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             terms.append(settings.label_sharpness * (label * (1 - label)).mean())
         return sum(terms[1:], terms[0]) if terms else None
 
+    @torch.no_grad()
     def act(self, session: GaussianSession, action: str) -> None:
+        refinement = session.refinement
         match action:
             case "find_shadow":
                 if self.settings.shadow:
@@ -329,11 +331,15 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             case "size_states":
                 judge_states(session, self, refit=False)
             case "judge_states_again":
-                judge_states_again(session, self)
+                suspected = bool(refinement.error_scale) or bool(refinement.verdicts.any())
+                if _corrects_states(session) and suspected:
+                    judge_again(_search(session, self))
             case "fit_states":
                 fit_states(session, self)
             case "carve_from_states":
-                carve_from_states(session, self)
+                if _fits_states(session):
+                    with session.searching():
+                        carve_again(session, self)
             case "conclude_states":  # with standard deviations of the fits; excludes frames that no state explains
                 fit_states(session, self, last=True)
             case _:
@@ -417,14 +423,6 @@ def judge_states(session: GaussianSession, articulated: ArticulatedInstruments, 
 
 
 @torch.no_grad()
-def judge_states_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Search again for wrong states, if errors are large or wrong states were detected before."""
-    suspected = bool(session.refinement.error_scale) or bool(session.refinement.verdicts.any())
-    if _corrects_states(session) and suspected:
-        judge_again(_search(session, articulated))
-
-
-@torch.no_grad()
 def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *, last: bool = False) -> None:
     """Fit the states of all training frames to their images, if their errors exceed a tracker's."""
     if not _fits_states(session):
@@ -444,14 +442,6 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *,
             explained[index] = refitted[0].misfit
     if last:
         leave_out_unexplained(search, explained)
-
-
-@torch.no_grad()
-def carve_from_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Carve the instruments' shapes again from fitted states."""
-    if _fits_states(session):
-        with session.searching():
-            carve_again(session, articulated)
 
 
 def _search(session: GaussianSession, articulated: ArticulatedInstruments) -> StateSearch:
