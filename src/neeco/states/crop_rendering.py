@@ -241,6 +241,11 @@ class TissueRenderer:
         self._instruments = instruments or InstrumentRenderer(scene)
         self._posed: tuple[float, Gaussians] | None = None  # by time
 
+    @property
+    def shaded(self) -> bool:
+        """Whether instruments cast a shadow on it."""
+        return self.scene.casts_shadow
+
     @torch.no_grad()
     def render(self, camera: Camera, state: State | None) -> Tensor:
         """Return [h, w, 3] with the shadow of instruments in `state` (None: without)."""
@@ -248,7 +253,7 @@ class TissueRenderer:
         if self._posed is None or self._posed[0] != moment.time:  # the tissue depends on nothing else of a state
             self._posed = moment.time, self.scene.at(moment).select(slice(0, self.scene.canonical.counts[0]))
         tissue = self._posed[1]
-        if state is not None and self.scene.casts_shadow:
+        if state is not None and self.shaded:
             tissue = shadowed(tissue, camera, depth_maps, self._instruments.pose(state))
         elif tissue.headlight is not None:
             tissue = replace(tissue, headlight=replace(tissue.headlight, shadow=None))

@@ -208,7 +208,7 @@ class Fitter(Generic[P]):
     def with_shadow(self, view: FrameView, state: State) -> FrameView:
         """Return the view with the instruments' shadow in `state`, or in one that differs from it by less than two
         finite differences."""
-        if not self.tissue.scene.casts_shadow:
+        if not self.tissue.shaded:
             return view
         if view.shadow_of is not None:
             changed = self.parameters.increments_between(view.shadow_of, state).abs()
