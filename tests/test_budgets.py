@@ -14,26 +14,26 @@ from source_trees import module_paths, module_trees
 
 # lines of Python: the limit, and the aim
 ROOMS = {
-    "cli": (1737, 1700),
+    "cli": (1738, 1700),
     "viewer": (2765, 2100),
     "report": (1481, 1500),
-    "studies": (3688, 2600),
+    "studies": (3694, 2600),
     "ingest": (15_018, 10_500),
-    "tracking": (1613, 1200),
-    "synthesis": (4098, 3200),
+    "tracking": (1611, 1200),
+    "synthesis": (4114, 3200),
     "evaluation": (1301, 1200),
     "labels": (866, 800),
-    "methods": (5187, 3500),
-    "training": (2021, 1700),
-    "states": (3278, 2600),
+    "methods": (5092, 3500),
+    "training": (1973, 1700),
+    "states": (3257, 2600),
     "evidence": (1057, 1200),
-    "scene": (1956, 1800),
+    "scene": (1942, 1800),
     "capture": (4493, 3900),
     "raster": (3923, 3800),
     "geometry": (983, 1000),
     "base": (1544, 1500),
 }
-FILES, FUNCTIONS, NUMBERS = (281, 240), (3143, 3000), (284, 300)
+FILES, FUNCTIONS, NUMBERS = (281, 240), (3107, 3000), (284, 300)
 
 
 def lines_of_rooms() -> Counter[str]:

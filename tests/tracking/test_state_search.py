@@ -20,7 +20,6 @@ from wristed_world import make_driver
 from neeco.capture.model import InstrumentState, State, Uncertainty
 from neeco.methods.kinematic import discovery
 from neeco.methods.kinematic.articulation import ArticulatedInstruments
-from neeco.methods.kinematic.deformation import judge_states_again
 from neeco.scene import Recorded
 from neeco.scene.training_views import TrainingViews
 from neeco.states.contradictions import (
@@ -38,7 +37,7 @@ from neeco.states.parameters import StateParameters
 from neeco.states.refinement import Refinement, Verdict
 from neeco.states.search import SEARCH, StateSearch
 from neeco.training.config import method_defaults, training_config
-from neeco.training.session import GaussianSession, new_session
+from neeco.training.session import GaussianSession
 
 TRUE = [world.moving(k) for k in range(-4, 8)]
 
@@ -69,7 +68,7 @@ def session_of(root: Path, states: Sequence[State], cameras: int = 1) -> Gaussia
             shutil.copy(frame.image_path, other)
         frames += tuple(replace(f, image_path=other) for f, other in zip(frames, others, strict=False))
     scene.recorded = Recorded.of(frames, scene.instruments)
-    return new_session(scene, TrainingViews.read(frames, 1.0), method_defaults("kinematic"))
+    return GaussianSession(scene, TrainingViews.read(frames, 1.0), method_defaults("kinematic"))
 
 
 def search_of(session: GaussianSession) -> StateSearch:
@@ -315,7 +314,7 @@ def driver_session(root: Path, recorded: dict[int, State] | None = None, scale: 
     scene = make_driver(12)
     true = list(scene.recorded.states)
     frames = world.record(scene, root, true, "train").frames
-    session = new_session(scene, TrainingViews.read(frames, 1.0), method_defaults("kinematic"))
+    session = GaussianSession(scene, TrainingViews.read(frames, 1.0), method_defaults("kinematic"))
     search, random = search_of(session), torch.Generator().manual_seed(3)
     states = []
     for index, state in enumerate(true):
@@ -324,7 +323,7 @@ def driver_session(root: Path, recorded: dict[int, State] | None = None, scale: 
         states.append((recorded or {}).get(index, session.refinement.layout.moved(state, off)))
     frames = tuple(replace(frame, state=state) for frame, state in zip(frames, states, strict=True))
     scene.recorded = Recorded.of(frames, scene.instruments)
-    return new_session(scene, TrainingViews.read(frames, 1.0), method_defaults("kinematic"))
+    return GaussianSession(scene, TrainingViews.read(frames, 1.0), method_defaults("kinematic"))
 
 
 def no_outliers(search: StateSearch) -> Misfits:
@@ -384,7 +383,7 @@ def test_states_are_judged_again_where_errors_are_large(size: float, tmp_path: P
     mirrored = mirrored_state(search_of(right), 4, right.recorded.states[4])
     session = driver_session(tmp_path, {4: mirrored})
     session.refinement.error_scale.fill_(size)
-    judge_states_again(session, cast(ArticulatedInstruments, session.scene.deformation))
+    session.scene.deformation.act(session, "judge_states_again")
     assert contradicting(session.refinement) == ({4: Verdict.REFITTED} if size else {})
 
 

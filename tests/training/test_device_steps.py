@@ -9,7 +9,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -87,16 +89,10 @@ def session_on_meta(method: str, batch_size: int) -> GaussianSession:
     image, mask = torch.zeros(*size, 3, dtype=torch.uint8, device=META), torch.ones(size, dtype=torch.bool, device=META)
     refine = [f"refine.{part}=true" for part in ("registration", "latency", "frame_poses", "cameras")]
     config = training_config(method, {"iterations": 20_000, "batch_size": batch_size}, refine)
-    session = GaussianSession(
-        scene=scene,
-        length=config.length,
-        generator=torch.Generator(),  # "meta" has none of its own
-        views=TrainingViews(frames, (image,) * len(frames), (mask,) * len(frames)),
-        report=print,
-        batch_size=batch_size,
-        config=config,
-        extent=50.0,
-    )
+    views, own_generator = TrainingViews(frames, (image,) * len(frames), (mask,) * len(frames)), torch.Generator()
+    with patch.object(module, "torch", SimpleNamespace(Generator=lambda device: own_generator)):  # "meta" has none
+        session = GaussianSession(scene, views, config, print)
+    session.extent = 50.0
     session.start()
     session.iteration = 5_000
     return session

@@ -34,7 +34,7 @@ from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.method_registry import make_deformation
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
-from neeco.training.session import GaussianSession, new_session
+from neeco.training.session import GaussianSession
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def session(tmp_path: Path) -> GaussianSession:
         hinges.hinge_depth.fill_(PIVOT_MM)
         hinges.wrist_start.fill_(-20.0)
         hinges.radius.fill_(3.0)
-    session = new_session(scene, TrainingViews.read(frames), TrainConfig(method="kinematic"), print)
+    session = GaussianSession(scene, TrainingViews.read(frames), TrainConfig(method="kinematic"), print)
     session.iteration = session.length.iterations
     scene.requires_grad_(False)
     return session

@@ -15,7 +15,7 @@ from neeco.raster import rasterize
 from neeco.scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
-from neeco.training.session import GaussianSession, new_session
+from neeco.training.session import GaussianSession
 
 OFFSET, STRENGTH = (9.0, -6.0, 0.0), 0.5  # mm, of the lamp of the recorded images
 OTHER = (-7.0, -7.0, 0.0)
@@ -50,7 +50,7 @@ def session(
     masks = tuple(None if blank_every > 1 and k % blank_every == 0 else mask for k in range(len(frames)))
     views = TrainingViews(frames, images, masks)
     config = training_config("3dgs", {"iterations": 400})
-    return new_session(lit(make_scene(), (), 0.0), views, config)
+    return GaussianSession(lit(make_scene(), (), 0.0), views, config)
 
 
 def lamps(scene: GaussianScene) -> list[torch.Tensor]:

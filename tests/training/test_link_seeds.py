@@ -19,8 +19,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.evidence.carving import CarvedShape, CarvingSettings, Evidence, carve
 from neeco.geometry.rotations import rigid_from_vector, rotate_about
 from neeco.methods.kinematic.articulation import Articulation
-from neeco.methods.kinematic.link_registration import correct_poses
-from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
+from neeco.methods.kinematic.link_search import align_to_links, correct_poses, readings_of, start_links
 from neeco.methods.kinematic.wrist_search import search_wrist
 from neeco.scene.drawable import Recorded
 from neeco.states.refinement import RefineConfig, Refinement

@@ -11,18 +11,34 @@ import torch
 from torch import Tensor, nn
 
 from neeco.base.errors import NeecoError
-from neeco.capture.model import State
+from neeco.capture.model import Instrument, State
 from neeco.raster.devices import fast_bfloat16
+from neeco.scene.deformation import LabelledByMotion
 
-HALF_BY_DEFAULT: Mapping[str, Any] = {"deformation.half": None}  # decided by `half_resolved` where training starts
+HALF_BY_DEFAULT: Mapping[str, Any] = {"deformation.half": None}  # decided by `PlaceNetwork` where training starts
 
 
-def half_resolved(settings: Any, begun: Any | None) -> Any:
-    """Return a network's `settings` with `half`, where None, as in those of the run that was `begun`, or else by
-    whether this processor is fast at bfloat16."""
-    if settings.half is not None:
-        return settings
-    return replace(settings, half=fast_bfloat16() if begun is None else begun.half)
+class PlaceNetwork(LabelledByMotion):
+    """Deformation by a network of a Gaussian's mean, which is normalised to [-1, 1] over the points."""
+
+    large_operations = True
+
+    mean_center: Tensor
+    mean_halfwidth: Tensor
+
+    def __init__(self, instruments: tuple[Instrument, ...], settings: Any = None) -> None:
+        super().__init__(instruments, settings)
+        self.warm_up = self.settings.warm_up
+        self.register_buffer("mean_center", torch.zeros(3))
+        self.register_buffer("mean_halfwidth", torch.ones(()))
+
+    @classmethod
+    def resolved(cls, settings: Any, begun: Any | None = None) -> Any:
+        """Return `settings` with `half`, where None, as in those of the run that was `begun`, or else by whether this
+        processor is fast at bfloat16."""
+        if settings.half is not None:
+            return settings
+        return replace(settings, half=fast_bfloat16() if begun is None else begun.half)
 
 
 def check_warm_up(share: float) -> None:

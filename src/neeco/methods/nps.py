@@ -20,11 +20,11 @@ from neeco.base.errors import NeecoError
 from neeco.capture.model import Instrument, State
 from neeco.evidence.carving import CarvingSettings
 from neeco.geometry.rotations import matrix_to_quat, quat_multiply
-from neeco.methods.networks import HALF_BY_DEFAULT, check_warm_up, encode, half_resolved, octave_weights, robust_bounds
+from neeco.methods.networks import HALF_BY_DEFAULT, PlaceNetwork, check_warm_up, encode, octave_weights, robust_bounds
 from neeco.methods.tissue_fit import carve_seeds
 from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
-from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Perturbation, Posed, floored_decay, state_of
+from neeco.scene.deformation import UNPERTURBED, Perturbation, Posed, floored_decay, state_of
 from neeco.training.session import GaussianSession
 
 # Units of the head's output. With unit features the first Adam step moves every output by about width * rate = 0.2;
@@ -75,7 +75,7 @@ class NPSSettings:
             raise NeecoError(f"deformation.anneal: {self.anneal} is not a share of the training in [0, 1]")
 
 
-class NPS(LabelledByMotion):
+class NPS(PlaceNetwork):
     """The network F."""
 
     method = "nps"
@@ -95,32 +95,22 @@ class NPS(LabelledByMotion):
         },
     }
     needs_instruments = True
-    large_operations = True
 
     extra_rates: ClassVar[Mapping[str, float]] = {MEMBER_LOGITS: 1e-2}
 
     state_center: Tensor
     state_halfwidth: Tensor
-    mean_center: Tensor
-    mean_halfwidth: Tensor
     first_quats: Tensor
     rest: Tensor  # [I, 4, 4] mm: the instruments' poses in the state in which the canonical Gaussians are placed
     opened: Tensor  # share of the octaves that are open
 
-    @classmethod
-    def resolved(cls, settings: Any, begun: Any | None = None) -> Any:
-        """`settings` with `half` decided: by this processor, or as in those of a run that was `begun`."""
-        return half_resolved(settings, begun)
-
     def __init__(self, instruments: tuple[Instrument, ...], settings: NPSSettings | None = None) -> None:
         super().__init__(instruments, settings)
         sizes: NPSSettings = self.settings
-        depth, width, self.warm_up = sizes.depth, sizes.width, sizes.warm_up
+        depth, width = sizes.depth, sizes.width
         size = self.state_size()
         self.register_buffer("state_center", torch.zeros(size))
         self.register_buffer("state_halfwidth", torch.ones(size))
-        self.register_buffer("mean_center", torch.zeros(3))
-        self.register_buffer("mean_halfwidth", torch.ones(()))
         self.register_buffer("first_quats", torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(max(len(instruments), 1), 1))
         if sizes.seeds or sizes.membership:
             self.register_buffer("rest", torch.eye(4).repeat(len(instruments), 1, 1))
@@ -239,13 +229,10 @@ class NPS(LabelledByMotion):
             deformed = Posed(means, quats, (canonical.log_scales + SHAPE_UNIT * change[:, 7:]).exp())
         return self._carried(deformed, members(canonical), state) if self.settings.membership else deformed
 
-    def _motions(self, state: State) -> Tensor:
-        """Return the motion [I, 4, 4] mm of each instrument from the state of rest, world frame."""
-        return self._poses(state) @ self.rest.inverse()
-
     def _carried(self, deformed: Posed, shares: Tensor, state: State) -> Posed:
         """Return the static geometry and that moved with each instrument, blended by shares [N, 1 + I]."""
-        means, quats, carried = deformed.means, deformed.quats, self._motions(state)
+        means, quats = deformed.means, deformed.quats
+        carried = self._poses(state) @ self.rest.inverse()  # [I, 4, 4] mm, motions from the state of rest, world frame
         turns = matrix_to_quat(carried[:, :3, :3])  # [I, 4]
         turns = torch.where(turns[:, :1] < 0, -turns, turns)
         frames = [turns.new_tensor([1.0, 0.0, 0.0, 0.0]), *turns]

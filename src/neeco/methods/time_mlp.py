@@ -26,10 +26,10 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
-from neeco.methods.networks import HALF_BY_DEFAULT, RecordedTimes, check_warm_up, encode, half_resolved, robust_bounds
+from neeco.methods.networks import HALF_BY_DEFAULT, PlaceNetwork, RecordedTimes, check_warm_up, encode, robust_bounds
 from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformation import UNPERTURBED, LabelledByMotion, Perturbation, Posed, log_linear
+from neeco.scene.deformation import UNPERTURBED, Perturbation, Posed, log_linear
 from neeco.scene.method import PLAIN_TRAINING
 
 DEPTH, SKIP = 8, 4  # layers; the one after which the input is given again
@@ -67,7 +67,7 @@ class NoisyTime(Perturbation):
     time_noise: float = 0.0
 
 
-class TimeMLP(LabelledByMotion):
+class TimeMLP(PlaceNetwork):
     """A network of 8 layers over place and time."""
 
     method = "deformable-3dgs"
@@ -79,24 +79,13 @@ class TimeMLP(LabelledByMotion):
         "density_stop": 0.375,
     }
     needs_times = True
-    large_operations = True
-
-    mean_center: Tensor
-    mean_halfwidth: Tensor
-
-    @classmethod
-    def resolved(cls, settings: Any, begun: Any | None = None) -> Any:
-        """`settings` with `half` decided: by this processor, or as in those of a run that was `begun`."""
-        return half_resolved(settings, begun)
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: TimeMLPSettings | None = None) -> None:
         super().__init__(instruments, settings)
         sizes: TimeMLPSettings = self.settings
-        width, self.warm_up = sizes.width, sizes.warm_up
+        width = sizes.width
         self.L_time = (6 if sizes.synthetic else 10) if sizes.L_time is None else sizes.L_time
         self.times = RecordedTimes()
-        self.register_buffer("mean_center", torch.zeros(3))
-        self.register_buffer("mean_halfwidth", torch.ones(()))
         self.mean_inputs, time_inputs = 3 * (1 + 2 * sizes.L_mean), 1 + 2 * self.L_time
         if sizes.synthetic:
             self.time_net = nn.Sequential(nn.Linear(time_inputs, 256), nn.ReLU(), nn.Linear(256, 30))

@@ -26,7 +26,7 @@ from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_views import TrainingViews
 from neeco.states.refinement import RefineConfig
 from neeco.training.config import OptimizerConfig, TrainConfig, method_defaults
-from neeco.training.session import GaussianSession, new_session
+from neeco.training.session import GaussianSession
 
 DENSITY_START = 200  # steps of a longer fit of the tissue before it adds Gaussians
 
@@ -79,7 +79,7 @@ def fit_tissue(
         optimizer=OptimizerConfig(),  # what counts as evidence was measured at these rates, whatever training has
     )
     distinct = distinct_frames([(frame.state, frame.camera) for frame in views.frames])
-    session = new_session(tissue, views.subset(distinct), short)
+    session = GaussianSession(tissue, views.subset(distinct), short)
     session.start()
     while session.iteration < steps:
         session.step()
@@ -88,8 +88,8 @@ def fit_tissue(
 
 
 def carved_shape(session: GaussianSession, evidence: Evidence, name: str, generator: torch.Generator) -> CarvedShape:
-    """Return the carved shape, or seeds around the tracked frame where the evidence does not move with the instrument.
-    Raises NeecoError without evidence."""
+    """Return the carved shape, or seeds around the tracked frame where the evidence does not move with the instrument,
+    which is reported and noted in the scene's diagnostics. Raises NeecoError without evidence."""
     search = session.config.deformation.carving
     shape = carve(evidence, name, generator, search)
     if shape is None:
@@ -97,21 +97,8 @@ def carved_shape(session: GaussianSession, evidence: Evidence, name: str, genera
             f"instrument {name!r}: nothing in the images moves with its recorded pose; check that its poses are in mm "
             f"and in the cameras' world frame (`neeco check`): {HOW_TO_REGISTER}; or train with --method nps"
         )
-    if moves_with_pose(session, evidence, name, shape):
-        return shape
-    spread = CARVING.seed_spread * evidence.distance
-    seeds = (torch.randn(search.seeds, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
-    frame = torch.eye(4, device=seeds.device)  # the tracked frame is on the body
-    return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
-
-
-def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, shape: CarvedShape) -> bool:
-    """Whether the evidence moves with the instrument: with exchanged poses it must be weaker.
-
-    Where it is not (an instrument that hardly moves), carving cannot separate the instrument from static parts of the
-    scene. Reports that, and notes it in the scene's diagnostics.
-    """
-    search = session.config.deformation.carving
+    # with exchanged poses the evidence must be weaker: where it is not (an instrument that hardly moves), carving
+    # cannot separate the instrument from static parts of the scene
     views = posed_views(evidence, name, search)
     recorded_scores, _ = score_points(evidence, views.own, shape.seeds)
     other = views.exchanged_scores(shape.seeds)
@@ -121,12 +108,16 @@ def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, sha
         "evidence_of_other_poses": round(float(other.mean()), 4),
         "moves_with_its_pose": moves,
     }
-    if not moves:
-        session.report(
-            f"warning: {name}: the images hardly depend on its recorded pose; its shape is searched around the "
-            f"tracked frame, and its labels may be wrong: record more motion, or register its poses ({HOW_TO_REGISTER})"
-        )
-    return moves
+    if moves:
+        return shape
+    session.report(
+        f"warning: {name}: the images hardly depend on its recorded pose; its shape is searched around the "
+        f"tracked frame, and its labels may be wrong: record more motion, or register its poses ({HOW_TO_REGISTER})"
+    )
+    spread = CARVING.seed_spread * evidence.distance
+    seeds = (torch.randn(search.seeds, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
+    frame = torch.eye(4, device=seeds.device)  # the tracked frame is on the body
+    return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
 
 
 def carve_seeds(session: GaussianSession) -> list[tuple[Tensor, float]]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from neeco.capture.model import Camera, Capture, Frame, Instrument, InstrumentState, RecordedStates, State
 from neeco.geometry.lens import Lens
@@ -157,48 +156,50 @@ class ArticulatedMotion:
     links: tuple[tuple[Tensor, Tensor], ...] = ()  # of every instrument: weights [M, L], links' amounts [L, A, 2]
 
 
-class DrawableScene(Protocol):
-    """A learned scene that can be rendered: a `GaussianScene` or a radiance field, always a torch module.
+class DrawableScene(nn.Module):
+    """A learned scene that can be rendered: a `GaussianScene` or a radiance field.
 
-    Code that poses or labels Gaussians takes a `GaussianScene` (see `require_gaussians`)."""
+    Code that poses or labels Gaussians takes a `GaussianScene` (see `require_gaussians`). `settings` are the method's
+    own."""
 
-    method: str
-    instruments: tuple[Instrument, ...]
-    recorded: Recorded
-    diagnostics: dict[str, Any]
     has_gaussians: bool  # False: nothing to rasterise, pose or label; an image takes seconds
+    settings: Any
+
+    def __init__(self, method: str, instruments: tuple[Instrument, ...], recorded: Recorded) -> None:
+        super().__init__()
+        self.method = method
+        self.instruments = instruments
+        self.recorded = recorded
+        self.diagnostics: dict[str, Any] = {}
 
     @property
     def casts_shadow(self) -> bool:
         """Whether the instruments' shadow is rendered explicitly, so that none is learned as a faint part of them."""
+        return False
 
     @property
-    def label_names(self) -> Sequence[tuple[str, str]]:
-        """(instrument, part) of each label column; empty where the scene learns no labels."""
+    def label_names(self) -> tuple[tuple[str, str], ...]:
+        """(instrument, part) of each label column; empty where the scene learns no labels. Mask id = index + 1, 0 is
+        tissue."""
+        return ()
 
     @property
     def num_gaussians(self) -> int | None:
         """Number of Gaussians; None: a scene without Gaussians."""
+        return None
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """Render `state` from the recorded `camera`; `labels`: with label channels, if the scene has any."""
+        raise NotImplementedError
 
     def motion(self) -> ArticulatedMotion | None:
         """Return the articulation if it determines all motion, else None."""
+        return None
 
     def torch_threads(self) -> AbstractContextManager[None]:
-        """Use the number of torch's threads that renders the scene fastest."""
-
-    @property
-    def settings(self) -> Any:
-        """The method's own settings."""
+        """Use the number of torch's threads that renders the scene fastest: by default all."""
+        return nullcontext()
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return (tensors, JSON-able fields) to store in addition to its modules' state."""
-
-    def named_parameters(self) -> Any: ...
-    def named_buffers(self) -> Any: ...
-    def state_dict(self) -> Mapping[str, Tensor]: ...
-    def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> Any: ...
-    def requires_grad_(self, requires_grad: bool = True) -> Any: ...
-    def to(self, device: torch.device) -> Any: ...
+        return {}, {}

@@ -39,7 +39,7 @@ CANONICAL_SHAPES = {  # of one Gaussian
 }
 
 
-class GaussianScene(nn.Module):
+class GaussianScene(DrawableScene):
     """A learned scene of Gaussians: `at` poses them in a state, for any method; `render` renders them.
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
@@ -65,15 +65,12 @@ class GaussianScene(nn.Module):
         recorded: Recorded,
         center: Tensor,
     ) -> None:
-        super().__init__()
-        self.method = method
+        super().__init__(method, instruments, recorded)
         self.canonical = canonical
         self.deformation = deformation
-        self.instruments = instruments
-        self.recorded = recorded
+        self.settings = deformation.settings
         self.sh_degree = 0
         self.background = 0.0
-        self.diagnostics: dict[str, Any] = {}
         device = canonical.means.device
         self.register_buffer("center", center.float().to(device))  # [3] mm, middle of the tissue
         zeros = partial(torch.zeros, device=device)
@@ -88,11 +85,6 @@ class GaussianScene(nn.Module):
         self._shines = CachedPredicate(lambda strengths: (strengths > 0).any())
         self._corrects = CachedPredicate(lambda registration: registration.any())
         self._corrects_bases = CachedPredicate(lambda corrections: corrections.any())
-
-    @property
-    def settings(self) -> Any:
-        """The method's own settings."""
-        return self.deformation.settings
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianScene:
         """Move the canonical Gaussians with the modules (called by `to`)."""
@@ -116,7 +108,8 @@ class GaussianScene(nn.Module):
         prefix = "canonical."
         canonical = _canonical(
             {name.removeprefix(prefix): t for name, t in stored.tensors.items() if name.startswith(prefix)},
-            _counts(header["counts"], len(stored.instruments)),
+            tuple(header["counts"]),
+            len(stored.instruments),
         )
         center = canonical.means.new_zeros(3)
         scene = cls(header["method"], canonical, deformation, stored.instruments, stored.recorded, center)
@@ -137,6 +130,10 @@ class GaussianScene(nn.Module):
         canonical = self.canonical
         posed = self.deformation.pose(canonical, self.registered(state), perturbation)
         tissue, instruments = canonical.counts[0], len(canonical) - canonical.counts[0]
+        shadow = None
+        if self.casts_shadow:
+            strengths = self.shadow_strengths.clamp(0.0, 1.0)
+            shadow = Shadow(canonical.of_instruments, self.shadow_offsets, strengths, self.shadow_width)
         falloff = torch.cat([self.falloff[:1].expand(tissue), self.falloff[1:].expand(instruments)])
         return Gaussians(
             means=posed.means,
@@ -145,7 +142,7 @@ class GaussianScene(nn.Module):
             opacities=torch.sigmoid(canonical.opacity_logits),
             sh=canonical.spherical_harmonics(self.sh_degree),
             sh_frames=posed.sh_frames,
-            headlight=Headlight(falloff, self.vignette, self._shadow()),
+            headlight=Headlight(falloff, self.vignette, shadow),
             background=canonical.means.new_full((3,), self.background) if self.background else None,
         )
 
@@ -166,12 +163,6 @@ class GaussianScene(nn.Module):
     def casts_shadow(self) -> bool:
         """Whether a lamp next to the lens was found, and there are instruments to cast its shadow."""
         return self._shines(self.shadow_strengths) and len(self.canonical) > self.canonical.counts[0]
-
-    def _shadow(self) -> Shadow | None:
-        if not self.casts_shadow:
-            return None
-        strengths = self.shadow_strengths.clamp(0.0, 1.0)
-        return Shadow(self.canonical.of_instruments, self.shadow_offsets, strengths, self.shadow_width)
 
     def registered(self, state: State) -> State:
         """Return `state` with the learned corrections of states, bases and of tracker to world.
@@ -264,16 +255,12 @@ def require_gaussians(scene: DrawableScene, asked_by: str) -> GaussianScene:
     return scene
 
 
-def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:
-    """Return the number of Gaussians per body. Raises ValueError if invalid; without instruments, all are tissue."""
+def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...], instruments: int) -> CanonicalGaussians:
+    """Return the Gaussians. Raises ValueError for wrong shapes, types or numbers; without instruments, all bodies are
+    tissue."""
     fits = instruments == 0 or len(counts) in (1, 1 + instruments)
     if not fits or not all(isinstance(count, int) and count >= 0 for count in counts):
         raise ValueError(f"counts of {len(counts)} bodies do not fit {instruments} instruments")
-    return tuple(counts)
-
-
-def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
-    """Return the Gaussians. Raises ValueError for wrong shapes, types or numbers."""
     if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
         raise ValueError(f"{missing[0]} is missing")
     for name, tensor in tensors.items():

@@ -46,7 +46,11 @@ class StateCorrections(nn.Module):
     def __init__(self, instruments: Sequence[Instrument], device: torch.device) -> None:
         super().__init__()
         self.names = tuple(item.name for item in instruments)
-        self.readings = tuple(recorded_readings(item) for item in instruments)
+        trees = [() if item.kinematics is None else item.kinematics.readings for item in instruments]
+        self.readings = tuple(
+            tuple(reading for reading in readings if reading not in item.unrecorded)
+            for item, readings in zip(instruments, trees, strict=True)
+        )
         slide, angle = CORRECTIONS.slide_mm, CORRECTIONS.angle_rad
         recorded = zip(instruments, self.readings, strict=True)
         self._units = [[slide if item.slides(name) else angle for name in readings] for item, readings in recorded]
@@ -85,12 +89,6 @@ class StateCorrections(nn.Module):
                 pose = before.pose.to(increments) @ rigid_from_vector(increments[:6])
                 moved[name] = InstrumentState(pose, joints)
         return replace(state, instruments=moved)
-
-
-def recorded_readings(instrument: Instrument) -> tuple[str, ...]:
-    """Return the readings of an instrument's stated kinematics that were recorded."""
-    tree = instrument.kinematics
-    return () if tree is None else tuple(reading for reading in tree.readings if reading not in instrument.unrecorded)
 
 
 def kernel(one: Tensor, other: Tensor, length: Tensor | float) -> Tensor:

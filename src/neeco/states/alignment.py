@@ -23,7 +23,7 @@ from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
 from neeco.states.crop_rendering import CROPS
 from neeco.states.minimise import Differences, ImageResidual, Render, minimise
-from neeco.states.parameters import InstrumentParameters, StateParameters, moved_camera, precision_of
+from neeco.states.parameters import InstrumentParameters, StateParameters, moved_camera
 
 if TYPE_CHECKING:
     from neeco.scene import GaussianScene
@@ -78,7 +78,7 @@ def align_frame(
     config = config or (WIDE if scene.recorded.error_scale else AlignConfig())
     instruments = [item for item in scene.instruments if item.name in frame.state.instruments]
     parameters = StateParameters(tuple(map(InstrumentParameters.of, instruments)), joints_last=True, camera=True)
-    mask, precision = frame.load_mask(), precision_of(_deviations(parameters, instruments, config))
+    mask, precision = frame.load_mask(), torch.diag(_deviations(parameters, instruments, config) ** -2)
     counted = torch.ones(frame.camera.height, frame.camera.width) if mask is None else mask.float()
     radians = config.step_deg * torch.pi / 180
     steps = parameters.vector(radians, config.step_mm, (radians, config.step_mm), (radians, config.step_mm))

@@ -249,18 +249,15 @@ class TissueRenderer:
     @torch.no_grad()
     def render(self, camera: Camera, state: State | None) -> Tensor:
         """Return [h, w, 3] with the shadow of instruments in `state` (None: without)."""
-        tissue = self._at(self.scene.recorded.states[0] if state is None else state)
+        moment = self.scene.recorded.states[0] if state is None else state
+        if self._posed is None or self._posed[0] != moment.time:  # the tissue depends on nothing else of a state
+            self._posed = moment.time, self.scene.at(moment).select(slice(0, self.scene.canonical.counts[0]))
+        tissue = self._posed[1]
         if state is not None and self.shaded:
             tissue = shadowed(tissue, camera, depth_maps, self._instruments.pose(state))
         elif tissue.headlight is not None:
             tissue = replace(tissue, headlight=replace(tissue.headlight, shadow=None))
         return rasterize(tissue, camera).color.clamp(0, 1).cpu()
-
-    def _at(self, state: State) -> Gaussians:
-        """Return the tissue at the time of `state`, its only dependence on it."""
-        if self._posed is None or self._posed[0] != state.time:
-            self._posed = state.time, self.scene.at(state).select(slice(0, self.scene.canonical.counts[0]))
-        return self._posed[1]
 
 
 def _without_tissue(scene: GaussianScene) -> GaussianScene:

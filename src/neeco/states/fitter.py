@@ -26,7 +26,7 @@ from neeco.states.crop_rendering import (
     working_size,
 )
 from neeco.states.minimise import Differences, ImageResidual, Render, minimise
-from neeco.states.parameters import StateParameters, precision_of
+from neeco.states.parameters import StateParameters
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,4 +255,4 @@ def residual_of(view: FrameView, size: float, correlation_px: float = FIT.correl
 
 def loose_prior(parameters: StateParameters, degrees: float, millimetres: float, joint_degrees: float) -> Tensor:
     """Return the precision [P, P] of a prior of these deviations; 0.25 mm per degree for prismatic joints."""
-    return precision_of(parameters.vector_from_degrees(degrees, millimetres, joint_degrees, joint_degrees / 4))
+    return torch.diag(parameters.vector_from_degrees(degrees, millimetres, joint_degrees, joint_degrees / 4) ** -2)

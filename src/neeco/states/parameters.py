@@ -18,7 +18,7 @@ from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.geometry.camera import Camera
-from neeco.geometry.rotations import rigid_from_vector
+from neeco.geometry.rotations import rigid, rigid_from_vector
 
 DEG = math.pi / 180
 
@@ -29,32 +29,21 @@ def moved_pose(pose: Tensor, increment: Tensor, pivot: Tensor | None = None) -> 
     increment [6]: rotation vector (rad) about `pivot` [3] mm (None: the origin), then translation (mm).
     """
     if not (increment.requires_grad or pose.requires_grad) and increment.dtype == torch.float64:
-        return _moved_array(pose, increment, pivot)
+        vector = increment.detach().cpu().numpy()  # without gradients ten times as fast in numpy
+        array = rigid(Rotation.from_rotvec(vector[:3]).as_matrix(), vector[3:])
+        if pivot is not None:
+            place = pivot.cpu().numpy()
+            array[:3, 3] += place - array[:3, :3] @ place
+        return torch.from_numpy(pose.detach().cpu().double().numpy() @ array).to(increment.device)
     step = rigid_from_vector(increment)
     if pivot is not None:
         step[:3, 3] += pivot - step[:3, :3] @ pivot
     return pose.to(increment) @ step
 
 
-def _moved_array(pose: Tensor, increment: Tensor, pivot: Tensor | None) -> Tensor:
-    """Return `moved_pose` without gradients in float64, ten times as fast."""
-    vector, step = increment.detach().cpu().numpy(), np.eye(4)
-    rotation = Rotation.from_rotvec(vector[:3]).as_matrix()
-    step[:3, :3], step[:3, 3] = rotation, vector[3:]
-    if pivot is not None:
-        place = pivot.cpu().numpy()
-        step[:3, 3] += place - rotation @ place
-    return torch.from_numpy(pose.detach().cpu().double().numpy() @ step).to(increment.device)
-
-
 def moved_camera(camera: Camera, increment: Tensor) -> Camera:
     """Return `camera` moved in its own frame by `increment` [6] (see `moved_pose`)."""
     return replace(camera, world_from_camera=moved_pose(camera.world_from_camera, increment))
-
-
-def precision_of(deviations: Tensor) -> Tensor:
-    """Return the precision [P, P] of a prior with independent standard deviations [P] about zero."""
-    return torch.diag(deviations**-2)
 
 
 def sds_of(sizes: tuple[float, ...], slides: Sequence[bool] | np.ndarray) -> np.ndarray:

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.capture.model import Frame, Instrument, State, evenly_spaced
+from neeco.capture.model import Frame, State, evenly_spaced
 from neeco.scene import GaussianScene
 from neeco.states.crop_rendering import FrameView, InstrumentRenderer, TissueRenderer
 from neeco.states.fitter import Fitter, StateFit
-from neeco.states.parameters import DEG, InstrumentParameters, StateParameters, sds_of
+from neeco.states.parameters import DEG, StateParameters, sds_of
 from neeco.states.refinement import LIMITS, Refinement
 
 
@@ -64,11 +64,15 @@ class StateSearch:
     def of(
         cls, scene: GaussianScene, refinement: Refinement, frames: Sequence[Frame], shafts: Sequence[Tensor]
     ) -> StateSearch:
-        """Return the search with the present `scene`."""
-        bounded = StateParameters(
-            tuple(_bounded(p, item) for p, item in zip(refinement.layout.instruments, scene.instruments, strict=True))
-        )
-        fitter = Fitter(InstrumentRenderer(scene), bounded, TissueRenderer(scene), SEARCH.correlation_px)
+        """Return the search with the present `scene`; joints stay within their limits, extended by half their range."""
+        bounded = []
+        for parameters, item in zip(refinement.layout.instruments, scene.instruments, strict=True):
+            limits = [item.joints[joint] or (-math.inf, math.inf) for joint in parameters.joints]
+            low, high = torch.tensor(limits, dtype=torch.float64).reshape(-1, 2).unbind(1)
+            beyond = torch.where((high - low).isfinite(), SEARCH.beyond_limits * (high - low), 0.0)
+            bounded.append(replace(parameters, low=low - beyond, high=high + beyond))
+        layout = StateParameters(tuple(bounded))
+        fitter = Fitter(InstrumentRenderer(scene), layout, TissueRenderer(scene), SEARCH.correlation_px)
         return cls(scene, refinement, frames, fitter, shafts)
 
     @property
@@ -226,17 +230,6 @@ class StateSearch:
         sizes = (SEARCH.tilt * DEG, SEARCH.roll * DEG, SEARCH.across, SEARCH.depth, joint, joint * LIMITS.mm_per_rad)
         errors = [sds_of(sizes, parameters.slides) for parameters in self.refinement.layout.instruments]
         return torch.from_numpy(np.concatenate(errors))
-
-
-def _bounded(parameters: InstrumentParameters, instrument: Instrument) -> InstrumentParameters:
-    """Return the parameters with bounds of the joints: their limits, extended by half their range."""
-    ends = []
-    for joint in parameters.joints:
-        low, high = instrument.joints[joint] or (-math.inf, math.inf)
-        beyond = SEARCH.beyond_limits * (high - low) if math.isfinite(high - low) else 0.0
-        ends.append([low - beyond, high + beyond])
-    bounds = torch.tensor(ends, dtype=torch.float64).reshape(-1, 2)
-    return replace(parameters, low=bounds[:, 0], high=bounds[:, 1])
 
 
 def _about(shaft: Tensor) -> Tensor:

@@ -171,15 +171,15 @@ class LabelFitter:
             if rendered[..., 0].sum() < LABEL_FIT.min_pixels:
                 return None
             was, (before, *_), _ = self._layout(rendered)
-            pivot, ahead = (self._in_image(state, camera, along) for along in (0.0, 1.0))
-            before = before if before @ (ahead - pivot) >= 0 else -before
+            focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+            (*pivot, depth), (*ahead, further) = (self._along(state, camera, along) for along in (0.0, 1.0))
+            shift = (focal * ahead / further + principal) - (focal * pivot / depth + principal)  # px
+            before = before if before @ shift >= 0 else -before
             turn = math.atan2(direction[1], direction[0]) - math.atan2(before[1], before[0])
             motion = np.eye(4)
             motion[:3, :3] = Rotation.from_rotvec([0, 0, turn]).as_matrix()
-            principal = np.array([camera.cx, camera.cy])
             was = motion[:2, :2] @ (was - principal) + principal
-            depth = self._along(state, camera)[2]
-            motion[:2, 3] = (center - was) / np.array([camera.fx, camera.fy]) * depth
+            motion[:2, 3] = (center - was) / focal * depth
             state = _before_camera(state, camera, motion)
         return state
 
@@ -196,11 +196,6 @@ class LabelFitter:
         pose = state.instruments[item.name].pose.double().cpu().numpy()
         point = (item.pivot + millimetres * item.axis).numpy()
         return (camera.camera_from_world @ pose @ np.append(point, 1.0))[:3]
-
-    def _in_image(self, state: State, camera: Camera, millimetres: float) -> np.ndarray:
-        """Return the pixel [2] (x, y) of `_along`."""
-        x, y, z = self._along(state, camera, millimetres)
-        return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
 
     def _layout(self, channels: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], float]:
         """Return the centre [2] px of an image of channels [h, w, 3], its possible directions [2] towards the tip, and

@@ -17,7 +17,7 @@ from neeco.scene.method_registry import make_deformation, method_class
 from neeco.scene.training_session import Report, Session
 from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
-from neeco.training.session import new_session
+from neeco.training.session import GaussianSession
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ def begin_session(
     if scene is None:
         scene = initial_scene(capture, views.frames, config, report)
     assert isinstance(scene, GaussianScene)
-    session = new_session(scene.to(views.device), views, config, report)
+    session = GaussianSession(scene.to(views.device), views, config, report)
     session.timed = capture.timed
     if is_new and (trees := scene.deformation.begin(session)):
         instruments = [replace(item, kinematics=trees.get(item.name, item.kinematics)) for item in capture.instruments]

@@ -95,19 +95,15 @@ class Schedule:
         self.history.append((loss, psnr))
         if self.phase == 2:
             return
-        ready = iteration >= self.scaled(self.config.earliest) and self._settled()
+        ready, window = False, self.window
+        if iteration >= self.scaled(self.config.earliest) and len(self.history) == 2 * window:
+            # PSNR's moving average is above the threshold and the loss fell between two windows
+            values = np.array(self.history)
+            loss_before, loss_now = values[:window, 0].mean(), values[window:, 0].mean()
+            ready = bool(values[window:, 1].mean() > self.config.psnr_threshold and loss_now < loss_before)
         late = progress >= self.config.latest_fraction
         if ready or late:
             self.phase, self.phase_started, self.forced = 2, iteration, not ready
-
-    def _settled(self) -> bool:
-        """Return whether PSNR's moving average is above the threshold and the loss fell between two windows."""
-        window = self.window
-        if len(self.history) < 2 * window:
-            return False
-        values = np.array(self.history)
-        loss_before, loss_now = values[:window, 0].mean(), values[window:, 0].mean()
-        return bool(values[window:, 1].mean() > self.config.psnr_threshold and loss_now < loss_before)
 
     def _acting_phase(self, part: Part) -> int:
         """Return the phase whose settings of `part` apply; 0: off, as in 3DGS."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -14,15 +14,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
-from neeco.capture.model import Camera, Frame, State
+from neeco.capture.model import Camera, State
 from neeco.evidence.foreground import Comparison, Foreground
 from neeco.evidence.label_quality import LABEL_QUALITY, QUALITY, label_counts, quality_of
-from neeco.raster import Rendering, rasterize
+from neeco.raster import rasterize
 from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformation import DEFORMATION, Perturbation, floored_decay, log_linear
-from neeco.scene.drawable import Recorded
 from neeco.scene.gaussian_scene import GaussianScene
 from neeco.scene.training_session import Report, Session, StepResult, check_finite, members, numbers
 from neeco.scene.training_views import TrainingViews
@@ -35,49 +34,47 @@ from neeco.training.schedule import Schedule, due, order_by_pose
 from neeco.training.silhouettes import Silhouettes
 
 
-@dataclass(kw_only=True)
 class GaussianSession(Session):
-    """One training run of any method that deforms Gaussians. Its hooks are `Deformation`'s."""
+    """One training run of any method that deforms Gaussians, at iteration 0 and on the device of the views; `start` it
+    before the first step. Its hooks are `Deformation`'s."""
 
     scene: GaussianScene
-    views: TrainingViews
-    report: Report
-    batch_size: int  # frames per step
-    timed: bool = field(default=True, init=False)  # `State.time` is in seconds
-    config: TrainConfig
-    extent: float  # mm; unit of the positions' learning rate and the dense size
-    pose_order: np.ndarray = field(init=False)
-    refinement: Refinement = field(init=False)
-    rng: np.random.Generator = field(init=False)
-    schedule: Schedule = field(init=False)
-    resolution: Resolution = field(init=False)
-    full_views: TrainingViews = field(init=False)  # at full size; `views` are the current ones
-    scale: float = field(init=False)  # of `views`
-    limits: tuple[int, int] = field(init=False)  # maximum Gaussians of the tissue, and of each instrument
-    recorded: Recorded = field(init=False)  # as it was before training
-    given: list[tuple[State, Camera]] = field(init=False)  # of every frame of `views`, as recorded, on their device
-    statistics: GradientStatistics = field(init=False)
-    silhouettes: Silhouettes | None = None  # of the instruments, once a method has observed them
-    queue: list[int] = field(default_factory=list)
-    queue_phase: int = 1
 
-    def __post_init__(self) -> None:
-        config, frames, device = self.config, self.views.frames, self.views.device
-        names = tuple(instrument.name for instrument in self.scene.instruments)
+    def __init__(
+        self, scene: GaussianScene, views: TrainingViews, config: TrainConfig, report: Report = lambda text: None
+    ) -> None:
+        super().__init__(scene, config.length, torch.Generator(views.device).manual_seed(config.seed))
+        self.config, self.report = config, report
+        self.batch_size = config.batch_size  # frames per step
+        self.timed = True  # `State.time` is in seconds
+        self.full_views = views  # at full size; `views` are the current ones, of the size `scale`
+        self.resolution = Resolution(config.resolution, views)
+        self.limits = config.gaussian_limits(self.resolution.pixels)  # Gaussians of the tissue, and of each instrument
+        self.recorded = scene.recorded  # as it was before training
         self.adam = Adam(self.batch_size)
-        self.pose_order = pose_order(frames, names)
-        self.refinement = Refinement(config.refine, frames, self.scene.instruments, device)
-        self.rng = np.random.default_rng(config.seed)
+        self.refinement = Refinement(config.refine, views.frames, scene.instruments, views.device)
         self.schedule = Schedule(config.schedule, config.iterations)
-        self.full_views = self.views
-        self.resolution = Resolution(config.resolution, self.views)
-        self.limits = config.gaussian_limits(self.resolution.pixels)
-        self.recorded = self.scene.recorded
-        self._use_views(self.full_views, 1.0)
+        states = [frame.state.instruments for frame in views.frames]
+        tracked = [[of[item.name].pose[:3, 1:].double().numpy() for item in scene.instruments] for of in states]
+        self.pose_order = order_by_pose(np.reshape(tracked, (len(states), -1)))  # by positions and directions
+        self.rng = np.random.default_rng(config.seed)
+        self.silhouettes: Silhouettes | None = None  # of the instruments, once a method has observed them
+        self.queue: list[int] = []
+        self.queue_phase = 1
+        self._use_views(views, 1.0)
+
+    @cached_property
+    def extent(self) -> float:
+        """Half the median distance of the cameras from the scene, mm: unit of the positions' learning rate and the
+        dense size."""
+        center = self.scene.center.cpu()
+        poses = [frame.camera.world_from_camera for frame in self.full_views.frames]
+        return 0.5 * float(np.median([float((pose[:3, 3].float() - center).norm()) for pose in poses]))
 
     def _use_views(self, views: TrainingViews, scale: float) -> None:
         """Render and compare with these views from now on, whose images are scaled by `scale`."""
         self.views, self.scale = views, scale
+        # state and camera of every frame as recorded
         self.given = [(frame.state.to(views.device), frame.camera.to(views.device)) for frame in views.frames]
 
     @contextmanager
@@ -145,7 +142,12 @@ class GaussianSession(Session):
             self._use_views(self.full_views.scaled(scale), scale)
         scene.sh_degree = self.schedule.sh_degree(self.iteration)
         scene.deformation.warming_up = progress < scene.deformation.warm_up
-        chosen = [self._next_frame() for _ in range(views)]
+        chosen = []
+        for _ in range(views):
+            if not self.queue or self.queue_phase != self.phase:
+                self.queue = self.schedule.frames(self.pose_order, self.rng)
+            self.queue_phase = self.phase
+            chosen.append(self.queue.pop(0))
         terms: list[Tensor] = []
         for index, following in zip(chosen, [*chosen[1:], *self.queue[:1], None], strict=False):
             terms += self._accumulate(index, progress, following)
@@ -182,7 +184,10 @@ class GaussianSession(Session):
             assert rendering.channels is not None
             fitted = loss + self.silhouettes.loss(index, rendering.channels[..., 0])
         weight = trust_of(self.given[index][0]) * float(self.refinement.counts(index))
-        total = weight * fitted + self._regularisation(rendering, penalty)
+        own = None
+        if not scene.deformation.warming_up:
+            own = scene.deformation.regularisation(scene.canonical, rendering, self.iteration)
+        total = weight * fitted + sum(term for term in (penalty, own) if term is not None)
         with tf32_products(self.views.device) if scene.deformation.large_operations else nullcontext():
             (total / views).backward()  # passing a gradient would make torch import sympy: 2 s per training
         gradient = rendering.center_offsets.grad
@@ -207,21 +212,6 @@ class GaussianSession(Session):
         order = self.pose_order
         # float32, rounded down: other roundings would select other frames and change runs
         return [int(order[int(place)]) for place in torch.linspace(0, len(order) - 1, min(count, len(order)))]
-
-    def _next_frame(self) -> int:
-        phase = self.schedule.phase
-        if not self.queue or self.queue_phase != phase:
-            self.queue = self.schedule.frames(self.pose_order, self.rng)
-        self.queue_phase = phase
-        return self.queue.pop(0)
-
-    def _regularisation(self, rendering: Rendering, penalty: Tensor | None) -> Tensor | float:
-        """Return the prior on corrected poses plus the method's own term."""
-        deformation = self.scene.deformation
-        terms = [penalty]
-        if not deformation.warming_up:
-            terms.append(deformation.regularisation(self.scene.canonical, rendering, self.iteration))
-        return sum(term for term in terms if term is not None)
 
     def _update(self, progress: float) -> None:
         """Take an optimiser step on everything that has a gradient; shadows have none before one is detected."""
@@ -268,12 +258,13 @@ class GaussianSession(Session):
 
     def _control_density(self, progress: float) -> None:
         settings, config, scene = self.schedule.density(), self.config, self.scene
-        prunes = self._due(config.density.prune_interval)
+        reached = partial(due, before=self.iteration - self.batch_size, now=self.iteration)
+        prunes = reached(config.density.prune_interval)
         if prunes:
             self.refinement.center()
         if self.iteration < self.schedule.scaled(config.density_start):
             return
-        grows = self._due(settings.interval) and progress < config.growth_stop
+        grows = reached(settings.interval) and progress < config.growth_stop
         if grows or (prunes and progress < config.density.prune_stop):
             instruments = len(scene.canonical.counts) - 1
             tissue, instrument = self.limits
@@ -290,12 +281,8 @@ class GaussianSession(Session):
                 unsupported=scene.deformation.prune_mask(scene.canonical, [camera for _, camera in self.given]),
             )
             self.begin_statistics()
-        if settings.opacity_reset and self._due(settings.opacity_reset) and progress < config.growth_stop:
+        if settings.opacity_reset and reached(settings.opacity_reset) and progress < config.growth_stop:
             reset_opacity(scene.canonical, self.adam, config.density.reset_opacity)
-
-    def _due(self, interval: int) -> bool:
-        """Return whether this step reached a multiple of `interval` iterations."""
-        return due(interval, self.iteration - self.batch_size, self.iteration)
 
     def between_steps(self, before: float) -> None:
         """Run the method's own hook, then the events of the schedule that the last step passed."""
@@ -377,37 +364,6 @@ class GaussianSession(Session):
         quality = quality_of([label_counts(view, foreground) for view in views])
         if quality is not None:
             self.scene.diagnostics[LABEL_QUALITY] = quality.as_json()
-
-
-def new_session(
-    scene: GaussianScene, views: TrainingViews, config: TrainConfig, report: Report = lambda text: None
-) -> GaussianSession:
-    """Return a session at iteration 0, on the device of the views; `start` it before the first step."""
-    generator = torch.Generator(views.device).manual_seed(config.seed)
-    center = scene.center.cpu()
-    distances = [float((frame.camera.world_from_camera[:3, 3].float() - center).norm()) for frame in views.frames]
-    extent = 0.5 * float(np.median(distances))
-    return GaussianSession(
-        scene=scene,
-        length=config.length,
-        generator=generator,
-        views=views,
-        report=report,
-        batch_size=config.batch_size,
-        config=config,
-        extent=extent,
-    )
-
-
-def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.ndarray:
-    """Return frames in the order of a walk through instrument positions and directions (see `order_by_pose`)."""
-    if not instruments:
-        return np.arange(len(frames))
-    rows = [
-        np.concatenate([frame.state.instruments[name].pose[:3, 1:].double().numpy().ravel() for name in instruments])
-        for frame in frames
-    ]
-    return order_by_pose(np.stack(rows))
 
 
 def trust_of(state: State) -> float:

@@ -308,7 +308,9 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             terms.append(settings.label_sharpness * (label * (1 - label)).mean())
         return sum(terms[1:], terms[0]) if terms else None
 
+    @torch.no_grad()
     def act(self, session: GaussianSession, action: str) -> None:
+        refinement = session.refinement
         match action:
             case "find_shadow":
                 if self.settings.shadow:
@@ -327,13 +329,17 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             case "judge_states":
                 judge_states(session, self)
             case "size_states":
-                size_states(session, self)
+                judge_states(session, self, refit=False)
             case "judge_states_again":
-                judge_states_again(session, self)
+                suspected = bool(refinement.error_scale) or bool(refinement.verdicts.any())
+                if _corrects_states(session) and suspected:
+                    judge_again(_search(session, self))
             case "fit_states":
                 fit_states(session, self)
             case "carve_from_states":
-                carve_from_states(session, self)
+                if _fits_states(session):
+                    with session.searching():
+                        carve_again(session, self)
             case "conclude_states":  # with standard deviations of the fits; excludes frames that no state explains
                 fit_states(session, self, last=True)
             case _:
@@ -402,28 +408,18 @@ def _fits_states(session: GaussianSession) -> bool:
 
 
 @torch.no_grad()
-def judge_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Estimate the size of state errors over all training frames, and search for gross errors."""
-    if _corrects_states(session) and not session.refinement.error_scale:
-        search = _search(session, articulated)
-        misfits = Misfits.of(search)
-        large = _size_errors(session, search, misfits.outliers)
+def judge_states(session: GaussianSession, articulated: ArticulatedInstruments, *, refit: bool = True) -> None:
+    """Estimate the size of state errors over all training frames, unless they were large before, and report whether
+    they exceed a tracker's; with `refit`, search for gross errors, too."""
+    if not _corrects_states(session) or session.refinement.error_scale:
+        return
+    search = _search(session, articulated)
+    misfits = Misfits.of(search) if refit else None
+    large = search.size_errors(() if misfits is None else misfits.outliers)
+    if large:
+        session.report("the states' errors are larger than a tracker's: they are corrected by the images")
+    if misfits is not None:
         refit_outliers(search, SEARCH.scale if large else SEARCH.large, misfits)
-
-
-@torch.no_grad()
-def size_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Estimate the size of state errors over all training frames, unless they were large before."""
-    if _corrects_states(session) and not session.refinement.error_scale:
-        _size_errors(session, _search(session, articulated), ())
-
-
-@torch.no_grad()
-def judge_states_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Search again for wrong states, if errors are large or wrong states were detected before."""
-    suspected = bool(session.refinement.error_scale) or bool(session.refinement.verdicts.any())
-    if _corrects_states(session) and suspected:
-        judge_again(_search(session, articulated))
 
 
 @torch.no_grad()
@@ -448,22 +444,6 @@ def fit_states(session: GaussianSession, articulated: ArticulatedInstruments, *,
         leave_out_unexplained(search, explained)
 
 
-@torch.no_grad()
-def carve_from_states(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
-    """Carve the instruments' shapes again from fitted states."""
-    if _fits_states(session):
-        with session.searching():
-            carve_again(session, articulated)
-
-
 def _search(session: GaussianSession, articulated: ArticulatedInstruments) -> StateSearch:
     shafts = [articulation.shaft()[1].detach().cpu().double() for articulation in articulated.articulations]
     return StateSearch.of(session.scene, session.refinement, session.full_views.frames, shafts)
-
-
-def _size_errors(session: GaussianSession, search: StateSearch, outliers: Sequence[int]) -> bool:
-    """Estimate the size of the errors of all states except `outliers`, and report whether it exceeds a tracker's."""
-    large = search.size_errors(outliers)
-    if large:
-        session.report("the states' errors are larger than a tracker's: they are corrected by the images")
-    return large

@@ -17,8 +17,7 @@ from neeco.geometry.projection import project_world
 from neeco.methods.breathing import BreathingTissue, find_breathing
 from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
 from neeco.methods.kinematic.hinges import STATE_LINKS, STICKS, Hinges, start_hinges
-from neeco.methods.kinematic.link_registration import correct_poses
-from neeco.methods.kinematic.link_search import align_to_links, readings_of, start_links
+from neeco.methods.kinematic.link_search import align_to_links, correct_poses, readings_of, start_links
 from neeco.methods.kinematic.wrist_search import WRISTS, search_wrist
 from neeco.methods.tissue_fit import carved_shape, fit_tissue, tissue_evidence
 from neeco.raster.reference import SH_C0
@@ -83,12 +82,9 @@ def _unstated_wrists(
             )
         else:
             trees[instrument.name] = tree
-            session.report(f"{instrument.name}: images show its links: {_words(tree)}; if that is wrong, {STATE_LINKS}")
+            words = ", ".join(f"{link.name} turned by {' and '.join(link.value)}" for link in tree.links if link.value)
+            session.report(f"{instrument.name}: images show its links: {words}; if that is wrong, {STATE_LINKS}")
     return trees
-
-
-def _words(tree: KinematicTree) -> str:
-    return ", ".join(f"{link.name} turned by {' and '.join(link.value)}" for link in tree.links if link.value)
 
 
 def carve_again(session: GaussianSession, articulated: ArticulatedInstruments) -> None:

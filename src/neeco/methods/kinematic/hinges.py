@@ -162,20 +162,13 @@ class Hinges(Articulation):
         links = torch.stack([body * (1 - wrist), *jaws], 1).index_select(1, torch.cat([order[0].new_zeros(1), *order]))
         return torch.cat([links[:, :1], (body * wrist)[:, None], links[:, 1:]], 1)
 
+    @torch.no_grad()
     def settled(self, points: Tensor, logits: Tensor) -> Tensor:
+        """Near a hinge all links move similarly, and images hardly discriminate between them. But jaws turn between the
+        prongs of the clevis, and distal to these there are only jaws unless one is fixed."""
         if not self.jointed:
             return logits
-        link_logits, ruled_out = logits[:, : self.link_count], self._ruled_out(points) > 0.5
-        lowest = link_logits.masked_fill(ruled_out, torch.inf).amin(1, keepdim=True)
-        settled = torch.where(ruled_out, torch.minimum(link_logits, lowest - HINGES.ruled_out_margin), link_logits)
-        return torch.cat([settled, logits[:, self.link_count :]], 1)
-
-    @torch.no_grad()
-    def _ruled_out(self, points: Tensor) -> Tensor:
-        """Return how strongly points [M, 3] mm exclude each link, [M, link_count] in [0, 1].
-
-        Near a hinge all links move similarly, and images hardly discriminate between them. But jaws turn between the
-        prongs of the clevis, and distal to these there are only jaws unless one is fixed."""
+        # how strongly the points exclude the shaft, and each jaw, [M] in [0, 1]
         along, beyond, columns = self.along_shaft(points), points.new_ones(len(points)), []
         for joint in range(len(self.reading_names)):
             pivot, axis = self.hinge(joint)
@@ -185,7 +178,10 @@ class Hinges(Articulation):
             prongs = (0.5 + (aside - HINGES.prongs_from) / HINGES.border_width_radii).clamp(0, 1) * (1 - past)
             columns += [prongs, prongs]
             beyond = beyond * past * ~self._fixed(joint).any()
-        return torch.stack([beyond, *columns], 1)
+        link_logits, ruled_out = logits[:, : self.link_count], torch.stack([beyond, *columns], 1) > 0.5
+        lowest = link_logits.masked_fill(ruled_out, torch.inf).amin(1, keepdim=True)
+        settled = torch.where(ruled_out, torch.minimum(link_logits, lowest - HINGES.ruled_out_margin), link_logits)
+        return torch.cat([settled, logits[:, self.link_count :]], 1)
 
     def _fixed(self, joint: int) -> Tensor:
         """Return which of a joint's jaws is fixed, [2] bool."""

@@ -16,15 +16,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
-from neeco.capture.model import BaseUncertainty, Instrument, evenly_spaced
+from neeco.capture.model import BaseUncertainty, evenly_spaced
 from neeco.evidence.carving import CarvedShape, Evidence, camera_from_instrument
 from neeco.geometry.least_squares import Linearisation, levenberg_marquardt
 from neeco.geometry.projection import project
 from neeco.geometry.rotations import rigid_from_vector, rotation_from_vector, skew
 from neeco.methods.kinematic.articulation import SETTINGS, Articulation
-from neeco.methods.kinematic.link_search import doubted_readings
 from neeco.states.outline_fit import OUTLINES
-from neeco.training.session import GaussianSession
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,12 +76,6 @@ class LinkRegistration:
     along_mm: float  # shift of the first pivot along the shaft, mean over the frames
     along_sd_mm: float
 
-    def about(self, center: Tensor) -> Tensor:
-        """Return `base` [6] with its rotation about another point [3] mm."""
-        arm = self.center - center
-        moved = self.base[3:] + arm - rotation_from_vector(self.base[:3]) @ arm
-        return torch.cat([self.base[:3], moved])
-
 
 @torch.no_grad()
 def register_links(
@@ -103,14 +95,18 @@ def register_links(
         return None
     problem = SilhouetteProblem(links, evidence, name, shape, line, readings)
     if stated is not None:
-        problem.base_root = base_root(stated, problem.center)
+        arm = problem.center.double().cpu() - torch.tensor(stated.center, dtype=torch.float64)
+        to_center = torch.eye(6, dtype=torch.float64)  # a turn about another point shifts this one
+        to_center[3:, :3] = -skew(arm)
+        covariance = to_center @ torch.tensor(stated.covariance, dtype=torch.float64) @ to_center.T
+        problem.base_root = torch.linalg.cholesky(covariance).to(problem.center)
         problem.layout["base"] = torch.ones_like(problem.layout["base"])
     fits: list[tuple[tuple[str, ...], np.ndarray, Linearisation[np.ndarray]]] = []
     names: list[str] = []
     for more in MODELS:
         names += more
         problem.fit_only(names)
-        solved = minimised(problem)
+        solved = problem.minimised()
         fits.append((tuple(names), solved, problem.linearise(solved)))
     costs = [fitted.value for _, _, fitted in fits]
     chosen = next(k for k in range(len(fits)) if costs[k] - min(costs[k:]) < CAPSULES.min_gain)
@@ -136,79 +132,14 @@ def register_links(
     )
 
 
-def correct_poses(
-    session: GaussianSession,
-    links: Articulation,
-    evidence: Evidence,
-    instrument: Instrument,
-    shape: CarvedShape,
-    readings: list[dict[str, float]],
-) -> bool:
-    """Correct the links of an instrument, or also its base, if that explains the evidence better; return whether its
-    poses moved.
-
-    Warns of its readings if other ones explain the evidence better than any correction.
-    """
-    scene, name = session.scene, instrument.name
-    doubt = doubted_readings(session, links, evidence, instrument, readings)
-    stated = instrument.base_uncertainty
-    fit = register_links(links, evidence, name, shape, readings, stated=stated)
-    if doubt is not None and fit is not None:
-        other = register_links(links, evidence, name, shape, [doubt.change(row) for row in readings], stated=stated)
-        doubt = doubt if other is not None and other.cost < fit.cost else None
-    if doubt is not None:
-        session.report(f"warning: {name}: its links fit the images {doubt.ratio:.1f} times as well {doubt.words}")
-        doubted = {f"{name}.{reading}": f"the links fit the images better {doubt.words}" for reading in doubt.names}
-        scene.diagnostics.setdefault("doubted_readings", {}).update(doubted)
-    if doubt is not None or fit is None or not fit.needed:
-        return False
-    base = fit.about(scene.center)
-    with torch.no_grad():
-        scene.base_corrections[scene.instruments.index(instrument)] = base
-        links.axis_shifts.copy_(fit.pivots - links.points)
-        cosines = (links.directions * fit.axes).sum(1, keepdim=True)
-        links.axis_turns.copy_(torch.linalg.cross(links.directions, fit.axes) / cosines)
-        links.reading_offsets.copy_(fit.offsets)
-    off, sd, degrees = -fit.along_mm, fit.along_sd_mm, float(torch.rad2deg(fit.base[:3].norm()))
-    its_base = f", its base by {float(fit.base[3:].norm()):.1f} mm and {degrees:.1f} degrees" if base.any() else ""
-    session.report(
-        f"{name}: the pose's frame is off along the shaft by {off:.1f} mm (standard deviation {sd:.1f} mm; positive: "
-        f"towards the jaws){its_base}; corrected"
-    )
-    scene.diagnostics.setdefault("registration_of_links", {})[name] = {
-        "frame_off_along_shaft_mm": round(off, 3),
-        "frame_off_along_shaft_sd_mm": round(sd, 3),
-        "base_correction": [round(value, 5) for value in base.tolist()],
-    }
-    return bool(base.any())
-
-
-def base_root(stated: BaseUncertainty, center: Tensor) -> Tensor:
-    """Return the Cholesky factor [6, 6] of the covariance of a base's turn (rad) about `center` [3] and shift (mm)."""
-    arm = center.double().cpu() - torch.tensor(stated.center, dtype=torch.float64)
-    to_center = torch.eye(6, dtype=torch.float64)  # a turn about another point shifts this one
-    to_center[3:, :3] = -skew(arm)
-    covariance = to_center @ torch.tensor(stated.covariance, dtype=torch.float64) @ to_center.T
-    return torch.linalg.cholesky(covariance).to(center)
-
-
-def minimised(problem: SilhouetteProblem, *, coarse: bool = False) -> np.ndarray:
-    """Return the minimiser of the cost, in standard deviations of the fitted parameters. The problem then compares
-    images of the last width; coarse: of the first width only."""
-    solved = np.zeros(problem.size)
-    for width, steps in list(zip(CAPSULES.widths, CAPSULES.max_steps, strict=True))[: 1 if coarse else None]:
-        problem.compare_at(width)
-        solved = levenberg_marquardt(solved, problem.linearise, np.add, max_steps=steps, damping=1e-3, tolerance=1e-3)
-    return solved
-
-
 class SilhouetteProblem:
     """Silhouettes of capsules along an instrument's links, against the evidence of F frames.
 
     `layout` has the standard deviations of all parameters, in which vectors of those that are fitted are counted."""
 
     layout: dict[str, Tensor]
-    base_root: Tensor | None = None  # [6, 6] of the stated covariance, in which `base` is counted
+    # [6, 6] root of the stated covariance of the turn (rad) about `center` and shift (mm), in which `base` is counted
+    base_root: Tensor | None = None
 
     def __init__(
         self,
@@ -269,6 +200,15 @@ class SilhouetteProblem:
         correlated = CAPSULES.cells_per_observation * (width / CAPSULES.widths[-1]) ** 2
         usual = (1 - self.target.mean(0)).clamp_min(CAPSULES.min_weight)
         self.weight = usual / (CAPSULES.evidence_sd * correlated**0.5)
+
+    def minimised(self, *, coarse: bool = False) -> np.ndarray:
+        """Return the minimiser of the cost, in standard deviations of the fitted parameters. Images of the last width
+        are compared from then on; coarse: of the first width only."""
+        solved = np.zeros(self.size)
+        for width, steps in list(zip(CAPSULES.widths, CAPSULES.max_steps, strict=True))[: 1 if coarse else None]:
+            self.compare_at(width)
+            solved = levenberg_marquardt(solved, self.linearise, np.add, max_steps=steps, damping=1e-3, tolerance=1e-3)
+        return solved
 
     def linearise(self, at: np.ndarray) -> Linearisation[np.ndarray]:
         residual = self._residual(at)

@@ -23,8 +23,9 @@ from neeco.evidence.carving import (
     posed_views,
     score_points,
 )
-from neeco.geometry.rotations import rotate_about
+from neeco.geometry.rotations import rotate_about, rotation_from_vector
 from neeco.methods.kinematic.articulation import Articulation
+from neeco.methods.kinematic.link_registration import register_links
 from neeco.training.session import GaussianSession
 
 
@@ -134,6 +135,55 @@ def _shaft_about_line(
         radius=radius,
         seeds=points @ base[:3, :3].T + base[:3, 3],
     )
+
+
+def correct_poses(
+    session: GaussianSession,
+    links: Articulation,
+    evidence: Evidence,
+    instrument: Instrument,
+    shape: CarvedShape,
+    readings: list[dict[str, float]],
+) -> bool:
+    """Correct the links of an instrument, or also its base, if that explains the evidence better; return whether its
+    poses moved.
+
+    Warns of its readings if other ones explain the evidence better than any correction.
+    """
+    scene, name = session.scene, instrument.name
+    doubt = doubted_readings(session, links, evidence, instrument, readings)
+    stated = instrument.base_uncertainty
+    fit = register_links(links, evidence, name, shape, readings, stated=stated)
+    if doubt is not None and fit is not None:
+        other = register_links(links, evidence, name, shape, [doubt.change(row) for row in readings], stated=stated)
+        doubt = doubt if other is not None and other.cost < fit.cost else None
+    if doubt is not None:
+        session.report(f"warning: {name}: its links fit the images {doubt.ratio:.1f} times as well {doubt.words}")
+        doubted = {f"{name}.{reading}": f"the links fit the images better {doubt.words}" for reading in doubt.names}
+        scene.diagnostics.setdefault("doubted_readings", {}).update(doubted)
+    if doubt is not None or fit is None or not fit.needed:
+        return False
+    arm = fit.center - scene.center
+    turn = rotation_from_vector(fit.base[:3])
+    base = torch.cat([fit.base[:3], fit.base[3:] + arm - turn @ arm])  # turning about the scene's centre
+    with torch.no_grad():
+        scene.base_corrections[scene.instruments.index(instrument)] = base
+        links.axis_shifts.copy_(fit.pivots - links.points)
+        cosines = (links.directions * fit.axes).sum(1, keepdim=True)
+        links.axis_turns.copy_(torch.linalg.cross(links.directions, fit.axes) / cosines)
+        links.reading_offsets.copy_(fit.offsets)
+    off, sd, degrees = -fit.along_mm, fit.along_sd_mm, float(torch.rad2deg(fit.base[:3].norm()))
+    its_base = f", its base by {float(fit.base[3:].norm()):.1f} mm and {degrees:.1f} degrees" if base.any() else ""
+    session.report(
+        f"{name}: the pose's frame is off along the shaft by {off:.1f} mm (standard deviation {sd:.1f} mm; positive: "
+        f"towards the jaws){its_base}; corrected"
+    )
+    scene.diagnostics.setdefault("registration_of_links", {})[name] = {
+        "frame_off_along_shaft_mm": round(off, 3),
+        "frame_off_along_shaft_sd_mm": round(sd, 3),
+        "base_correction": [round(value, 5) for value in base.tolist()],
+    }
+    return bool(base.any())
 
 
 @torch.no_grad()
@@ -378,20 +428,14 @@ class _Volumes:
         self.evidence = evidence.subset(torch.arange(0, len(readings), step))
         self.camera_from_instrument = camera_from_instrument(self.evidence, name)  # [F, 4, 4]
         generator = torch.Generator().manual_seed(seed)
-        self.points = [self._about(link, generator) for link in range(1, links.link_count)]
-
-    def _about(self, link: int, generator: torch.Generator) -> Tensor:
-        """Sample points [`check_points`, 3] mm about a link at rest."""
-        radius = float(self.links.radius)
-        centers, half = (
-            part.cpu()
-            for part in _extent_of(
-                self.links, link, LINKS.check_reach_radii * radius, LINKS.check_margin_radii * radius
-            )
-        )
-        which = torch.randint(len(centers), (LINKS.check_points,), generator=generator)
-        away = 2 * torch.rand(LINKS.check_points, 3, generator=generator) - 1
-        return (centers[which] + away * half[which, None]).to(self.evidence.device)
+        radius = float(links.radius)
+        reach, margin = LINKS.check_reach_radii * radius, LINKS.check_margin_radii * radius
+        self.points: list[Tensor] = []  # [`check_points`, 3] mm about every link at rest
+        for link in range(1, links.link_count):
+            centers, half = (part.cpu() for part in _extent_of(links, link, reach, margin))
+            which = torch.randint(len(centers), (LINKS.check_points,), generator=generator)
+            away = 2 * torch.rand(LINKS.check_points, 3, generator=generator) - 1
+            self.points.append((centers[which] + away * half[which, None]).to(self.evidence.device))
 
     def motions(self, change: Callable[[Readings], Readings]) -> Tensor:
         """Return the poses [F, L, 4, 4] of all links in the camera's frame after `change` of the readings."""

@@ -19,7 +19,7 @@ from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.evidence.carving import CarvedShape, Evidence
 from neeco.geometry.rotations import rigid
 from neeco.methods.kinematic.articulation import Articulation
-from neeco.methods.kinematic.link_registration import CAPSULES, SilhouetteProblem, minimised
+from neeco.methods.kinematic.link_registration import CAPSULES, SilhouetteProblem
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ def search_wrist(
 
     def fitted_cost(wrist: _Wrist) -> float:
         problem = problem_of(wrist)
-        return problem.cost(minimised(problem, coarse=True))
+        return problem.cost(problem.minimised(coarse=True))
 
     likely = sorted(_hypotheses(shape, joints, others), key=first_cost)[: WRISTS.n_fitted]
     costs = {wrist: fitted_cost(wrist) for wrist in likely}
@@ -119,11 +119,11 @@ def search_wrist(
         costs |= {wrist: fitted_cost(wrist) for wrist in unequal}
         best = min(costs, key=costs.__getitem__)
     problem = problem_of(best)
-    parameters = minimised(problem)
+    parameters = problem.minimised()
     for joint in filter(None, (best.first, best.second)):
         rest = {joint: float(np.mean([frame_readings[joint] for frame_readings in readings]))}
         resting = problem_of(best, [{**frame_readings, **rest} for frame_readings in readings])
-        if resting.cost(minimised(resting)) - problem.cost(parameters) < WRISTS.min_gain:
+        if resting.cost(resting.minimised()) - problem.cost(parameters) < WRISTS.min_gain:
             return None
     pivots, axes = (part.double().cpu().numpy() for part in problem.corrected_axes(problem.parts(parameters)))
     return _placed(best.tree(shape, closed), best.jaw, pivots, axes)

@@ -23,10 +23,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -37,7 +35,7 @@ from neeco.methods.networks import octave_angles, octave_weights
 from neeco.raster.devices import tf32_products
 from neeco.raster.resampling import draw_through
 from neeco.raster.types import Rendering
-from neeco.scene.drawable import Recorded
+from neeco.scene.drawable import DrawableScene, Recorded
 
 HEAD_RANGE = 1e-4  # the warp's heads start in U(-1e-4, 1e-4): the untrained field hardly moves anything
 SMALL_ANGLE = 1e-4  # rad^2 below which the series is more exact than the closed form
@@ -325,7 +323,7 @@ class RayRendering:
     codes: Tensor  # [R, C]
 
 
-class NerfScene(nn.Module):
+class NerfScene(DrawableScene):
     """Radiance field; inside, positions are (world - center) / scale, so that sparse points lie in [-1, 1].
 
     `bounds` (near, far) are those of the samples' depth in mm. `opened` counts the warp's frequencies that are in use.
@@ -337,20 +335,13 @@ class NerfScene(nn.Module):
     opened: Tensor
     times: Tensor
 
-    label_names: tuple[tuple[str, str], ...] = ()
-    num_gaussians = None
     has_gaussians = False
-    casts_shadow = False
 
     def __init__(
         self, method: str, settings: NerfiesSettings, instruments: tuple[Instrument, ...], recorded: Recorded
     ) -> None:
-        super().__init__()
-        self.method = method
+        super().__init__(method, instruments, recorded)
         self.settings = settings
-        self.instruments = instruments
-        self.recorded = recorded
-        self.diagnostics: dict[str, Any] = {}
         times = sorted({state.time for state in recorded.states})
         self.register_buffer("center", torch.zeros(3))  # mm
         self.register_buffer("scale", torch.ones(()))  # mm
@@ -362,17 +353,6 @@ class NerfScene(nn.Module):
         self.warp = WarpField(settings.warp_frequencies, settings.code, settings.warp_depth, settings.warp_width)
         self.coarse = Template(settings)
         self.fine = Template(settings) if settings.fine_samples else None
-
-    def motion(self) -> None:
-        """A field has no Gaussians that could move."""
-
-    def torch_threads(self) -> AbstractContextManager[None]:
-        """All of torch's threads: an image is a few large products."""
-        return nullcontext()
-
-    def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return nothing: the state of its modules is complete."""
-        return {}, {}
 
     def codes_at(self, codes: Tensor, times: Tensor) -> Tensor:
         """Codes [R, C] at `times` [R] s: linear between the training frames' codes [T, C], the nearest outside."""

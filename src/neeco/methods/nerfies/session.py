@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -105,32 +104,19 @@ def elastic_loss(jacobians: Tensor, scale: float = 0.03) -> Tensor:
     return geman_mcclure(values.log().square().sum(-1), scale)
 
 
-@dataclass
 class NerfiesSession(Session):
-    """One training run in memory. `points` [P, 3] mm are tissue; empty where none were measured."""
+    """One training run in memory, at iteration 0."""
 
     scene: NerfScene
-    table: RayTable
-    points: Tensor
 
-    @classmethod
-    def around(
-        cls, scene: NerfScene, capture: Capture, views: TrainingViews, length: RunLength, seed: int
-    ) -> NerfiesSession:
-        """A session at iteration 0."""
-        cloud, device = capture.points, views.device
+    def __init__(self, scene: NerfScene, capture: Capture, views: TrainingViews, length: RunLength, seed: int) -> None:
+        device, cloud = views.device, capture.points
+        super().__init__(scene, length, torch.Generator(device).manual_seed(seed))
+        self.settings: NerfiesSettings = scene.settings
+        self.table, self.adam = RayTable(views), Adam()
         points = torch.from_numpy(cloud.positions).float() if cloud.measured else torch.zeros(0, 3)
-        generator = torch.Generator(device).manual_seed(seed)
-        return cls(scene, length, generator, RayTable(views), points.to(device))
-
-    def __post_init__(self) -> None:
-        self.adam = Adam()
-        self.scene.requires_grad_(True)
-
-    @property
-    def settings(self) -> NerfiesSettings:
-        """The method's own."""
-        return self.scene.settings
+        self.points = points.to(device)  # [P, 3] mm, tissue; empty where none were measured
+        scene.requires_grad_(True)
 
     def step(self) -> StepResult:
         """Render rays of all frames, compare, learn. Raises NeecoError when the loss is not finite."""
@@ -206,7 +192,7 @@ class Nerfies(Method):
         cls, capture: Capture, views: TrainingViews, settings: Any, length: RunLength, seed: int, scene: Any | None
     ) -> Session:
         field = initial_field(cls.method, capture, views.frames, settings) if scene is None else scene
-        return NerfiesSession.around(field.to(views.device), capture, views, length, seed)
+        return NerfiesSession(field.to(views.device), capture, views, length, seed)
 
     @classmethod
     def load(cls, stored: Stored) -> NerfScene:

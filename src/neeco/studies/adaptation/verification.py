@@ -21,7 +21,7 @@ from neeco.capture.model import Frame, InstrumentState, State
 from neeco.evaluation.masks import iou, open_masks
 from neeco.evidence.image_cut import cut_out
 from neeco.labels.settings import LABELS
-from neeco.scene.io import load_scene
+from neeco.scene.io import load_gaussians
 from neeco.studies.adaptation import AdaptRequest
 from neeco.studies.downstream.samples import class_table, paired_parts
 from neeco.synthesis.generator import limit_threads
@@ -160,7 +160,7 @@ class Verifier:
 @lru_cache(maxsize=1)
 def _opened(shared: Shared) -> Verifier:
     """Return the verifier, opened once per worker."""
-    scene = load_scene(shared.scene).to(shared.device)
+    scene = load_gaussians(shared.scene, "neeco adapt", shared.device)
     fitter = LabelFitter.of(scene, *classes_of(scene, shared.request))
     return Verifier(fitter, shared.frames, shared.request.min_overlap)
 
