@@ -52,6 +52,7 @@ train CAPTURE --output RUN --method nps --set deformation.half=false
 ingest recording.yaml --output CAPTURE --frames 30 --json ingest.json
 ingest recording.yaml --output CAPTURE --strict
 synthesize RUN --output SET --count 2 --views perturbed --states extrapolate --margin 0.2 --seed 4
+synthesize RUN --output SET --count 2 --views rolled
 synthesize RUN --output SET --count 2 --views orbit --max-unobserved 0.9 --max-attempts 20
 synthesize RUN --output SET --count 2 --image-format jpg --quality 90 --scale 2
 synthesize RUN --output SET --count 2 --no-tissue-check --min-share 0.001
